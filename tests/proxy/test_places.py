@@ -94,7 +94,7 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, position_m=None), Refusal.WRONG_STATE, "motion capture"),
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not report its yaw"),
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, captured_ns=NOW - 3 * NS_PER_S), Refusal.WRONG_STATE, "3.0 s old"),
-        (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m, and at most 5.00 m is allowed"),
+        (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m and must be at most 5.00 m"),
         (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude_m=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
         (Position(5.0, 0.0, 1.0), START, Refusal.OUT_OF_RANGE, "outside the safety box, box -4 -4 0 4 4 3"),
         (Position(0.0, 0.0, 3.5), START, Refusal.OUT_OF_RANGE, "outside the safety box"),

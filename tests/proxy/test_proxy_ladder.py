@@ -738,7 +738,7 @@ def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -
         assert steps(witness) == [("hover", "none")]
         bench.run(4.5)
         assert bench.driver.told == [Hover(), Land()]
-        assert "before it was restarted" in messages(witness, "flight")[0]
+        assert "before its restart" in messages(witness, "flight")[0]
 
 
 def test_a_vehicle_that_never_tells_its_state_is_watched_from_its_first_command_on(bench: Bench) -> None:

@@ -276,7 +276,7 @@ def test_a_way_that_leads_nowhere_is_given_up() -> None:
     assert isinstance(stuck(flight(), 5.0, 10.0).action, Position)
     decided = stuck(flight(), 5.0, 10.3)
     assert (decided.refusal, decided.lasting) == (Refusal.WRONG_STATE, True)
-    assert "came no nearer to its start for 10 s, and 5.0 m are left" in decided.why
+    assert "got no closer to its start for 10 s, and 5.0 m remain" in decided.why
 
 
 def test_close_by_it_lands_if_it_comes_no_nearer() -> None:

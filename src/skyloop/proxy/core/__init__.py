@@ -1,1 +1,1 @@
-"""The proxy's decisions, pure: inputs and the time are arguments, there is no thread, socket, lock or clock in here."""
+"""The proxy's pure decisions: inputs and the time are arguments; there are no threads, sockets, locks or clocks."""

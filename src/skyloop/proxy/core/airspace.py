@@ -1,11 +1,11 @@
-"""Where a vehicle may fly, and how fast: one verdict for each set-point, place, hover, take-off and step. Pure.
+"""Where a vehicle may fly, and how fast: one verdict for each set-point, position, hover, take-off and step. Pure.
 
-Every wall is a plane: those of the safety box, and before each no-fly zone the one through its nearest point, square to
-the line of sight, behind which all of the zone lies because zones are convex. Within a zone the plane by which the
-vehicle came in stays, so that it is led back to its own side. Towards a plane at distance ``d`` the vehicle may be as
-fast as it can still be stopped: ``v·t + v²/(2·a) = d`` with the reaction time ``t``, the age of the position included,
-and the deceleration ``a``. A velocity keeps what runs along the plane; a tilt is let through until the vehicle is as
-fast as that, and then is turned into one that brakes.
+Every wall is a plane: those of the safety box and, for each no-fly zone, the plane through its nearest point that is
+perpendicular to the line of sight. All of the zone lies behind that plane, because zones are convex. Inside a zone, the
+plane through which the vehicle entered stays, so that the vehicle is led back to its own side. At distance ``d`` from a
+plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the reaction time ``t`` (plus
+the age of the position) and the deceleration ``a``. A velocity keeps its component along the plane. An attitude passes
+unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
 """
 
 from __future__ import annotations
@@ -22,65 +22,66 @@ from skyloop.proxy.core.settings import ALTITUDE_GAIN, SLACK_M, AirspaceSettings
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
-LOST_NS: Final = 2 * NS_PER_S  #: a position that is older is not waited for
-BLIND_M: Final = 0.5  #: between walls a vehicle flies to a place at most so far without a new position
-#: A position that changes by more than this, and more than can have been flown since, has jumped.
+LOST_NS: Final = 2 * NS_PER_S  #: an older position is not worth waiting for
+BLIND_M: Final = 0.5  #: longest flight between walls to a position without a new measured one
+#: A position that changes by more than this, and by more than the vehicle can have flown since, has jumped.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: so far beyond a wall is taken for noise; farther is outside, where only coming back is allowed
-BRAKE_GAIN: Final = 2.0  #: deceleration asked for per speed that is too much [1/s]
-RETURN_M_S: Final = 0.5  #: at most so fast is it led back that is beyond a wall and asks to go farther
-#: A vehicle that hovers is brought down from so far above ``limits.altitude`` [m], at this speed at least [m/s].
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; farther out, only coming back is allowed
+BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
+RETURN_M_S: Final = 0.5  #: maximum speed of leading a vehicle back that asks to go farther beyond a wall
+#: A hovering vehicle this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
-TAKEOFF_M: Final = 1.0  #: a take-off leads at least so high
-LIFTED_M: Final = 0.3  #: a zone that ends lower is left by it: a vehicle may stand on a table that is one
+TAKEOFF_M: Final = 1.0  #: assumed minimum height of a take-off
+LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: a vehicle may stand on a table that is one
 
-_FAST_M_S: Final = 10.0  # what a vehicle that does not report its velocity may fly
-_BLIND_S: Final = 0.1  # what a vehicle does in less is within the reaction time
-_OLD_S: Final = 1.0  # a position may stay the same for longer where the vehicle stands still after all
-_AT_REST_M_S: Final = 0.05  # a slower vehicle may report the same position again and again
-_GROUND_NS: Final = NS_PER_S // 2  # the ground below is the median over so long: no single wrong height moves it
-_NO_WAY_M: Final = 0.05  # so near the place there is no direction that the limits could be applied to
-_PASSES: Final = 8  # of shortening by all walls in turn, before giving up on all but standing still
+_FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
+_BLIND_S: Final = 0.1  # covered by the reaction time
+_OLD_S: Final = 1.0  # maximum age of a position: the vehicle may be at rest after all
+_AT_REST_M_S: Final = 0.05  # slower vehicles may repeat the same position
+_GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that one wrong value has no effect
+_NO_WAY_M: Final = 0.05  # this close to the target, there is no direction to apply limits to
+_PASSES: Final = 8  # rounds of shortening by all walls in turn, before demanding a stop
 
 
 class Verdict(NamedTuple):
-    """What becomes of what is asked for."""
+    """The decision about a request."""
 
-    action: AnyAction | None = None  #: what may be done of it; None: the vehicle must stop, or stay where it stands
-    clamps: tuple[Clamp, ...] = ()  #: what was in the way of it
-    refusal: Refusal | None = None  #: None without an action: it goes on as soon as a young position comes
-    why: str = ""  #: of the refusal, for a person
-    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none
+    action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
+    clamps: tuple[Clamp, ...] = ()  #: the limits that applied
+    refusal: Refusal | None = None  #: None without an action: the action resumes with the next fresh position
+    why: str = ""  #: reason of the refusal, for people
+    enforced: bool | None = None  #: whether the safety box and zones could be enforced; None: there are none
 
 
 class Airspace:
-    """Judges what one vehicle is asked to do by where it is."""
+    """Judges the actions requested of one vehicle by its position."""
 
     def __init__(self, settings: AirspaceSettings | None = None) -> None:
         self.settings = settings or AirspaceSettings()
-        self.jumped_m = 0.0  #: how far the position jumped lately; whoever acts on it sets it to 0
-        self._way: tuple[Vec3, Space] | None = None  # the place that it was allowed to fly to, and in which space
-        self._sinks = self._blocked = False  # down to the ceiling; and something is between
+        self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
+        self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space at that time
+        self._sinks = self._blocked = False  # sinking to the ceiling; and whether something is in the way
         self._newest: Feedback | None = None
-        self._at_ns = 0  # how old the newest position is by itself
-        self._moves = False  # by what it was allowed last
-        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # the plane before each zone when it was outside last
-        self._ground: deque[tuple[int, float]] = deque()  # when, and how high below the vehicle [m]
+        self._at_ns = 0  # capture time of the newest position, without repeats
+        self._moves = False  # by its last permitted set-point
+        self._sides: dict[Zone, tuple[Vec3, float]] = {}  # each zone's plane from when the vehicle was last outside
+        self._ground: deque[tuple[int, float]] = deque()  # time, and height of the ground in world axes [m]
 
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
     ) -> Verdict:
-        """Decide what becomes of what is asked for, newly or once more.
+        """Judge a new or repeated request.
 
         Args:
-            action: What is asked for; finite.
-            feedback: The newest sample; None: none came yet.
-            now_ns: The time now, on the clock of ``feedback.captured_ns`` [ns].
-            new: Whether it was newly asked for. A place that was allowed stays so while nothing else is asked for: what
-                comes into the straight way because the vehicle drifts is kept clear of step by step, and for a lower
-                ceiling its height is lowered.
-            planned: It is a place of a way that was checked as a whole, and whose height may be lowered from the start.
+            action: The requested action, with finite numbers.
+            feedback: The newest sample; None: none yet.
+            now_ns: The present time, on the clock of ``feedback.captured_ns`` [ns].
+            new: Whether it is a new request. A permitted target stays permitted while nothing else is requested: if
+                drift brings an obstacle into the straight line, the steps keep clear of it, and under a lower ceiling
+                the target is lowered.
+            planned: Whether it is part of a route that was checked as a whole, so that it may be lowered from the
+                start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -98,7 +99,7 @@ class Airspace:
         return Verdict(action)
 
     def step(self, action: Velocity | Attitude, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Shorten a set-point, or one step on the way to a place, to what limits and walls allow."""
+        """Shorten a set-point, or one step towards a target, to what limits and walls allow."""
         self.observe(feedback)
         return self._set_point(action, feedback, now_ns)
 
@@ -112,7 +113,7 @@ class Airspace:
         return Verdict(allowed, clamps, enforced=enforced)
 
     def objection(self, action: Position, feedback: Feedback | None, now_ns: int) -> str:
-        """Return what is wrong with a place by itself, whatever the way there is, for a person; empty if nothing is."""
+        """Return what is wrong with a target, whatever the path to it, for people; empty if nothing is."""
         self.observe(feedback)
         if action.problem or feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return action.problem
@@ -120,7 +121,7 @@ class Airspace:
         return self._too_high(action.z, ground) or space.problem_at(action.place) or _too_low(action.z, ground)
 
     def ceiling_problem(self, altitude: float, feedback: Feedback | None) -> str:
-        """Return why ``limits.altitude`` must not be so low now: some vehicles sink to it by themselves."""
+        """Return why ``limits.altitude`` must not be this low now: some vehicles sink to it automatically."""
         self.observe(feedback)
         if feedback is None or feedback.position_m is None or (ground := self._ground_below(feedback)) is None:
             return ""
@@ -130,16 +131,16 @@ class Airspace:
         return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
 
     def apart(self) -> Airspace:
-        """Return one that has seen the same, to try something without a trace."""
+        """Return a copy with the same observations, for trial judgements."""
         other = Airspace(self.settings)
         other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
         other._sides, other._ground = dict(self._sides), self._ground.copy()
         return other
 
     def observe(self, feedback: Feedback | None) -> None:
-        """Note where the vehicle is: on which side of each zone, how old that is, and where the ground is below it.
+        """Note the vehicle's position: its age, the side of each zone that it is on, and the ground below.
 
-        ``jumped_m`` is set where the position changed by more than the vehicle can have flown.
+        ``jumped_m`` is set if the position changed by more than the vehicle can have flown.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -173,18 +174,19 @@ class Airspace:
             self._ground.clear()
 
     def allowed_speed(self, distance: float, late_s: float) -> float:
-        """The greatest speed towards a wall so far away [m/s]; 0 beyond it."""
+        """Return the maximum speed towards a wall at this distance [m/s]; 0 beyond it."""
         deceleration = self.settings.deceleration
+        # The positive root of v·t + v²/(2·a) = d.
         lost = deceleration * late_s
         return math.sqrt(lost * lost + 2 * deceleration * distance) - lost if distance > 0.0 else 0.0
 
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point that keeps within the box and out of the zones.
+        """Return the nearest set-point that stays inside the box and outside the zones.
 
         Returns:
-            The set-point, what was in the way, and whether the position is known; if not, the set-point is unchanged.
+            The set-point, the limits that applied, and whether the position is known; if not, nothing changes.
         """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
@@ -196,7 +198,7 @@ class Airspace:
         walls = self._walls(feedback.position_m)
         turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
         now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
-        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come nearer since
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # it has come nearer since the measurement
             walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True
@@ -209,6 +211,7 @@ class Airspace:
         walls = [] if space.box is None else list(space.box.walls_inside(at))
         for zone in space.barriers:
             wall = zone.wall_outside(at)
+            # Inside the zone, the nearest plane could be on its far side: keep the one from when it was outside.
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
                 wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
@@ -221,6 +224,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
+        # Beyond walls: stop, unless the velocity leads back through at least one of them, and farther beyond none.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
@@ -232,7 +236,7 @@ class Airspace:
                 if now is not None and (excess := _dot(now, wall.normal) - most) > 0.0:
                     most -= min(1.0, BRAKE_GAIN / 4 * excess)
                 if _dot(asked, wall.normal) <= 0.0:
-                    most = max(0.0, most)  # who does not ask to go there is not pushed away
+                    most = max(0.0, most)  # a vehicle that does not ask to go there is not pushed back, either
                 towards = _dot(wanted, wall.normal)
                 if towards > most + 1e-9:
                     wanted = _add(wanted, wall.normal, most - towards)
@@ -241,7 +245,7 @@ class Airspace:
             if math.dist(wanted, before) < 1e-6:
                 break
         else:
-            wanted = (0.0, 0.0, 0.0)  # between walls that contradict one another
+            wanted = (0.0, 0.0, 0.0)  # contradicting walls
         if not clamps:
             return action, ()
         forward, left = _to_body(wanted[0], wanted[1], turn)
@@ -250,12 +254,12 @@ class Airspace:
     def _attitude(
         self, action: Attitude, walls: list[Wall], turn: tuple[float, float], now: Vec3, late_s: float
     ) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Pitch forward accelerates forward, roll to the right to the right, both by g·tan."""
+        """Shorten an attitude. Pitch forward accelerates forward, roll to the right to the right, both by g·tan."""
         ahead, aside = GRAVITY_M_S2 * math.tan(action.pitch), -GRAVITY_M_S2 * math.tan(action.roll)
         east, north, climb = _to_world((ahead, aside, action.climb), turn)
         clamps: dict[str, Clamp] = {}
         deceleration = self.settings.deceleration
-        unseen_s = late_s - self.settings.reaction_s  # for so long it may have become faster
+        unseen_s = late_s - self.settings.reaction_s  # time in which it may have become faster
         gaining_s = unseen_s if unseen_s > _BLIND_S else 0.0
         for wall in walls:
             x, y, z = wall.normal
@@ -318,7 +322,7 @@ class Airspace:
         return Verdict(fitted, tuple(clamps), enforced=True if space.walled else None)
 
     def _hover(self, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Hover, or come down first from above ``limits.altitude``, as far as nothing is between."""
+        """Hover, or first descend from above ``limits.altitude``, as far as nothing is in the way."""
         limits = self.settings.limits
         altitude = None if feedback is None else feedback.altitude_m
         above = 0.0 if altitude is None else altitude - limits.altitude
@@ -340,16 +344,16 @@ class Airspace:
         x, y, z = feedback.position_m
         zones, at, top = Space(zones=self.settings.space.zones), (x, y, z + LIFTED_M), (x, y, z + TAKEOFF_M)
         problem = zones.problem_at(at) or zones.problem_between(at, top)
-        return _out_of_range(f"it would take off into it: {problem}") if problem else Verdict(action)
+        return _out_of_range(f"the take-off would enter it: {problem}") if problem else Verdict(action)
 
     def _ground_below(self, feedback: Feedback) -> float | None:
-        """How high the ground is below the vehicle, as it was for the most part lately [m]; None: not known."""
+        """Return the recent median height of the ground below the vehicle, in world axes [m]; None: unknown."""
         if feedback.altitude_m is None or not self._ground:
             return None
         return sorted(height for _, height in self._ground)[len(self._ground) // 2]
 
     def ceiling(self, feedback: Feedback) -> float:
-        """Return how high it may fly here, world axes [m]; infinite where the ground is not known."""
+        """Return the maximum height here, in world axes [m]; infinite if the ground is unknown."""
         ground = self._ground_below(feedback)
         return math.inf if ground is None else ground + self.settings.limits.altitude
 
@@ -358,16 +362,15 @@ class Airspace:
         if ground is None or z - ground - limit <= SLACK_M:
             return ""
         return (
-            f"z is {z:g} m, and at most {ground + limit:.2f} m is allowed: "
-            f"{limit:g} m above the ground (limits.altitude)"
+            f"z is {z:g} m and must be at most {ground + limit:.2f} m: {limit:g} m above the ground (limits.altitude)"
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """How old the newest position is, which may have been reported again and again; it was observed."""
+        """Return the age of the newest position, whether or not it was repeated."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Whether a place can be flown to by the newest position: by its age, between walls also by the speed."""
+        """Return whether the newest position is fresh enough to fly to a target; between walls, speed counts, too."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)
@@ -376,7 +379,7 @@ class Airspace:
 
 
 def _speed(feedback: Feedback) -> float:
-    """The speed that is reported [m/s]; 0 if none is."""
+    """Return the reported speed [m/s]; 0 if there is none."""
     return 0.0 if feedback.velocity_m_s is None else math.hypot(*feedback.velocity_m_s)
 
 
@@ -387,25 +390,23 @@ def _out_of_range(why: str) -> Verdict:
 def _too_low(z: float, ground: float | None) -> str:
     if ground is None or ground - z <= SLACK_M:
         return ""
-    return f"z is {z:g} m, which is {ground - z:.2f} m below the ground under the vehicle: choose a place above it"
+    return f"z is {z:g} m, which is {ground - z:.2f} m below the ground under the vehicle: choose a target above it"
 
 
 def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
-    """Why the vehicle can't be flown to a place now, and what helps; empty if it can."""
+    """Return why the vehicle can't fly to targets now, and what helps; empty if it can."""
     if feedback is None or feedback.position_m is None:
         return f"{NO_POSITION}: fly it by velocity, or {POSITION_SOURCES}"
     if feedback.yaw_rad is None:
         return "the vehicle does not report its yaw: fly it by velocity"
     age_ns = now_ns - feedback.captured_ns
     if age_ns > LOST_NS:
-        return (
-            f"the vehicle's newest position is {seconds(age_ns):.1f} s old, at most {seconds(LOST_NS):g} s are allowed"
-        )
+        return f"the vehicle's newest position is {seconds(age_ns):.1f} s old, over the limit of {seconds(LOST_NS):g} s"
     return ""
 
 
 def _fastest(at: Vec3, place: Vec3, limits: Limits) -> tuple[float, str]:
-    """The greatest speed along the straight way that keeps to those across and upwards, and which of them it is."""
+    """Return the maximum speed along the line within the horizontal and vertical limits, and the binding limit."""
     across, up = math.dist(at[:2], place[:2]), abs(place[2] - at[2])
     away = math.hypot(across, up)
     if away < _NO_WAY_M:
@@ -424,7 +425,7 @@ def _add(a: Vec3, b: Vec3, share: float) -> Vec3:
 
 
 def _to_world(body: Vec3, turn: tuple[float, float]) -> Vec3:
-    """Levelled body axes to world axes; ``turn`` holds cosine and sine of the yaw."""
+    """Rotate from levelled body axes to world axes; ``turn`` holds cosine and sine of the yaw."""
     c, s = turn
     return c * body[0] - s * body[1], s * body[0] + c * body[1], body[2]
 

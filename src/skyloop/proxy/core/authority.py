@@ -1,10 +1,9 @@
-"""Who may command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
+"""The authority to command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
 
-Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease
-whose number was never used before in this run. A strictly higher priority takes over at once, or after the holder was
-asked; a pre-empted pilot waits in the queue at the position that its priority and first arrival give it. A holder that
-stated how long it wants the authority loses it when that time is over and somebody waits. The rules in words are in
-``docs/proxy.md``.
+Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
+number is unique in this run. A strictly higher priority takes over at once, or after the holder was asked. A pre-empted
+pilot waits in the queue, in order of priority and first arrival. A holder that requested the authority for a limited
+time loses it when that time is over and someone waits. ``docs/proxy.md`` has the rules in words.
 """
 
 from __future__ import annotations
@@ -17,17 +16,17 @@ from skyloop.clock import nanoseconds
 
 @dataclass(frozen=True, slots=True, order=True)
 class QueueEntry:
-    """An application that holds the authority or waits for it. Sorts in the order of being served."""
+    """An application that holds the authority or waits for it. Sorts in order of service."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of its first request since it last held or wanted nothing
+    arrival: int  #: number of its first request since it last held or requested nothing
     app_id: int
-    term_ns: int | None = field(default=None, compare=False)  #: for how long it is wanted, from the grant; None: open
-    #: Until when the holder is asked before it is pre-empted; None: it is not asked (any more).
+    term_ns: int | None = field(default=None, compare=False)  #: requested duration from the grant; None: unlimited
+    #: Until when the holder is asked before it is pre-empted; None: it is not being asked.
     asks_until_ns: int | None = field(default=None, compare=False)
 
     def asks(self, now_ns: int) -> bool:
-        """Whether the holder is still being asked."""
+        """Return whether the holder is still being asked."""
         return self.asks_until_ns is not None and now_ns < self.asks_until_ns
 
 
@@ -38,12 +37,12 @@ class Granted:
     app_id: int
     priority: int
     lease: int
-    until_ns: int | None = None  #: when its time is over
+    until_ns: int | None = None  #: end of its time
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` because its time is over and others wait."""
+    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired``: its time is over and others wait."""
 
     app_id: int
     lease: int
@@ -52,9 +51,9 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Preempted:
-    """The lease ended because somebody of strictly higher priority wants it, or the holder ``granted`` it.
+    """The lease ended for a request of strictly higher priority, or because the holder ``granted`` one.
 
-    The loser waits in the queue.
+    The former holder waits in the queue.
     """
 
     app_id: int
@@ -66,12 +65,12 @@ class Preempted:
 
 @dataclass(frozen=True, slots=True)
 class Queued:
-    """An application waits in the queue or has moved in it, ``position`` 1 being next."""
+    """An application waits in the queue, or has moved up; ``position`` 1 is next."""
 
     app_id: int
     priority: int
     position: int
-    wait_ns: int | None = None  #: expected; None: not known
+    wait_ns: int | None = None  #: estimate; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +81,13 @@ class Asked:
     lease: int
     by_id: int
     by_priority: int
-    until_ns: int  #: when ``by_id`` wins if its priority is strictly higher
-    term_ns: int | None = None  #: for how long it is wanted
+    until_ns: int  #: when ``by_id`` wins, if its priority is strictly higher
+    term_ns: int | None = None  #: requested duration
 
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The holder does not hand it over to ``app_id``, who waits on."""
+    """The holder declined to hand it over to ``app_id``, which keeps waiting."""
 
     app_id: int
     holder_id: int
@@ -97,7 +96,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """Who asked the holder does so no more: it has left the queue, or waits without asking."""
+    """A request to the holder ended: the other application left the queue, or now waits without asking."""
 
     app_id: int  #: the holder
     lease: int
@@ -106,7 +105,7 @@ class Withdrawn:
 
 @dataclass(frozen=True, slots=True)
 class Expired:
-    """The holder's time is over; it keeps the authority until somebody wants it. Told once."""
+    """The holder's time is over; it keeps the authority until someone requests it. Reported once."""
 
     app_id: int
     lease: int
@@ -116,18 +115,18 @@ Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Withdrawn | Ex
 
 
 class Authority:
-    """Who holds the authority over one vehicle and who waits for it. Methods return what changed, in order."""
+    """The holder of the authority over one vehicle, and the queue. Methods return the changes, in order."""
 
     def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
-        self.timeout_ns = nanoseconds(timeout_s)  #: a holder silent for so long loses the lease
-        self.ask_ns = nanoseconds(ask_s)  #: how long a holder that is asked may wait before the higher priority wins
+        self.timeout_ns = nanoseconds(timeout_s)  #: silence after which a holder loses the lease
+        self.ask_ns = nanoseconds(ask_s)  #: how long a holder may be asked before the higher priority wins
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 for none
-        self.last_command_ns = 0  #: when a holder sent its last valid command, this one or one before it
+        self.last_command_ns = 0  #: time of the last valid command of a holder, this one or an earlier one
         self._granted_ns = 0  # when the holder got the lease
-        self.until_ns: int | None = None  #: when the holder's time is over
+        self.until_ns: int | None = None  #: end of the holder's time
         self.silent: QueueEntry | None = (
-            None  #: who lost the lease by silence and keeps the name on it until somebody asks
+            None  #: the last holder if it lost the lease by silence; listed until someone requests the authority
         )
         self._last_lease = 0
         self._arrivals = 0
@@ -137,29 +136,29 @@ class Authority:
 
     @property
     def owner(self) -> QueueEntry | None:
-        """Whose name is on it: the holder's, or that of one who lost the lease by silence and has no successor."""
+        """The listed owner: the holder, or a silent former one without a successor."""
         return self.holder or self.silent
 
     @property
     def waiting(self) -> tuple[QueueEntry, ...]:
-        """Those in the queue, the next one first."""
+        """The queue, the next one first."""
         return tuple(self._waiting)
 
     @property
     def granted(self) -> int:
-        """How often the authority was granted in this run."""
+        """Number of grants in this run."""
         return self._last_lease
 
     def position(self, app_id: int) -> int:
-        """Return the position in the queue from 1; 0 for an application that does not wait."""
+        """Return the position in the queue from 1; 0 if the application does not wait."""
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
 
     def asking(self, app_id: int, now_ns: int) -> bool:
-        """Whether this application waits while the holder is asked to hand it over."""
+        """Return whether this application waits while the holder is asked to hand it over."""
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return how long a waiting application will wait if each keeps to its time; None: somebody gave none."""
+        """Return a waiting application's expected wait if each keeps to its time; None: someone gave none."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -173,7 +172,7 @@ class Authority:
             wait_ns = None if wait_ns is None or entry.term_ns is None else wait_ns + entry.term_ns
         return None
 
-    # What applications do --------------------------------------------------------------------------------------
+    # Requests of applications ------------------------------------------------------------------------------------
 
     def request(
         self,
@@ -185,11 +184,11 @@ class Authority:
         term_ns: int | None = None,
         ask: bool = False,
     ) -> list[Effect]:
-        """Ask for the authority, or change the priority or the time of an earlier request.
+        """Request the authority, or change the priority or the time of an earlier request.
 
-        ``queue`` False: do not wait. ``term_ns``: for how long it is wanted; None: until it is given back.
-        ``ask``: let the holder be asked first. Afterwards the application holds the authority, or has a
-        :meth:`position`, or was refused because somebody of at least the same priority holds it.
+        ``queue`` False: do not wait. ``term_ns``: requested duration; None: until it is given back. ``ask``: ask the
+        holder first. Afterwards the application holds the authority, or has a :meth:`position`, or was refused because
+        a holder has at least the same priority.
         """
         effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
@@ -197,13 +196,13 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # and asks again, as everybody else does
+            effects.append(self._relieve())  # it must request it again, like all others
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
             self._known_positions.pop(app_id, None)
         effects += self._hand_over(now_ns)
-        if not queue and entry in self._waiting:  # somebody of higher priority was waiting
+        if not queue and entry in self._waiting:  # others of higher priority were waiting
             self._waiting.remove(entry)
         effects += self._moved(now_ns)
         holder = self.holder
@@ -217,10 +216,10 @@ class Authority:
         return effects
 
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
-        """The holder answers who asks. Does nothing if ``app_id`` is not the holder, or ``by_id`` does not ask.
+        """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` does not ask.
 
-        Granting is to step back: the first in the queue gets it, and the holder waits, with no higher priority than
-        that one has. Declining is reported; a strictly higher priority wins all the same when the time to ask is over.
+        Granting means stepping back: the first in the queue gets it, and the holder waits, with at most that one's
+        priority. Declining is reported; a strictly higher priority still wins when the time to ask is over.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -233,18 +232,18 @@ class Authority:
         return self._pre_empt(now_ns, granted=True) + self._moved(now_ns)
 
     def release(self, app_id: int, now_ns: int) -> list[Effect]:
-        """Give the authority back, or leave the queue. Does nothing for an application that does neither."""
+        """Release the authority, or leave the queue. Does nothing for other applications."""
         return self._drop(app_id, "released", now_ns)
 
     def gone(self, app_id: int, now_ns: int) -> list[Effect]:
-        """The application's connection ended."""
+        """Handle the end of the application's connection."""
         return self._drop(app_id, "gone", now_ns)
 
     def update(self, now_ns: int) -> list[Effect]:
-        """Do what goes by time; call at a steady pace.
+        """Apply changes due by time; call at a steady pace.
 
-        The lease of a silent holder ends, and of one whose time is over while others wait; a holder that was asked for
-        long enough is pre-empted.
+        A silent holder's lease ends, and so does that of a holder whose time is over while others wait. A holder that
+        was asked for long enough is pre-empted.
         """
         holder = self.holder
         if holder is None:
@@ -255,13 +254,13 @@ class Authority:
                 self.silent = holder
             return effects
         effects = self._settle(now_ns)
-        if self._is_over(now_ns) and not self._expiry_reported:  # nobody waits, or it would have been relieved
+        if self._is_over(now_ns) and not self._expiry_reported:  # no one waits, or it would have been relieved
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects
 
     def slept(self, ns: int) -> None:
-        """Let everything be older by so much: the computer slept, and its clock stood still."""
+        """Age everything by this time: the computer slept, and its clock stopped."""
         self.last_command_ns -= ns
         self._granted_ns -= ns
         if self.until_ns is not None:
@@ -272,7 +271,7 @@ class Authority:
     def _dequeue(
         self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
     ) -> tuple[QueueEntry, bool]:
-        """Return the application's entry, out of the queue, and whether the holder was asked for it before."""
+        """Take the application's entry out of the queue; return it, and whether the holder was being asked."""
         known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
         asked_before = known is not None and known.asks(now_ns)
         if known is not None:
@@ -285,7 +284,7 @@ class Authority:
         return QueueEntry(priority, arrival, app_id, term_ns, asks_until_ns if ask else None), asked_before
 
     def _may_be_taken(self, entry: QueueEntry, now_ns: int) -> bool:
-        """Whether this entry need not wait."""
+        """Return whether this entry need not wait."""
         holder = self.holder
         if holder is None or self._is_over(now_ns):
             return True
@@ -295,7 +294,7 @@ class Authority:
         return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
 
     def _change_term(self, term_ns: int | None, now_ns: int) -> None:
-        """The holder wants it for so long from now; no longer than before while others wait. None: as before."""
+        """Set the holder's remaining time, without extending it while others wait. None: keep it."""
         if term_ns is None:
             return
         until_ns = now_ns + term_ns
@@ -304,9 +303,10 @@ class Authority:
         self.until_ns, self._expiry_reported = until_ns, False
 
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
-        """Give it to the first in the queue; the holder waits.
+        """Give the authority to the first in the queue; the holder waits.
 
-        It keeps what is left of its time, and has no higher priority than the new one, or it would take it back.
+        The holder keeps its remaining time, but gets at most the new holder's priority, or it would take it back at
+        once.
         """
         holder, lease = self.holder, self.lease
         assert holder is not None
@@ -317,7 +317,7 @@ class Authority:
         return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
 
     def _relieve(self) -> Lost:
-        """The holder's time is over and others wait."""
+        """End the lease of a holder whose time is over while others wait."""
         assert self.holder is not None
         lost = Lost(self.holder.app_id, self.lease, "expired")
         self._vacate()
@@ -339,13 +339,13 @@ class Authority:
         return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
-        """Hand the authority over if it is time to, then report who has moved in the queue."""
+        """Hand the authority over if due, then report changed positions in the queue."""
         return self._hand_over(now_ns) + self._moved(now_ns)
 
     def _hand_over(self, now_ns: int) -> list[Effect]:
-        """Give the authority to the first in the queue if it is time to.
+        """Give the authority to the first in the queue if due.
 
-        That is if nobody holds it, the holder's time is over, or somebody of strictly higher priority need not ask any
+        It is due if there is no holder, the holder's time is over, or a strictly higher priority need not ask any
         longer.
         """
         effects: list[Effect] = []

@@ -1,13 +1,14 @@
 """The software autopilot: take-off, hover, land, velocity and position for vehicles that lack them. Pure.
 
-And the way back to where the vehicle took off, for all: a series of places to fly to, each judged as ``go_to`` is
-(:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight over the start, and there a landing or a
-hover. Both are stepped from outside. The rules of the way back in words are in ``docs/proxy.md``.
+Also the return to where the vehicle took off, for all vehicles: a series of targets, each judged as for ``go_to``
+(:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start, and a landing
+or hover there. Both are stepped from outside. ``docs/proxy.md`` has the rules of the return in words.
 
-A vehicle that takes velocities gets velocities; one that takes only attitude with climb rate gets the output of a
-velocity loop (proportional and integral, the common cascade of small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
-"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs are REP 103's: to accelerate
-forward the nose goes down, which is positive pitch; to accelerate left the left side goes down, which is negative roll.
+A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
+a velocity loop (proportional and integral, the common cascade of small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
+"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103: to accelerate
+forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down, which is negative
+roll.
 """
 
 from __future__ import annotations
@@ -37,43 +38,43 @@ from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.proxy.core.settings import AutopilotSettings, Clamp, ReturnSettings
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: the pace that it is made for
+PERIOD_S: Final = 0.02  #: the pace that it is designed for
 ALTITUDE_GAIN: Final = 1.0  #: climb per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
-POSITION_SPEED: Final = 0.5  #: at most [m/s]
-GO_GAIN: Final = 0.9  #: on the way to a place: speed per metre that is left [1/s]
-GO_SPEED: Final = 1.0  #: at most, where none is given [m/s]
-GO_DECELERATION: Final = 0.6  #: towards it [m/s²]
-TURN_GAIN: Final = 1.5  #: yaw rate per radian that is left [1/s]
-TURN_RATE: Final = 1.2  #: at most, where none is given [rad/s]
-SETTLED_SPEED: Final = 0.2  #: below it the place to hold is fixed [m/s]
-ARRIVED: Final = 0.1  #: a take-off ends so far below its altitude [m]
-LONGEST_RISE: Final = 2.0  #: a take-off ends after so many times what it takes by its climb rate, ...
-LONGEST_RISE_S: Final = 2.0  #: ... and this [s]
+POSITION_SPEED: Final = 0.5  #: maximum in a hover [m/s]
+GO_GAIN: Final = 0.9  #: on the way to a target: speed per remaining metre [1/s]
+GO_SPEED: Final = 1.0  #: maximum if none is given [m/s]
+GO_DECELERATION: Final = 0.6  #: towards the target [m/s²]
+TURN_GAIN: Final = 1.5  #: yaw rate per remaining radian [1/s]
+TURN_RATE: Final = 1.2  #: maximum if none is given [rad/s]
+SETTLED_SPEED: Final = 0.2  #: a hover fixes its position once slower than this [m/s]
+ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
+LONGEST_RISE: Final = 2.0  #: a take-off ends after this multiple of its nominal duration, ...
+LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
-# On the way back:
-NEAR_M: Final = 0.3  #: so near, and at rest, it is there
-CLOSE_M: Final = 1.0  #: so near is near enough where it comes no nearer
+# Return flight:
+NEAR_M: Final = 0.3  #: this close, and at rest, it has arrived
+CLOSE_M: Final = 1.0  #: close enough if it gets no closer
 AT_REST_M_S: Final = 0.3
-HEADWAY_M: Final = 0.2  #: a way that does not become shorter by this ...
+HEADWAY_M: Final = 0.2  #: a leg that does not become shorter by this ...
 STALL_NS: Final = 10 * NS_PER_S  #: ... within this time leads nowhere
-#: How long a failsafe bears with what is against a return before it lands where the vehicle is.
+#: How long a failsafe tolerates obstacles to a return before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
-CLEARANCE_M: Final = 0.3  #: kept to the ceiling of the room and to the upper wall of the safety box
+CLEARANCE_M: Final = 0.3  #: distance to the ceiling of the room and to the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 
 SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:
-    """What the autopilot adds to the actions that a vehicle itself takes."""
+    """Return the actions that the autopilot adds to a vehicle's own."""
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
 
 
 class Mode(Enum):
-    """What the autopilot does now."""
+    """The autopilot's current task."""
 
     OFF = auto()
     TAKEOFF = auto()
@@ -93,7 +94,7 @@ _STATES: Final = {
 
 
 class Autopilot:
-    """Flies one vehicle in software; ``flight`` is told what is done, and asked when that has ended."""
+    """Flies one vehicle in software; reports its task to ``flight``, which decides when the task has ended."""
 
     def __init__(
         self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None
@@ -101,16 +102,16 @@ class Autopilot:
         self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
-        self.drifts = False  #: it is held level, as its velocity is not known: nothing brakes it
-        #: The velocity that is allowed instead of the wanted one, by the newest feedback; not asked while it lands.
+        self.drifts = False  #: the vehicle is held level because its velocity is unknown: nothing brakes it
+        #: Returns the permitted velocity for a desired one, by the newest feedback; not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
         self._integral = (0.0, 0.0)  # forward, left [rad]
         self._stepped_ns: int | None = None
         self._lifted_ns: int | None = None  # when the take-off left the ground
-        self._from_height: float | None = None  # its position's height then [m]
-        self._altitudes: set[float] = set()  # the lowest and the highest that were read since then [m]
+        self._from_height: float | None = None  # height of its position at that time [m]
+        self._altitudes: set[float] = set()  # lowest and highest reading since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
         self._hold_yaw: float | None = None
@@ -118,11 +119,11 @@ class Autopilot:
     def start(
         self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
     ) -> None:
-        """Begin to do this; :meth:`step` goes on with it. Repeats of what is being done change nothing."""
+        """Start a task; :meth:`step` continues it. Repeats of the current task change nothing."""
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
-                self._hold_yaw = None  # where it was turned to is kept from here on, not where it looked before
+                self._hold_yaw = None  # keep the yaw it has reached from here on, not the earlier one
             self._target = action
         if mode is self.mode:
             return
@@ -134,33 +135,33 @@ class Autopilot:
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
 
     def stop(self, action_name: str) -> None:
-        """The vehicle itself does something now: steer no longer."""
+        """Stop steering: the vehicle itself executes something now."""
         self.mode = Mode.OFF
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
-        """Fly on no longer: the vehicle failed at what was to take the place of this."""
+        """Stop moving: the vehicle failed to execute the action that was to replace this task."""
         if isinstance(self._target, Position) and self._target.yaw is not None:
-            self._hold_yaw = None  # as in `start`: it keeps the yaw that it has reached
+            self._hold_yaw = None  # as in `start`: keep the yaw that it has reached
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
-        """The vehicle refused what it was sent: a take-off of one that ``reported`` to stand is over."""
+        """Handle the vehicle's refusal of a set-point: a take-off is over if the vehicle ``reported`` to stand."""
         if self.flight.refused(reported):
             self.mode = Mode.OFF
 
     def step(
         self, now_ns: int, feedback: Feedback | None, reported: FlightState = FlightState.UNKNOWN
     ) -> Attitude | Velocity | None:
-        """What to send to the vehicle now; None while off. To be called every :data:`PERIOD_S`.
+        """Return the set-point to send now; None while off. Call every :data:`PERIOD_S`.
 
-        ``reported``: the flight state as the vehicle's driver reported it, which is not that of the ``feedback``.
+        ``reported``: the flight state from the driver, which may differ from that in ``feedback``.
         """
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
         wanted = self._wanted(now_ns, known, reported)
-        if self.flight.has_ended(reported, now_ns, known):  # what is sent last stays in force
+        if self.flight.has_ended(reported, now_ns, known):  # the last set-point stays in force
             wanted = wanted if self.mode is Mode.LAND else Velocity()
             self.mode = Mode.OFF
         elif known is not None and self.mode is not Mode.LAND:
@@ -184,7 +185,7 @@ class Autopilot:
         return self._target
 
     def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
-        """Climb until the altimeter, or else the position or the time, say that it is high enough."""
+        """Climb until the altimeter (otherwise the position, or the time) shows enough height."""
         settings = self.settings
         altitude = known.altitude_m if known is not None else None
         height = known.position_m[2] if known is not None and known.position_m is not None else None
@@ -203,8 +204,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter reads the same all the time. One that moves, and has the vehicle down when the time is over,
-        # is right: motors turn, and it has not left the ground, as a real Betaflight on a slow computer.
+        # A stuck altimeter always reads the same. One that moves, but shows the vehicle on the ground when the time is
+        # over, is right: the motors turn without lift-off, as seen with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
@@ -215,7 +216,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # it may be anywhere by when it is heard again: there it stays
+        if known is None:  # it may be anywhere when it is next received: hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -236,7 +237,7 @@ class Autopilot:
         return Velocity(forward, left, up)
 
     def _go(self, target: Position, known: Feedback | None) -> Velocity:
-        """Straight towards a place, and slower near it; a speed of zero while position or yaw are not known."""
+        """Fly straight towards a target, slower near it; at zero speed while position or yaw is unknown."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
         if self._hold_yaw is None:
@@ -256,7 +257,7 @@ class Autopilot:
         )
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
-        """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""
+        """Return the roll and pitch [rad] to reach a velocity; level while the velocity is unknown."""
         self.drifts = known is None or known.velocity_m_s is None
         if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
@@ -269,7 +270,7 @@ class Autopilot:
         )
         forward = settings.velocity_p * forward_error + integral[0]
         left = settings.velocity_p * left_error + integral[1]
-        if math.hypot(forward, left) <= settings.tilt:  # else it would wind up
+        if math.hypot(forward, left) <= settings.tilt:  # only then: the integral would wind up
             self._integral = integral
         else:
             forward, left = _shorten(forward, left, settings.tilt)
@@ -290,21 +291,21 @@ def _shorten(x: float, y: float, most: float) -> tuple[float, float]:
     return (x, y) if length <= most else (x / length * most, y / length * most)
 
 
-# The way back to the start --------------------------------------------------------------------------------------
+# Return to the start ----------------------------------------------------------------------------------------
 
 
 class StartPoint:
-    """Where the vehicle left the ground last, in world axes."""
+    """The place where the vehicle last left the ground, in world axes."""
 
     def __init__(self) -> None:
-        self.position: Vec3 | None = None  #: [m]; None: not known
+        self.position: Vec3 | None = None  #: [m]; None: unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # since when it stands; None: it does not
-        self._flew = False  # it was seen in the air
-        self._open = False  # it is just taking off, and its position is still awaited
+        self._standing_ns: int | None = None  # since when it has been standing; None: it is not
+        self._flew = False  # it has been seen in the air
+        self._open = False  # it is taking off, and its position is still awaited
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
-        """Observe the vehicle; a moment of "landed" in the air does not move the start."""
+        """Observe the vehicle; a brief false "landed" in the air does not move the start."""
         before, self._state = self._state, state
         if state in _GROUNDED:
             if self._standing_ns is None:
@@ -328,18 +329,18 @@ class StartPoint:
 
 
 class ReturnDecision(NamedTuple):
-    """What the vehicle does next on its way back."""
+    """The vehicle's next step of a return."""
 
     action: Position | Land | None = None  #: None: it must stop
     clamps: tuple[Clamp, ...] = ()
-    refusal: Refusal | None = None  #: None without an action: it goes on as soon as a young position comes
-    why: str = ""  #: of the refusal, for a person
-    lasting: bool = False  #: waiting for a young position does not help
-    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no place
+    refusal: Refusal | None = None  #: None without an action: it continues with the next fresh position
+    why: str = ""  #: reason of the refusal, for people
+    lasting: bool = False  #: waiting for a fresh position does not help
+    enforced: bool | None = None  #: whether the safety box and zones were enforced; None: there are none, or no target
 
 
 class ReturnFlight:
-    """One flight back to the start point; ``settings`` hold where the action leaves something open."""
+    """One flight back to the start; ``settings`` fill in what the action leaves open."""
 
     def __init__(self, action: ReturnToStart, start: Vec3 | None, settings: ReturnSettings) -> None:
         self.phase = ReturnPhase.NONE
@@ -349,19 +350,19 @@ class ReturnFlight:
         self._speed = settings.speed
         self._land = settings.land if action.land is None else action.land
         self._target: Vec3 = (0.0, 0.0, 0.0)
-        self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered where the ceiling is lower now
-        self._over: Vec3 = (0.0, 0.0, 0.0)  # the place above the start
-        self._left_m, self._left_ns = math.inf, 0  # the shortest way that was left, and since when it is
+        self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered under a lower ceiling
+        self._over: Vec3 = (0.0, 0.0, 0.0)  # the point above the start
+        self._left_m, self._left_ns = math.inf, 0  # the shortest remaining distance, and since when
         self._stepped_ns = 0
 
     def step(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
-        """Decide what the vehicle does now."""
+        """Decide the vehicle's next action."""
         begins = self.phase is ReturnPhase.NONE
         if self.phase is not ReturnPhase.LANDING:
             airspace.observe(feedback)
             problem = self._plan(airspace, feedback, now_ns)
             if problem is not None:
-                self.phase = ReturnPhase.NONE  # all of it is checked again before it goes on
+                self.phase = ReturnPhase.NONE  # everything is checked again before it continues
                 return problem
         if self.phase is ReturnPhase.LANDING:
             return ReturnDecision(Land())
@@ -374,22 +375,22 @@ class ReturnFlight:
         return ReturnDecision(None, place.clamps, place.refusal, place.why)
 
     def _plan(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision | None:
-        """Begin, or go on to the next part of the way; return what is against it."""
+        """Start, or continue with the next leg; return an objection, if any."""
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return None  # which is the same for every place
+            return None  # the same for every target
         if self.phase is not ReturnPhase.NONE:
             problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
         if self._start is None:
-            why = "where it took off is not known: fly it to a place, or land it here"
+            why = "the start is unknown: fly the vehicle to a position, or land it here"
             return ReturnDecision(None, (), Refusal.WRONG_STATE, why, True)
         problem = self._begin(self._start, airspace, feedback, feedback.position_m)
         return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, problem, True) if problem else None
 
     def _begin(self, start: Vec3, airspace: Airspace, feedback: Feedback, at: Vec3) -> str:
-        """Plan the whole way; return what is in it, for a person."""
+        """Plan the whole return; return what is in the way, for people."""
         space = airspace.settings.space
         top = max(at[2], start[2] + self._height) if math.dist(at[:2], start[:2]) >= CLOSE_M else at[2]
         top = min(top, airspace.ceiling(feedback))
@@ -397,7 +398,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # From outside of the box, or in a zone, it does not climb first: the straight way leads back inside.
+        # From outside the box, or inside a zone, it does not climb first: the straight line leads back inside.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:
@@ -413,7 +414,7 @@ class ReturnFlight:
         return ""
 
     def _go_on(self, feedback: Feedback, at: Vec3, now_ns: int) -> str:
-        """Begin the next part of the way where the present one is over; return what is against it, for a person."""
+        """Start the next leg when the current one is over; return an objection for people, if any."""
         left_m = math.dist(at, self._flown)
         paused, self._stepped_ns = now_ns - self._stepped_ns > NS_PER_S, now_ns
         if paused or left_m < self._left_m - HEADWAY_M:
@@ -422,7 +423,7 @@ class ReturnFlight:
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
                 self.phase, self._left_m = ReturnPhase.FLYING, math.inf
-                self._target = self._flown = self._over  # the straight way there is judged with it
+                self._target = self._flown = self._over  # the straight line to it is judged together with it
                 return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S
@@ -431,5 +432,5 @@ class ReturnFlight:
         else:
             return ""
         if stalled and left_m > CLOSE_M:
-            return f"it came no nearer to its start for {seconds(STALL_NS):g} s, and {left_m:.1f} m are left"
+            return f"it has got no closer to its start for {seconds(STALL_NS):g} s, and {left_m:.1f} m remain"
         return ""

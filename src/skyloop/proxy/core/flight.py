@@ -1,8 +1,8 @@
-"""One flight: whether the vehicle flies, whose flight that is, and how sure both are. Pure: the time is an argument.
+"""One flight: whether the vehicle flies, whose flight it is, and how sure both are. Pure: the time is an argument.
 
-The proxy steers only for an application's own, new intent, or to end a flight that it began itself. What others arm,
-fly, switch or land is observed, reported, and left alone. A flight is over when the vehicle shows it, and not by time
-alone. The rules in words are in ``docs/proxy.md``.
+The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
+mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle shows it,
+not by time alone. ``docs/proxy.md`` has the rules in words.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from skyloop.messages import (
     Velocity,
 )
 
-#: A take-off that was asked for so long ago and does not show is none of ours any more: drivers give one up sooner.
+#: A requested take-off that does not show within this time is no longer ours: drivers give up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
-#: One that was called off shows within this time if the vehicle rises all the same.
+#: A cancelled take-off shows within this time if the vehicle rises nevertheless.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over when the vehicle stood for so long: one that bounces, or reports so for a moment, still flies.
+#: A flight is over when the vehicle has been standing this long: bounces and brief false reports don't end it.
 STANDING_NS: Final = nanoseconds(1.0)
-#: How long it is believed without being observed that a flight is this proxy's: then it may be another one.
+#: How long an unobserved flight counts as this proxy's; after that, it may be another one.
 BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: older feedback shows nothing
-AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle first seen above it that reports no state is taken to be flying [m]
-STALL_ALTITUDE: Final = 0.5  #: below it a descent that makes no headway has met the ground [m]
+AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle first seen above it that reports no state counts as flying [m]
+STALL_ALTITUDE: Final = 0.5  #: below it, a descent that makes no headway has reached the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: [m]
-BLIND_NS: Final = 15 * NS_PER_S  #: of a landing that nothing shows, nobody can say by then what became of it
+BLIND_NS: Final = 15 * NS_PER_S  #: a landing without any sensor evidence has an unknown result after this time
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
@@ -47,65 +47,65 @@ _FLYING: Final = (Takeoff, Hover, Attitude, Velocity, Position)
 
 
 class Whose(Enum):
-    """Who began the flight, or steers since."""
+    """Who started the flight, or has taken it over."""
 
-    NOBODYS = auto()  #: the vehicle does not fly, as far as is known
-    OURS = auto()  #: an application of this proxy does, or this proxy ends what one began
-    OTHERS = auto()  #: somebody else does: a remote control, a ground station, another program
+    NOBODYS = auto()  #: as far as is known, the vehicle is not flying
+    OURS = auto()  #: an application of this proxy, or the proxy ending an application's flight
+    OTHERS = auto()  #: a remote control, a ground station, another program
 
 
 class Changed(NamedTuple):
-    """The flight is somebody else's now. ``why``: to be published, empty where it is already."""
+    """The flight has changed hands. ``why``: text to publish, empty if already published."""
 
     whose: Whose
     why: str = ""
 
 
 class Snapshot(NamedTuple):
-    """What is known of the vehicle where something is decided: read once, and passed on."""
+    """The vehicle's known state for one decision: read once, and passed on."""
 
     now_ns: int
     state: FlightState
-    feedback: Feedback | None  #: the newest sample; None: none came yet
+    feedback: Feedback | None  #: the newest sample; None: none yet
     link: LinkState
     link_up: bool
 
 
 class Flight:
-    """What is known of one vehicle's flight.
+    """The known state of one vehicle's flight.
 
-    :meth:`state` and :meth:`flies` take no lock and change nothing: any thread may ask. All else is called under the
-    command handler's lock.
+    :meth:`state` and :meth:`flies` acquire no lock and change nothing, so any thread may call them. Everything else is
+    called under the command handler's lock.
 
     Args:
-        native: The actions that the vehicle itself takes. One that is steered from here and takes neither take-off nor
-            landing has no notion of a flight: what it is told to do, and what it shows, is its flight state.
-        shared: Whether somebody else may fly it besides; else a flight is never others'.
+        native: The actions that the vehicle itself supports. A software-steered vehicle without native take-off and
+            landing has no concept of a flight: its flight state follows from its commands and observations.
+        shared: Whether others may also fly the vehicle; otherwise a flight is never others'.
     """
 
     def __init__(self, native: frozenset[str] = frozenset(), *, shared: bool = True) -> None:
         self._shared = shared
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
-        self.left_to = ""  #: what others made of it, in the driver's word
-        self._believed_until_ns: int | None = None  # what is found in the air until then was begun by an earlier run
-        self._claimed_until_ns: int | None = None  # a take-off was asked for, and shows until then
-        self._grounded_ns: int | None = None  # since when it stands
-        self._steered = False  # in software, at what :attr:`_state` says
-        self._state = FlightState.LANDED  # of a vehicle without a notion, or of what is steered
-        self._begun_ns = 0  # when what is steered began
-        self._was_up = False  # the vehicle reported to be in the air since it is steered
-        self._landed_ns: int | None = None  # since when it reports to stand meanwhile
-        self._seen = False  # an altitude was
+        self.left_to = ""  #: what others made it do, in the driver's word
+        self._believed_until_ns: int | None = None  # a vehicle found in the air until then is on an old run's flight
+        self._claimed_until_ns: int | None = None  # deadline for a requested take-off to show
+        self._grounded_ns: int | None = None  # since when it has been standing
+        self._steered = False  # in software, with the task of :attr:`_state`
+        self._state = FlightState.LANDED  # of a vehicle without a concept of flight, or of the steered task
+        self._begun_ns = 0  # when the steered task began
+        self._was_up = False  # the vehicle has reported to be in the air while steered
+        self._landed_ns: int | None = None  # since when it has reported to stand while steered
+        self._seen = False  # an altitude has been seen
         self._lowest, self._lowest_ns = math.inf, 0
-        self._blind_ns: int | None = None  # since when a landing goes by nothing
-        self._sent_up = False  # the newest action is one of the air
+        self._blind_ns: int | None = None  # since when a landing has had no sensor evidence
+        self._sent_up = False  # the newest action is one for the air
         self._seen_up = False  # it was seen in the air, and not on the ground since
 
     # Does it fly? ------------------------------------------------------------------------------------------------
 
     def state(self, reported: FlightState) -> FlightState:
-        """Return the flight state, given the one that the driver reported. Any thread."""
+        """Return the flight state, given the driver's. Thread-safe."""
         state = self._state
         if reported is FlightState.EMERGENCY:
             return reported
@@ -120,26 +120,26 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether it flies, or may, in a state of :meth:`state`. Any thread.
+        """Return whether it flies, or may fly, in a state of :meth:`state`. Thread-safe.
 
-        A vehicle of which nothing is known flies if it was seen to, or from the first command to do so.
+        A vehicle in an unknown state flies if it was seen flying, or from the first command to fly on.
         """
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
-        """Return whether a take-off was asked for that does not show yet: what stands may be about to fly."""
+        """Return whether a requested take-off does not show yet, so that a standing vehicle may be about to fly."""
         return self._claimed_until_ns is not None and now_ns < self._claimed_until_ns
 
     # Whose is it? ------------------------------------------------------------------------------------------------
 
     @property
     def ours(self) -> bool:
-        """Whether the proxy may hold, land or stop the vehicle by itself."""
+        """Whether the proxy may hold, land or stop the vehicle on its initiative."""
         return self.whose is Whose.OURS
 
     @property
     def others(self) -> str:
-        """Why the vehicle is left alone, for a person; empty where it is not somebody else's."""
+        """Why the vehicle is left alone, for people; empty if it is not flown by others."""
         if self.whose is not Whose.OTHERS:
             return ""
         if self.left_to:
@@ -148,36 +148,36 @@ class Flight:
 
     @property
     def awaited(self) -> bool:
-        """Whether a flight that an earlier run began is still looked for."""
+        """Whether a flight of an earlier run may still turn up."""
         return self._believed_until_ns is not None
 
     def began_before(self, until_ns: int) -> None:
-        """Take a vehicle that is found in the air until then to be on a flight that an earlier run began."""
+        """Count a vehicle found in the air until then as on a flight of an earlier run."""
         self._believed_until_ns = until_ns
 
     def claim(self, now_ns: int) -> None:
-        """Note that a take-off is asked for: the flight that comes of it is ours."""
+        """Note a requested take-off: the resulting flight is ours."""
         self._claimed_until_ns = now_ns + CLAIM_NS
         if self.whose is Whose.NOBODYS:
             self.whose = Whose.OURS
 
     def call_off(self, now_ns: int) -> None:
-        """Note that a take-off which does not show yet is called off."""
+        """Note that a take-off that does not show yet is cancelled."""
         if self._claimed_until_ns is not None:
             self._claimed_until_ns = min(self._claimed_until_ns, now_ns + CALLED_OFF_NS)
 
     def take(self) -> None:
-        """Note that an application's new intent was carried out: whatever flies is ours from here on."""
+        """Note that an application's new intent was executed: from here on, the flight is ours."""
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Note that what is found in the air from now on may be another flight; return whether it may."""
+        """Note that a vehicle found in the air from now on may be on another flight; return whether it may."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared
 
     def slept(self, ns: int) -> None:
-        """Note that the computer slept for so long, which its clock does not count: it may be another flight by now."""
+        """Note that the computer slept, which its clock does not count: it may be another flight by now."""
         if self._believed_until_ns is not None:
             self._believed_until_ns -= ns
         if self._claimed_until_ns is not None:
@@ -190,8 +190,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        ``left_to``: what others chose since we steered last, as the driver observes it. ``feedback``: the newest
-        sample, where the link is up and it is young; None: nothing is shown now.
+        ``left_to``: what others made the vehicle do since we last steered, as the driver observes it. ``feedback``: the
+        newest sample, if the link is up and the sample is fresh; None: no current data.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._look(reported, left_to, feedback.altitude_m)
@@ -216,13 +216,13 @@ class Flight:
         return None if self.whose is before else Changed(self.whose, self._words(before))
 
     def _look(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
-        """What a vehicle without a notion shows while nothing is steered."""
+        """Observe a vehicle without a concept of flight while nothing is steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
-            if not left_to and self._state is not FlightState.EMERGENCY:  # else a pilot flies it, past its driver
+            if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot flies it past its driver
                 self._state = FlightState.LANDED
         elif reported is FlightState.UNKNOWN and begins_high and self._state is FlightState.LANDED:
-            self._state = FlightState.FLYING  # the proxy may have been restarted under it
+            self._state = FlightState.FLYING  # the proxy may have restarted during the flight
         self._seen = self._seen or altitude is not None
 
     def _stands(self, now_ns: int) -> None:
@@ -237,28 +237,28 @@ class Flight:
 
     def _words(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver reported who took it, or the flight is over, or it can't be anybody else's
+            return ""  # the driver reported who took it, or the flight is over, or it can only be ours
         if self.whose is Whose.OURS:
-            return "the vehicle is on a flight that this proxy began before it was restarted"
+            return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
 
-    # What it is told to do ---------------------------------------------------------------------------------------
+    # Commands ------------------------------------------------------------------------------------------------------
 
     def sent(self, action: Action) -> None:
-        """Note what was applied."""
+        """Note the applied action."""
         self._sent_up = isinstance(action, _FLYING)
         if isinstance(action, EmergencyStop):
             self._seen_up = False
 
     def steer(self, state: FlightState, now_ns: int) -> None:
-        """Note that the software autopilot begins with what is this state."""
+        """Note that the software autopilot starts the task with this state."""
         if not self._steered:
             self._was_up, self._landed_ns = False, None
         self._steered, self._state, self._begun_ns = True, state, now_ns
         self._start_descent(now_ns)
 
     def let_go(self, action_name: str) -> None:
-        """Note that the vehicle itself does something now."""
+        """Note that the vehicle itself executes an action now."""
         self._steered = False
         if action_name == "emergency_stop":
             self._state = FlightState.EMERGENCY
@@ -268,22 +268,22 @@ class Flight:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
     def refused(self, reported: FlightState) -> bool:
-        """Note that the vehicle refused what it was sent; return whether that ends a take-off from where it stands."""
+        """Note a refusal by the vehicle; return whether that ends a take-off from the ground."""
         if not (self._steered and self._state is FlightState.TAKING_OFF and reported is FlightState.LANDED):
             return False
         self._steered, self._state = False, FlightState.LANDED
         return True
 
     def lifted(self, reported: FlightState) -> bool:
-        """Return whether it has left the ground in a take-off, or does not report that."""
+        """Return whether it has left the ground in a take-off, or does not report it."""
         return not self._has_no_notion or self._was_up or reported is not FlightState.LANDED
 
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
-        """Return whether what is steered has come to its end on the ground; it is steered no longer then.
+        """Return whether the steered task has ended on the ground; then it is no longer steered.
 
-        What the vehicle reports counts where it reports anything. Else a descent has met the ground where the
-        altimeter, near it, shows no headway. A landing without either goes on for :data:`BLIND_NS`, and nothing is
-        known then. ``feedback``: as in :meth:`observe`.
+        The vehicle's report counts, if it reports its state. Otherwise a descent has reached the ground when the
+        altimeter, near the ground, shows no headway. A landing without either continues for :data:`BLIND_NS`, with an
+        unknown result. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:
@@ -291,7 +291,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # It may be about to rise: what it reported before it was told to do this proves nothing.
+            # It may be about to rise: reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

@@ -1,4 +1,4 @@
-"""What the parameters ask of the flight: limits, which set-points are shortened to, and other settings. Pure."""
+"""Settings of the flight from the parameters: limits for set-points, and others. Pure."""
 
 from __future__ import annotations
 
@@ -11,37 +11,38 @@ from skyloop.clock import nanoseconds
 from skyloop.messages import AnyAction, Attitude, Velocity
 from skyloop.zones import Space, space_of
 
-#: Climb allowed per metre that is left below ``limits.altitude`` [1/s]: the vehicle slows down before it is there, and
-#: sinks at this rate per metre that it is above.
+#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches.
+#: Above the limit, it sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
-#: So little above ``limits.altitude`` is the altimeter's noise [m].
+#: Altitudes this little above ``limits.altitude`` count as the altimeter's noise [m].
 SLACK_M: Final = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Clamp:
-    """A limit that was in the way of a set-point. For tilt and speed the two numbers are lengths of the vector."""
+    """A limit that shortened a set-point. For tilt and speed, the two numbers are lengths of the vector."""
 
     limit: str  #: name of the parameter
     asked: float
     applied: float
-    zone: str = ""  #: name of the no-fly zone, if it has one
+    zone: str = ""  #: name of the no-fly zone, if any
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits in force."""
+    """The effective limits."""
 
-    tilt: float = 0.35  #: greatest tilt from the vertical by roll and pitch together [rad]
-    climb: float = 1.0  #: greatest speed up or down [m/s]
+    tilt: float = 0.35  #: maximum tilt from the vertical by roll and pitch together [rad]
+    climb: float = 1.0  #: maximum speed up or down [m/s]
     yaw_rate: float = 1.75  #: [rad/s]
-    speed: float = 2.0  #: greatest horizontal speed [m/s]
-    altitude: float = 5.0  #: highest height above ground [m]
+    speed: float = 2.0  #: maximum horizontal speed [m/s]
+    altitude: float = 5.0  #: maximum height above ground [m]
 
     def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Return the nearest set-point within the limits, and what was in the way of it.
+        """Return the nearest set-point within the limits, and the limits that applied.
 
-        Tilt and horizontal speed are shortened with their direction kept. ``altitude`` [m] of the vehicle, if known.
+        Tilt and horizontal speed are shortened without changing their direction. ``altitude`` of the vehicle [m], if
+        known.
         """
         if type(action) is Velocity:
             x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
@@ -49,7 +50,7 @@ class Limits:
             assert isinstance(action, Attitude)
             x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
         highest = self.climb
-        if altitude is not None:  # above the limit it is negative: the vehicle comes down
+        if altitude is not None:  # above the limit it is negative: the vehicle descends
             room = self.altitude - altitude
             highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
         if (
@@ -75,17 +76,17 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class AirspaceSettings:
-    """What the parameters say about where it may fly, and how fast."""
+    """Parameters about where the vehicle may fly, and how fast."""
 
     limits: Limits = field(default_factory=Limits)
     space: Space = field(default_factory=Space)
-    deceleration: float = 1.0  #: at which the vehicle can be relied on to stop [m/s²]
-    reaction_s: float = 0.3  #: until it begins to
+    deceleration: float = 1.0  #: that the vehicle can reliably achieve [m/s²]
+    reaction_s: float = 0.3  #: delay before it starts to brake
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeSettings:
-    """When each step is taken. Times in s, battery as charge from 0 to 1."""
+    """The failsafe's thresholds. Times in s, battery as charge from 0 to 1."""
 
     hover_after_s: float = 0.5
     land_after_s: float = 5.0
@@ -93,12 +94,12 @@ class FailsafeSettings:
     battery_warn: float = 0.2
     battery_land: float = 0.1  #: 0: never
     battery_return: float = 0.0  #: 0: never
-    returns: bool = False  #: where nobody is in command, it lands at the start
+    returns: bool = False  #: without a pilot, it lands at the start
 
 
 @dataclass(frozen=True, slots=True)
 class AutopilotSettings:
-    """Tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
+    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
 
     takeoff_altitude: float = 1.0
     climb: float = 0.5
@@ -110,30 +111,30 @@ class AutopilotSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReturnSettings:
-    """How a vehicle returns."""
+    """Settings of a return."""
 
-    height: float = 2.0  #: above the start, at least, on the way [m]
-    speed: float = 1.0  #: greatest on the way [m/s]
-    land: bool = True  #: at the end, or hover there
+    height: float = 2.0  #: minimum above the start on the way [m]
+    speed: float = 1.0  #: maximum on the way [m/s]
+    land: bool = True  #: land at the end, or hover there
 
 
 @dataclass(frozen=True, slots=True)
 class FlightSettings:
-    """What the parameters ask of the flight."""
+    """All settings of the flight."""
 
     airspace: AirspaceSettings = field(default_factory=AirspaceSettings)
     failsafe: FailsafeSettings = field(default_factory=FailsafeSettings)
     autopilot: AutopilotSettings = field(default_factory=AutopilotSettings)
     returns: ReturnSettings = field(default_factory=ReturnSettings)
-    max_age_ns: int = 0  #: of a command
+    max_age_ns: int = 0  #: maximum age of a command
     authority_timeout_ns: int = 0
     authority_ask_ns: int = 0
 
     def updated(self, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
-        """Return the settings with new values; parts that no changed parameter concerns stay the same object.
+        """Return the settings with new values; parts without changed parameters stay the same object.
 
-        ``value``: the values in force by name; ``changed``: how the names of those that changed begin, as ``limits``.
-        Raises :class:`ParameterError` where the no-fly zones can't be read.
+        ``value``: the effective values by name; ``changed``: prefixes of the changed names, such as ``limits``. Raises
+        :class:`ParameterError` if the no-fly zones can't be parsed.
         """
         new: dict[str, Any] = {}
         limits, space = self.airspace.limits, self.airspace.space

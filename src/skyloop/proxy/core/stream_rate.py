@@ -1,13 +1,13 @@
-"""How much of an encoded stream a path carries: judged by what a subscriber acknowledges, the time passed as argument.
+"""How much of an encoded stream a path carries, judged by a subscriber's acknowledgements. Pure: time is an argument.
 
-Delay comes first. What a picture's round trip takes above the shortest of late is taken for waiting in the path. A
-queue that stands brings the rate below what is delivered (as in Cardwell et al., "BBR: Congestion-Based Congestion
-Control", ACM Queue 14(5), 2016). A mobile network carries ten times as much in one tenth of a second as in the next,
-so near the average pictures are often late: each time the rate falls, too, and it grows so slowly that few are.
-No picture is begun while more is under way than the path delivers in :data:`MOST_WAIT_S`, so that one that stalls holds
-a few pictures and not seconds of them, and nothing has to be thrown away after it was encoded. While it stands still a
-picture is sent now and then, ever more seldom, as all that waits delays the first that is young; that one is sent as
-soon as anything is heard.
+Delay comes first. The part of a picture's round trip above the shortest recent one counts as waiting in the path. A
+standing queue reduces the rate below the delivery rate (as in Cardwell et al., "BBR: Congestion-Based Congestion
+Control", ACM Queue 14(5), 2016). A mobile network may carry ten times as much in one tenth of a second as in the next,
+so near its average rate pictures are often late. Each late picture also reduces the rate, which then grows so slowly
+that few are late. No picture is started while more is in flight than the path delivers in :data:`MOST_WAIT_S`, so that
+a stalled path holds a few pictures rather than seconds of them, and no encoded picture has to be dropped. While the
+path stalls, a picture is sent now and then, at growing intervals, because everything queued delays the first fresh
+picture. That one is sent as soon as an acknowledgement arrives.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 
 LEAST_KBIT_S: Final = 60
-#: The rate at first, and that below which single pictures that waited don't bring it: less helps them little, as most
-#: of such a wait is the path's own silence.
+#: The initial rate. Single late pictures do not reduce the rate below it: that would help little, because most of such
+#: a wait is the path's own silence.
 START_KBIT_S: Final = 300
-STANDING_S: Final = 0.25  #: the shortest wait within so long is that of a queue that stays …
-LONG_WAIT_S: Final = 0.06  #: … and the rate falls where it is longer …
-FALL: Final = 0.85  #: … to so much of what is delivered …
-GOOD_WAIT_S: Final = 0.03  #: … and grows where it is shorter
-LATE_S: Final = 0.1  #: a single picture that waited so long is late …
-LATE_FALL: Final = 0.7  #: … and the rate falls to so much of what it was …
-LATE_EVERY_S: Final = 0.15  #: … once for all that were held up together
-GROWTH_1_S: Final = 0.1  #: of the rate, each second …
-SEARCH_1_S: Final = 2.0  #: … and below the first rate, or as long as nothing was late
-MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
-SILENT_S: Final = 0.3  #: a path of which nothing was heard for so long stands still, through no fault of the rate …
-SILENT_FALL: Final = 0.5  #: … which is no longer known for what it may carry after it
-PROBE_S: Final = 0.15  #: while pictures wait there is one as often, if no more is under way than the rate gives in …
-PROBES_S: Final = 0.1  #: … this time; while nothing is heard …
-SELDOM: Final = 1 / 3  #: … after this share of the time in which nothing was …
+STANDING_S: Final = 0.25  #: the shortest wait within this time is that of a standing queue …
+LONG_WAIT_S: Final = 0.06  #: … and the rate falls if that is longer …
+FALL: Final = 0.85  #: … to this share of the delivery rate …
+GOOD_WAIT_S: Final = 0.03  #: … and grows if it is shorter
+LATE_S: Final = 0.1  #: a single picture that waited this long is late …
+LATE_FALL: Final = 0.7  #: … and the rate falls to this share …
+LATE_EVERY_S: Final = 0.15  #: … once for all pictures delayed together
+GROWTH_1_S: Final = 0.1  #: growth of the rate per second …
+SEARCH_1_S: Final = 2.0  #: … and below the initial rate, or while nothing has been late
+MOST_WAIT_S: Final = 0.08  #: this much may be in flight beyond the shortest round trip
+SILENT_S: Final = 0.3  #: a path silent for this long has stalled, through no fault of the rate …
+SILENT_FALL: Final = 0.5  #: … but its rate after the stall is uncertain
+PROBE_S: Final = 0.15  #: while pictures wait, one is sent this often, if no more is in flight than the rate allows in …
+PROBES_S: Final = 0.1  #: … this time; during silence …
+SELDOM: Final = 1 / 3  #: … after this share of the silence so far …
 SELDOM_S: Final = 0.5  #: … or this, if it is less
-LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
+LOST_S: Final = 1.0  #: pictures not acknowledged within this time count as lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
-_FEWEST: Final = 3  # pictures by which a queue is judged
+_FEWEST: Final = 3  # number of pictures needed to judge a queue
 
 
 @dataclass(slots=True)
@@ -51,29 +51,29 @@ class _Sent:
 
 
 class StreamRate:
-    """The rate of one stream to one subscriber, ``most_kbit_s`` at most. Not thread-safe."""
+    """The rate of one stream to one subscriber, at most ``most_kbit_s``. Not thread-safe."""
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
-        self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the present rate
-        self.wait_s = 0.0  #: how long pictures wait in the path at present, at the least [s]
+        self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the current rate
+        self.wait_s = 0.0  #: minimum time that pictures currently wait in the path [s]
         self.lost = 0  #: pictures that were never acknowledged
         self._most_kbit_s = most_kbit_s
-        self._searches = True  # nothing was late yet
-        self._silent = False  # the path stands still
-        self._quiet_ns = 0  # since when something is under way and nothing was heard; 0: nothing is
-        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when it was after the path stood still
-        self._owed = False  # a picture is to be sent at once
+        self._searches = True  # nothing has been late yet
+        self._silent = False  # the path has stalled
+        self._quiet_ns = 0  # since when pictures have been in flight without any acknowledgement; 0: none are
+        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when the path resumed after a stall
+        self._owed = False  # a picture must be sent at once
         self._under_way: deque[_Sent] = deque()
-        self._bytes = 0  # of these
-        self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest of them was
+        self._bytes = 0  # in flight
+        self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest picture was sent
         self._delivered = 0
-        self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] and when, each longer than those before it
-        self._waits: deque[tuple[float, int, int]] = deque()  # [s], when, and what was delivered until then
+        self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] with times, each longer than the last
+        self._waits: deque[tuple[float, int, int]] = deque()  # [s], time, and amount delivered until then
         self._changed_ns = now_ns
         self._late_ns = now_ns - nanoseconds(LATE_EVERY_S)
 
     def may_send(self, now_ns: int) -> bool:
-        """Return whether another picture may be begun now."""
+        """Return whether another picture may be started now."""
         under_way = self._under_way
         while under_way and now_ns - under_way[0].sent_ns > nanoseconds(LOST_S):
             self._bytes -= under_way.popleft().size
@@ -94,11 +94,11 @@ class StreamRate:
         return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
 
     def _holds(self, time_s: float) -> bool:
-        """Return whether no more is under way than the rate gives in so long [s]."""
+        """Return whether no more is in flight than the rate delivers in this time [s]."""
         return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
-        """Note that a picture was handed to the transport; ``seq`` is higher than those before."""
+        """Note that a picture was handed to the transport; ``seq`` is higher than all before."""
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
         self._quiet_ns = self._quiet_ns or now_ns
@@ -107,7 +107,7 @@ class StreamRate:
 
     def acknowledged(self, seq: int, now_ns: int) -> None:
         """Note that the subscriber has a picture."""
-        if self._quiet_ns and now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # more of what was sent comes now
+        if self._quiet_ns and now_ns - self._quiet_ns >= nanoseconds(SILENT_S):  # more acknowledgements will follow
             self._returned_ns, self._owed = now_ns, True
         newest = None
         while self._under_way and self._under_way[0].seq <= seq:
@@ -139,7 +139,7 @@ class StreamRate:
             _, since_ns, before = waits[0]
             delivered_kbit_s = (self._delivered - before) * 8e-3 / max(seconds(now_ns - since_ns), 0.001)
             self._fall(FALL * delivered_kbit_s)
-            waits.clear()  # and look again
+            waits.clear()  # and measure again
         elif wait_s > LATE_S:
             if now_ns - self._late_ns >= nanoseconds(LATE_EVERY_S):
                 self._late_ns = now_ns
@@ -149,7 +149,7 @@ class StreamRate:
             self.kbit_s = min(self.kbit_s * (1.0 + growth_1_s * step_s), self._most_kbit_s)
 
     def forget(self) -> None:
-        """Forget what is under way: it will not be acknowledged."""
+        """Forget the pictures in flight: they will not be acknowledged."""
         self._under_way.clear()
         self._waits.clear()
         self._bytes = self._quiet_ns = 0
@@ -161,7 +161,7 @@ class StreamRate:
             self._fall(SILENT_FALL * self.kbit_s)
 
     def _fall(self, kbit_s: float) -> None:
-        """Send less from now on, where it is less."""
+        """Reduce the rate, never below the minimum."""
         self._searches = False
         self.kbit_s = min(self.kbit_s, max(kbit_s, LEAST_KBIT_S))
 
@@ -176,14 +176,14 @@ class StreamRate:
         return self._shortest[0][0] if self._shortest else nanoseconds(0.1)
 
 
-#: What a picture is made smaller by, and the share of the pictures that is sent, from the best on: below the rate at
-#: which these make good pictures, the next are taken.
+#: Factors of the picture's size, and shares of the pictures that are sent, best first. If the rate is too low for good
+#: pictures in one form, the next is used.
 _LADDER: Final = ((1.0, 1.0), (0.75, 1.0), (0.5, 1.0), (0.5, 0.5), (0.25, 0.5))
-ENOUGH_BITS: Final = 0.05  #: of the rate, for a pixel that is sent: with less, blocks show
+ENOUGH_BITS: Final = 0.05  #: bits per sent pixel below which blocks show
 
 
 def picture_form(kbit_s: float, pixels_1_s: float) -> tuple[float, float]:
-    """Choose for a rate the factor of width and height, and the share of the pictures that is sent."""
+    """Return the factor of width and height, and the share of pictures to send, for a rate."""
     for scale, share in _LADDER:
         if kbit_s * 1000.0 >= ENOUGH_BITS * pixels_1_s * scale**2 * share:
             return scale, share
