@@ -211,7 +211,7 @@ def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedb
 @pytest.mark.parametrize(
     ("start", "space", "feedback", "reason", "words"),
     [
-        (None, ANYWHERE, at(5, 0, 1), Refusal.WRONG_STATE, "where it took off is not known"),
+        (None, ANYWHERE, at(5, 0, 1), Refusal.WRONG_STATE, "the start is unknown"),
         (HOME, ANYWHERE, None, Refusal.WRONG_STATE, "does not report its position"),
         (None, ANYWHERE, at(5, 0, 1, position_m=None), Refusal.WRONG_STATE, "does not report its position"),
         (HOME, ANYWHERE, at(5, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not report its yaw"),
