@@ -110,6 +110,7 @@ class CommandSender:
         self._granted = granted
         self._lock = threading.Lock()  # guards all below; never held while waiting or in a callback
         self._seq = 0
+        self._connected_ns = 0  # since when there is this connection
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
@@ -370,7 +371,7 @@ class CommandSender:
         self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
-            self._seq = 0
+            self._seq, self._connected_ns = 0, self._clock()
 
     def disconnected(self) -> None:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
@@ -480,7 +481,7 @@ class CommandSender:
         with self._lock:
             if status.state == "held":
                 if (before.state, before.lease) != ("held", status.lease):
-                    self._schedule.resume(now_ns)
+                    self._schedule.resume(now_ns, self._connected_ns)
             elif before.state == "held":
                 self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
