@@ -60,6 +60,7 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 #: time after which a silent one loses the authority.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
+_HOVER: Final = Hover()
 #: What an application asked for and no hover of the library's own may end.
 LANDING: Final = (Land, EmergencyStop)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
@@ -188,8 +189,11 @@ class CommandSender:
                 return
             absent = known_ns < self._clock()
             self._present_until_ns = until_ns
-            if absent:
-                self._schedule.clear(Fate.WITHDRAWN)  # set-points from before the absence are not repeated
+            if absent:  # set-points from before are not repeated, nor flown on by beside the signs of life that follow
+                moves = type(self._schedule.action) in (Velocity, Attitude)
+                self._schedule.clear(Fate.WITHDRAWN)
+                if moves:
+                    self._schedule.ask(_HOVER, self._clock(), automatic=True)
         if absent:
             self._connection.poke()
 
