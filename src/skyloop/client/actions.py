@@ -386,11 +386,8 @@ class CommandSchedule:
             self.action = _IDLE
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
-        """Start to send (again), on a connection of ``connected_ns``: drop a set-point that is too old.
-
-        What was asked for on that connection waited for the lease only: its caller saw who had the vehicle.
-        """
-        if now_ns - self._asked_ns > self._keep_ns:
+        """Start to send (again), on a connection of ``connected_ns``: drop a set-point that is too old."""
+        if now_ns - self._asked_ns > self._keep_ns:  # since the connection only the lease was awaited
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

@@ -60,7 +60,6 @@ ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for th
 #: time after which a silent one loses the authority.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
-_HOVER: Final = Hover()
 #: What an application asked for and no hover of the library's own may end.
 LANDING: Final = (Land, EmergencyStop)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
@@ -193,7 +192,7 @@ class CommandSender:
                 moves = type(self._schedule.action) in (Velocity, Attitude)
                 self._schedule.clear(Fate.WITHDRAWN)
                 if moves:
-                    self._schedule.ask(_HOVER, self._clock(), automatic=True)
+                    self._schedule.ask(Hover(), self._clock(), automatic=True)
         if absent:
             self._connection.poke()
 
@@ -470,7 +469,7 @@ class CommandSender:
                 changed = self._authority.queued(answer.position, answer.holder, answer.wait_s)
             elif isinstance(answer, Refused):
                 self._refusal = answer
-                changed = self._authority.refused()
+                changed = self._authority.given_back()
             else:  # no answer: the next tick requests it again
                 self._authority.pending = False
                 changed = False
@@ -483,10 +482,9 @@ class CommandSender:
         """Handle a changed status: clear the set-point with a lost authority, start sending with a new one."""
         status = self.status
         with self._lock:
-            if status.state == "held":
-                if (before.state, before.lease) != ("held", status.lease):
-                    self._schedule.resume(now_ns, self._connected_ns)
-            elif before.state == "held":
+            if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
+                self._schedule.resume(now_ns, self._connected_ns)
+            elif before.state == "held" and status.state != "held":
                 self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)

@@ -38,7 +38,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.command import SET_POINTS
 from skyloop.messages.fields import LATEST_NS
-from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain, in_time
+from skyloop.proxy.core.command_checks import TAKEOFF_NS, Intent, explain
 from skyloop.proxy.core.failsafe import REASONS
 from skyloop.proxy.core.flight import Snapshot, Whose
 from skyloop.proxy.core.settings import FlightSettings
@@ -296,7 +296,7 @@ class CommandHandler(FlightSupervisor):
         self._tell(session)
         applied_ns = self._count_applied(command)
         ladder = self.ladder
-        if not (ladder.idle or checks.goes_on(kind, automatic=automatic, link_up=seen.link_up)):
+        if not (ladder.idle or checks.goes_on(kind, seen, automatic=automatic)):
             self._events.publish_drafts(*self._apply_failsafe(ladder.fresh_command(), now_ns))
         return applied, applied_ns
 
@@ -321,8 +321,9 @@ class CommandHandler(FlightSupervisor):
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
-        shows_life = command.seq > session.intents.seq and in_time(command, now_ns, self.checks.max_age_ns)
-        session.intents.stop(command)
+        intents, holds = session.intents, self.holds(session, command.lease)
+        refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
+        intents.stop(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns
         if EmergencyStop not in self._executor.native:
@@ -333,7 +334,7 @@ class CommandHandler(FlightSupervisor):
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
-        if shows_life and self.holds(session, command.lease):
+        if refusal is None:
             self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
         self._rising_until_ns = None  # nothing but the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
@@ -366,10 +367,10 @@ class CommandHandler(FlightSupervisor):
         """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
         intent.refuse(reason, why)
         self._tell(session)
-        kind, link_up = type(command.action), self._publisher.link_up
+        kind, seen = type(command.action), self._executor.seen(now_ns)
         if kind is Takeoff:
             self._withdraw_takeoff(now_ns)
-        if self.ladder.lands_on and not self.checks.goes_on(kind, automatic=command.automatic, link_up=link_up):
+        if self.ladder.lands_on and not self.checks.goes_on(kind, seen, automatic=command.automatic):
             drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
             self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)

@@ -143,11 +143,6 @@ class Intent:
         return Outcome(app_id, self.number, fate, self.reason, text)
 
 
-def in_time(command: Command, now_ns: int, max_age_ns: int) -> bool:
-    """Whether it is young enough, and not from the future, which proves nothing."""
-    return -MAX_AHEAD_NS <= now_ns - command.sent_ns <= max_age_ns
-
-
 NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
@@ -173,7 +168,7 @@ class Intents:
         self.seq = command.seq
         if command.intent > self._received:
             self._received = command.intent
-        if not in_time(command, now_ns, max_age_ns):
+        if not -MAX_AHEAD_NS <= now_ns - command.sent_ns <= max_age_ns:
             return Refusal.STALE
         if command.lease != lease or not holds:
             named_one = command.lease not in (0, lease)
@@ -308,8 +303,7 @@ class CommandChecks:
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
             self.way_back = None
-        goes_on = self.goes_on(kind, automatic=automatic, link_up=seen.link_up)
-        if automatic and (goes_on or state is FlightState.LANDING):
+        if automatic and (state is FlightState.LANDING or self.goes_on(kind, seen, automatic=True)):
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
@@ -317,7 +311,8 @@ class CommandChecks:
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
-        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND and not goes_on:
+        lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
+        if lands and is_set_point and not self.goes_on(kind, seen, automatic=automatic):
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
@@ -343,18 +338,14 @@ class CommandChecks:
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
-    def goes_on(self, kind: type[Action], *, automatic: bool, link_up: bool) -> bool:
-        """Whether what the ladder makes the vehicle do goes on beside a command of the holder; else that ends it.
-
-        A landing goes on beside another one and what the library asks for by itself; the hover of a vehicle that is not
-        heard beside another hover, unless that was given up.
-        """
+    def goes_on(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
+        """Whether what the ladder does goes on beside a command of the holder that is carried out, or ends with it."""
         ladder = self._ladder
         if automatic:
             return ladder.lands_on or ladder.step is Failsafe.LAND
         if kind is Land:
             return ladder.lands_on
-        return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or link_up)
+        return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
         """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""
