@@ -19,6 +19,7 @@ from skyloop.messages import (
     EmergencyStop,
     FlightState,
     Hover,
+    Land,
     RequestAuthority,
     Role,
     Velocity,
@@ -119,6 +120,20 @@ def test_sticks_from_before_a_short_silence_do_not_fly_on_beside_its_signs_of_li
         flown.goes_on(0.05, 0.01)
     flown.pilot.present_until(flown.now_ns + 2 * S)
     assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(Hover(), True)}
+
+
+@pytest.mark.parametrize("action", [Land(), Hover()])
+def test_what_a_person_ended_the_flight_with_in_the_silence_is_repeated_when_it_is_over(action: Land | Hover) -> None:
+    """It was sent once, and dropped with the sticks: where that one packet was lost it flew on by them."""
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.pilot.command(Velocity(forward=0.5))
+    flown.goes_on(2.1)
+    assert flown.pilot.command(action)
+    assert flown.goes_on(0.2) == []
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(action, False)}
 
 
 def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:

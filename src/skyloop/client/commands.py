@@ -186,13 +186,13 @@ class CommandSender:
             known_ns = self._present_until_ns
             if known_ns is None or until_ns <= known_ns:
                 return
-            absent = known_ns < self._clock()
-            self._present_until_ns = until_ns
-            if absent:  # set-points from before are not repeated, nor flown on by beside the signs of life that follow
-                moves = type(self._schedule.action) in (Velocity, Attitude)
-                self._schedule.clear(Fate.WITHDRAWN)
-                if moves:
-                    self._schedule.ask(Hover(), self._clock(), automatic=True)
+            absent, schedule = known_ns < self._clock(), self._schedule
+            self._present_until_ns, kind = until_ns, type(schedule.action)
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # as a person asked, who may wait for it
+            if absent and not ends:  # nothing old is repeated, nor flown on by beside the signs of life that follow
+                schedule.clear(Fate.WITHDRAWN)
+                if kind in (Velocity, Attitude):
+                    schedule.ask(Hover(), self._clock(), automatic=True)
         if absent:
             self._connection.poke()
 
