@@ -165,7 +165,7 @@ def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authorit
 def test_given_back_and_refused(held: AuthorityTracker) -> None:
     assert held.given_back()
     assert (held.status.state, held.wanted) == ("none", False)
-    assert not held.refused()
+    assert not held.given_back()
 
 
 def test_a_new_connection_begins_anew(held: AuthorityTracker) -> None:

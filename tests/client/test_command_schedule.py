@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.client.actions import CommandSchedule
-from skyloop.clock import ManualClock
+from skyloop.clock import ManualClock, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import (
     AnyAction,
@@ -321,6 +321,24 @@ def test_what_was_asked_while_the_link_was_down(age_s: float, kept: bool) -> Non
     clock.advance(age_s)
     commander.resume(clock())
     assert commander.next(clock()) == (FORWARD if kept else Idle())
+
+
+@pytest.mark.parametrize("action", [Land(), FORWARD, Takeoff()])
+@pytest.mark.parametrize(("link_back_s", "fate"), [(0.0, Fate.AUTHORITY), (0.1, Fate.LINK)])
+def test_what_waited_long_for_the_lease_says_whether_the_link_was_lost_when_it_was_asked_for(
+    action: AnyAction, link_back_s: float, fate: Fate
+) -> None:
+    """It is never sent, but a caller who still waits for a landing may ask for it anew, which it is if only the lease
+    was awaited."""
+    clock = ManualClock()
+    commander = CommandSchedule()
+    connected_ns = clock() + nanoseconds(link_back_s)
+    intent = commander.ask(action, clock())
+    clock.advance(0.6)
+    commander.resume(clock(), connected_ns)
+    assert commander.next(clock()) == Idle()
+    assert commander.over is not None
+    assert (commander.over.intent, commander.over.fate) == (intent, fate)
 
 
 def test_wants_flight() -> None:

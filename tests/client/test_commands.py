@@ -15,6 +15,7 @@ import pytest
 from skyloop import extend
 from skyloop.client import Authority, AuthorityStatus, Drone, actions
 from skyloop.client.drone import open_drone
+from skyloop.clock import NS_PER_S
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     AnswerTakeover,
@@ -237,11 +238,13 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     assert again.automatic is kept, "a pilot who took it meanwhile keeps it; else who asked for it still does"
 
 
-@pytest.mark.parametrize("pressed", ["before the lease is back", "under the lease"])
+@pytest.mark.parametrize("pressed", ["before the lease is back", "long before the lease is back", "under the lease"])
 def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_callers_also_when_repeated(
-    proxy: ScriptedProxy, drone: Drone, pressed: str
+    proxy: ScriptedProxy, drone: Drone, pressed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It was asked for again as if the library had done so by itself, and refused."""
+    # When the lease is back, all that waited for it is too old to be sent as it is, or nothing is.
+    monkeypatch.setattr(drone._commands._schedule, "_keep_ns", -1 if pressed.startswith("long") else 10 * NS_PER_S)
     in_rtl = "the vehicle is in RTL, which was not chosen here"
     proxy.state = FlightState.FLYING
     drone.wait(lambda feedback: feedback.state is FlightState.FLYING, WAIT_S)

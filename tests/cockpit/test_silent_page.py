@@ -6,12 +6,25 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from skyloop.client.actions import CommandSchedule
 from skyloop.client.authority import AuthorityTracker
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import Scheduler
 from skyloop.cockpit.control_session import GONE_S
-from skyloop.messages import Command, EmergencyStop, FlightState, Hover, RequestAuthority, Role, Velocity, decode
+from skyloop.messages import (
+    Attitude,
+    Command,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Land,
+    RequestAuthority,
+    Role,
+    Velocity,
+    decode,
+)
 from tests.support.cockpit import Node, until
 from tests.support.cockpit_page import page
 from tests.support.testclient import TestClient
@@ -94,6 +107,33 @@ def test_a_page_that_is_heard_goes_on_and_nothing_from_before_its_silence_does()
     again = flown.goes_on(0.5)
     assert again
     assert all(type(command.action).__name__ == "Idle" for command in again)
+
+
+@pytest.mark.parametrize("sticks", [Velocity(forward=0.5), Attitude(pitch=0.1)])
+def test_sticks_from_before_a_short_silence_do_not_fly_on_beside_its_signs_of_life(sticks: Velocity | Attitude) -> None:
+    """It was too short for the failsafe, and ``Idle`` leaves a vehicle as it is: it flew on by them without end."""
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    for _ in range(42):  # in the last two it is not known to be there
+        flown.pilot.command(sticks)
+        flown.goes_on(0.05, 0.01)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(Hover(), True)}
+
+
+@pytest.mark.parametrize("action", [Land(), Hover()])
+def test_what_a_person_ended_the_flight_with_in_the_silence_is_repeated_when_it_is_over(action: Land | Hover) -> None:
+    """It was sent once, and dropped with the sticks: where that one packet was lost it flew on by them."""
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.pilot.command(Velocity(forward=0.5))
+    flown.goes_on(2.1)
+    assert flown.pilot.command(action)
+    assert flown.goes_on(0.2) == []
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(action, False)}
 
 
 def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:

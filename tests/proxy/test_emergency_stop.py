@@ -22,6 +22,21 @@ def test_the_repeats_of_a_stop_are_signs_of_life_of_who_flies() -> None:
         assert len(pilot.told(EventKind.FAILSAFE)) == 1, "silence is none"
 
 
+@pytest.mark.parametrize("off_s", [-0.3, 0.06, 3600.0])
+def test_a_stop_with_the_stamp_of_another_time_is_carried_out_and_is_no_sign_of_life(off_s: float) -> None:
+    """One from the future counted as one: packets with such a stamp could keep a dead pilot alive for ever."""
+    with Bench() as bench:
+        pilot = bench.airborne()
+        bench.driver.answers = False
+
+        def stop() -> None:
+            pilot.command(EmergencyStop(), sent_ns=bench.clock() + round(off_s * 1e9))
+
+        bench.run(0.7, stop)
+        assert EmergencyStop() in bench.driver.told
+        assert len(pilot.told(EventKind.FAILSAFE)) == 1
+
+
 def test_a_stop_of_another_application_keeps_no_silent_pilot_alive() -> None:
     with Bench() as bench:
         pilot, other = bench.airborne(), bench.join("other")

@@ -53,7 +53,7 @@ ORDERS: tuple[AnyAction, ...] = (
 def received(intents: Intents, number: int, action: AnyAction, state: FlightState = S.HOVERING) -> tuple[Intent, bool]:
     command = Command(intents.seq + 1, 1, number, NOW, action)
     assert intents.check(command, NOW, NS_PER_S, 1, True) is None
-    return intents.receive(command, state, NOW)
+    return intents.intent_of(command, state, NOW)
 
 
 @pytest.mark.parametrize("action", ORDERS, ids=lambda action: action.name)

@@ -295,13 +295,13 @@ def test_a_note_that_may_be_of_another_flight_is_not_believed(tmp_path: Path, wh
     if what == "damaged":
         path.write_bytes(b"\xff\x00")
     vehicle = "mavlink://udpin:0.0.0.0:1" if what == "another vehicle" else "fake://"
-    assert FlightRecord(path, "fake://", lambda: at_s + 1.0).believed() is (what != "damaged")
-    assert not FlightRecord(path, vehicle, lambda: at_s + later_s).believed()
+    assert (FlightRecord(path, "fake://", lambda: at_s + 1.0).left_s() > 0.0) is (what != "damaged")
+    assert FlightRecord(path, vehicle, lambda: at_s + later_s).left_s() == 0.0
 
 
 def test_a_note_that_can_not_be_written_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     record = FlightRecord(tmp_path / "missing" / "alpha.flight", "fake://")
-    assert not record.believed()
+    assert record.left_s() == 0.0
     record.start()
     record.set(True)
     wait_until(lambda: "can't be written" in caplog.text, "it is told")

@@ -114,6 +114,25 @@ def test_in_this_process_it_gives_everything_back(tmp_path: Path, monkeypatch: p
     assert list((tmp_path / "run").iterdir()) == []
 
 
+def test_a_process_that_fails_lands_first_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What looks after the keys raised, and the process left what flew in the air: what can't hover by itself falls."""
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+    monkeypatch.setattr("skyloop.proxy.serve.make_driver", lambda _uri: Toy(monotonic_ns))
+    apps: list[App] = []
+
+    def look() -> list[str]:
+        apps.append(flying())
+        raise RuntimeError("no folder of keys any more")
+
+    with pytest.raises(RuntimeError, match="no folder"):
+        serve("fake://", "toy", look=look)
+    told = capsys.readouterr().out.splitlines()
+    assert [line for line in told if not line.startswith("ready")] == ["told takeoff", "told land", "closed"]
+    apps[0].end.close()
+
+
 def test_a_descriptor_that_is_not_open_is_refused() -> None:
     reading, writing = os.pipe()
     os.close(reading)

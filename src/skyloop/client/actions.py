@@ -385,10 +385,10 @@ class CommandSchedule:
         if type(self.action) is not EmergencyStop:
             self.action = _IDLE
 
-    def resume(self, now_ns: int) -> None:
-        """Start to send (again): drop a set-point that is too old."""
-        if now_ns - self._asked_ns > self._keep_ns:
-            self.clear(Fate.LINK)
+    def resume(self, now_ns: int, connected_ns: int = 0) -> None:
+        """Start to send (again), on a connection of ``connected_ns``: drop a set-point that is too old."""
+        if now_ns - self._asked_ns > self._keep_ns:  # since the connection only the lease was awaited
+            self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns
 

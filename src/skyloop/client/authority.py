@@ -199,13 +199,9 @@ class AuthorityTracker:
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
 
     def given_back(self) -> bool:
-        """Note that it was released by the application, or refused for good."""
+        """Note that it was released by the application, or refused: neither granted nor queued."""
         self.wanted = self.pending = False
         return self._set(AuthorityStatus("none", priority=self.status.priority))
-
-    def refused(self) -> bool:
-        """Note that it was neither granted nor queued."""
-        return self.given_back()
 
     def event(self, event: Event, now_ns: int) -> bool:
         """Update from an event."""

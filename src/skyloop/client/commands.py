@@ -110,6 +110,7 @@ class CommandSender:
         self._granted = granted
         self._lock = threading.Lock()  # guards all below; never held while waiting or in a callback
         self._seq = 0
+        self._connected_ns = 0  # since when there is this connection
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
@@ -185,10 +186,13 @@ class CommandSender:
             known_ns = self._present_until_ns
             if known_ns is None or until_ns <= known_ns:
                 return
-            absent = known_ns < self._clock()
-            self._present_until_ns = until_ns
-            if absent:
-                self._schedule.clear(Fate.WITHDRAWN)  # set-points from before the absence are not repeated
+            absent, schedule = known_ns < self._clock(), self._schedule
+            self._present_until_ns, kind = until_ns, type(schedule.action)
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # as a person asked, who may wait for it
+            if absent and not ends:  # nothing old is repeated, nor flown on by beside the signs of life that follow
+                schedule.clear(Fate.WITHDRAWN)
+                if kind in (Velocity, Attitude):
+                    schedule.ask(Hover(), self._clock(), automatic=True)
         if absent:
             self._connection.poke()
 
@@ -370,7 +374,7 @@ class CommandSender:
         self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
-            self._seq = 0
+            self._seq, self._connected_ns = 0, self._clock()
 
     def disconnected(self) -> None:
         """Clear the set-point and the authority: nothing old is sent on the next connection."""
@@ -465,7 +469,7 @@ class CommandSender:
                 changed = self._authority.queued(answer.position, answer.holder, answer.wait_s)
             elif isinstance(answer, Refused):
                 self._refusal = answer
-                changed = self._authority.refused()
+                changed = self._authority.given_back()
             else:  # no answer: the next tick requests it again
                 self._authority.pending = False
                 changed = False
@@ -478,10 +482,9 @@ class CommandSender:
         """Handle a changed status: clear the set-point with a lost authority, start sending with a new one."""
         status = self.status
         with self._lock:
-            if status.state == "held":
-                if (before.state, before.lease) != ("held", status.lease):
-                    self._schedule.resume(now_ns)
-            elif before.state == "held":
+            if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
+                self._schedule.resume(now_ns, self._connected_ns)
+            elif before.state == "held" and status.state != "held":
                 self._schedule.clear(Fate.AUTHORITY)
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)

@@ -222,15 +222,15 @@ class ReturnSupervisor:
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
-        if self._ladder.returning and checks.back is not None:
+        if self._ladder.returning and checks.way_back is not None:
             self._fly(seen)
         if not ours:
-            checks.back = None
+            checks.way_back = None
         return self.observe()
 
     def observe(self) -> bool:
         """Observe how far the way back is; return whether feedback has something else to show."""
-        before, back = (self.start, self.phase), self._checks.back
+        before, back = (self.start, self.phase), self._checks.way_back
         self.start = self._checks.start.position
         self.phase = ReturnPhase.NONE if back is None or not self._executor.airborne else back.phase
         return (self.start, self.phase) != before

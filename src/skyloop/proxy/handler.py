@@ -239,7 +239,7 @@ class CommandHandler(FlightSupervisor):
             return self._refuse(session, command, refusal, why), now_ns
         action = command.action
         kind = type(action)
-        intent, new = intents.receive(command, state, now_ns)
+        intent, new = intents.intent_of(command, state, now_ns)
         if kind not in _LEAVE_A_TAKEOFF:
             if self._withdraw_takeoff(now_ns):
                 intent.withdrew = kind is Land
@@ -289,21 +289,14 @@ class CommandHandler(FlightSupervisor):
                 self._take_vehicle(session, applied, new)
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
-            checks.back = None
+            checks.way_back = None
         # Before feedback tells of this intent: beside it, "arrived" would be of the return before this one.
-        if fresh and self._back.observe():
+        if fresh and self._returns.observe():
             self._stamp()
         self._tell(session)
         applied_ns = self._count_applied(command)
         ladder = self.ladder
-        if command.automatic:
-            goes_on = ladder.lands_on or ladder.step is Failsafe.LAND
-        elif kind is Land:
-            goes_on = ladder.lands_on
-        else:
-            asked_anew = ladder.given_up or vehicle.link_up
-            goes_on = ladder.step is Failsafe.HOVER and kind is Hover and not asked_anew
-        if not (goes_on or ladder.idle):
+        if not (ladder.idle or checks.goes_on(kind, seen, automatic=automatic)):
             self._events.publish_drafts(*self._apply_failsafe(ladder.fresh_command(), now_ns))
         return applied, applied_ns
 
@@ -328,8 +321,9 @@ class CommandHandler(FlightSupervisor):
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
-        in_time = command.seq > session.intents.seq and now_ns - command.sent_ns <= self.checks.max_age_ns
-        session.intents.stop(command)
+        intents, holds = session.intents, self.holds(session, command.lease)
+        refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
+        intents.stop(command)
         if session.role is not Role.PILOT:
             return self._refuse_role(session, command), now_ns
         if EmergencyStop not in self._executor.native:
@@ -340,11 +334,11 @@ class CommandHandler(FlightSupervisor):
         except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
-        if in_time and self.holds(session, command.lease):
+        if refusal is None:
             self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
         self._rising_until_ns = None  # nothing but the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
-        self.checks.back = None
+        self.checks.way_back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
         return applied, self._count_applied(command)
 
@@ -373,9 +367,10 @@ class CommandHandler(FlightSupervisor):
         """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
         intent.refuse(reason, why)
         self._tell(session)
-        if type(command.action) is Takeoff:
+        kind, seen = type(command.action), self._executor.seen(now_ns)
+        if kind is Takeoff:
             self._withdraw_takeoff(now_ns)
-        if self.ladder.lands_on and type(command.action) is not Land and not command.automatic:
+        if self.ladder.lands_on and not self.checks.goes_on(kind, seen, automatic=command.automatic):
             drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
             self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)

@@ -140,7 +140,7 @@ class Proxy:
             server=server_end,
             sessions=self._sessions,
             clock=clock,
-            slept=slept or (slept_ns if clock is monotonic_ns else _never),
+            slept=slept or (slept_ns if clock is monotonic_ns else lambda: 0),
         )
         self.parameters = Parameters(lambda: described(driver), driver.set_parameter)
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
@@ -505,7 +505,3 @@ class Proxy:
     def applications(self) -> int:
         """How many applications are connected. Any thread."""
         return sum(session.role is not None for session in list(self._sessions.values()))
-
-
-def _never() -> int:
-    return 0

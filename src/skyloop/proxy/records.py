@@ -227,12 +227,11 @@ class FlightRecord:
         self._changed = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def believed(self) -> bool:
-        """Return whether an earlier run of this proxy flew this vehicle a moment ago. Call before :meth:`start`."""
-        return self.left_s() > 0.0
-
     def left_s(self) -> float:
-        """Return for how long the flight of an earlier run may still be found [s]; 0: there is none."""
+        """Return for how long the flight of an earlier run may still be found [s]; 0: there is none.
+
+        Call before :meth:`start`.
+        """
         try:
             age_s = self._wall() - self.path.stat().st_mtime
             with self.path.open(encoding="utf-8") as file:

@@ -174,6 +174,7 @@ def run(
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
                 land_within_s = max(land_within_s, ORPHAN_LANDS_WITHIN_S)
+        within_s = land_within_s  # from here on something may fly
         lines = [_announced(proxy) for proxy in proxies]
         # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
@@ -182,7 +183,6 @@ def run(
             if parent_fd is None:  # a parent gets the proxy's events, and may not read what is written here
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
-        within_s = land_within_s
 
 
 def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:

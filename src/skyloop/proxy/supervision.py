@@ -98,7 +98,7 @@ class FlightSupervisor:
             native=executor.native,
         )
         self.on_ownership: Callable[[bool], None] | None = None  #: called with whether the flight is ours, locked
-        self._back = ReturnSupervisor(self.checks, self.ladder, executor)
+        self._returns = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
         self._publisher = publisher
@@ -150,7 +150,7 @@ class FlightSupervisor:
             if session is not None:
                 self._observe_intent(session, now_ns)
             self._observe_takeoff(now_ns)
-            if self._back.update(executor.seen(now_ns), ours=self.flight.ours):
+            if self._returns.update(executor.seen(now_ns), ours=self.flight.ours):
                 self._stamp()
             steered = executor.step(now_ns)
             if steered is not None:
@@ -390,8 +390,8 @@ class FlightSupervisor:
                 "lease": authority.lease,
                 "failsafe": self.ladder.step,
                 "others": flight.others if flight.whose is Whose.OTHERS else None,
-                "start_position_m": self._back.start,
-                "return_phase": self._back.phase,
+                "start_position_m": self._returns.start,
+                "return_phase": self._returns.phase,
             }
         )
 
@@ -422,7 +422,7 @@ class FlightSupervisor:
             link_up=seen.link_up,
             battery=None if seen.feedback is None else seen.feedback.battery,
             ours=flight.whose is Whose.OURS,
-            return_problem=self._back.why_not(seen),
+            return_problem=self._returns.why_not(seen),
             shown=seen.link_up or Land not in self._executor.native,
         )
         effects = ladder.update(now_ns, inputs)
@@ -441,10 +441,10 @@ class FlightSupervisor:
             elif isinstance(effect, BatteryLow):
                 drafts.append(battery_event(effect))
             elif isinstance(effect.action, ReturnToStart):
-                self._back.begin(effect.action, now_ns)
+                self._returns.begin(effect.action, now_ns)
                 self.ladder.attempted(True)
             else:
-                self.checks.back = None
+                self.checks.way_back = None
                 taken = self._executor.failsafe(effect.action, now_ns)
                 self.ladder.attempted(taken)
                 if taken:

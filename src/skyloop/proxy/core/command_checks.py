@@ -48,7 +48,7 @@ from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may lie: the error of the clocks' offset
-TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground by then ends
+TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground by then ends, and is withdrawn
 #: A landing that withdrew a take-off is done when the vehicle stood for so long: an arming may have been on its way.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
@@ -177,7 +177,7 @@ class Intents:
             return Refusal.NON_FINITE
         return None
 
-    def receive(self, command: Command, state: FlightState, now_ns: int) -> tuple[Intent, bool]:
+    def intent_of(self, command: Command, state: FlightState, now_ns: int) -> tuple[Intent, bool]:
         """Return the intent of a command that :meth:`check` let through, and whether it is newly asked for."""
         newest, number = self.newest, command.intent
         if number == newest.number:
@@ -269,7 +269,7 @@ class CommandChecks:
         self.airspace = Airspace()
         self.returns = ReturnSettings()
         self.start = StartPoint()
-        self.back: ReturnFlight | None = None  #: the flight back to the start; None: it was not asked for
+        self.way_back: ReturnFlight | None = None  #: the flight back to the start; None: it was not asked for
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
@@ -302,8 +302,8 @@ class CommandChecks:
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
         if new and kind is ReturnToStart:
-            self.back = None
-        if automatic and (state is FlightState.LANDING or self._ladder.lands_on or self._ladder.step is Failsafe.LAND):
+            self.way_back = None
+        if automatic and (state is FlightState.LANDING or self.goes_on(kind, seen, automatic=True)):
             policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
             policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
@@ -311,7 +311,8 @@ class CommandChecks:
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
-        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND and not automatic:
+        lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
+        if lands and is_set_point and not self.goes_on(kind, seen, automatic=automatic):
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
@@ -320,12 +321,12 @@ class CommandChecks:
                 return Decision(None, Refusal.OUT_OF_RANGE, why)  # which would be too late after the take-off
             return Decision()
         if type(action) is ReturnToStart and policy is not StatePolicy.HOVER:
-            if self.back is None:
+            if self.way_back is None:
                 self.begin_return(action)
-            back = self.step_return(feedback, now_ns)
-            if back.action is None:
-                return Decision(_HOVER_ACTION, back.refusal, back.why)
-            return Decision(back.action, clamps=back.clamps, enforced=back.enforced)
+            step = self.step_return(feedback, now_ns)
+            if step.action is None:
+                return Decision(_HOVER_ACTION, step.refusal, step.why)
+            return Decision(step.action, clamps=step.clamps, enforced=step.enforced)
         action = _HOVER_ACTION if policy is StatePolicy.HOVER else action
         if self._is_judged(action, state):
             verdict = self.airspace.judge(action, feedback, now_ns, new=not intent.begun)
@@ -337,6 +338,15 @@ class CommandChecks:
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
+    def goes_on(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
+        """Whether what the ladder does goes on beside a command of the holder that is carried out, or ends with it."""
+        ladder = self._ladder
+        if automatic:
+            return ladder.lands_on or ladder.step is Failsafe.LAND
+        if kind is Land:
+            return ladder.lands_on
+        return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
+
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
         """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""
         if type(action) is Hover:
@@ -345,12 +355,12 @@ class CommandChecks:
 
     def begin_return(self, action: ReturnToStart) -> None:
         """Begin a flight back to the start, in place of another one."""
-        self.back = ReturnFlight(action, self.start.position, self.returns)
+        self.way_back = ReturnFlight(action, self.start.position, self.returns)
 
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
         """Decide what the vehicle does now on its flight back to the start."""
-        assert self.back is not None
-        return self.back.step(self.airspace, feedback, now_ns)
+        assert self.way_back is not None
+        return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
         """Return why the vehicle could not begin to return to its start now and land there; empty if it could."""
