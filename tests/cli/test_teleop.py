@@ -425,7 +425,7 @@ def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
         proxy.take_over("boss")
         drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
         for order, told in (
-            (FORWARD, "boss took over the authority; it comes back when they give it back (C takes control)"),
+            (FORWARD, "boss took over the authority; it returns when they release it (C takes control)"),
             ("grounded", "T takes off"),
             ("held", "press it twice"),
             ("release", "release"),

@@ -97,7 +97,7 @@ def test_idle_keeps_the_authority_before_the_first_command(proxy: ScriptedProxy,
         (lambda drone: drone.velocity(up=True), "up is True"),
         (lambda drone: drone.attitude(pitch=[0.1]), "pitch is "),
         (lambda drone: drone.attitude(climb=-math.inf), "climb is -inf"),
-        (lambda drone: drone.command("hover"), "a command is one of attitude, "),
+        (lambda drone: drone.command("hover"), "a command must be one of attitude, "),
         (lambda drone: drone.command(Velocity(forward=math.nan)), "NaN"),
         (lambda drone: drone.request_authority(32), "from 0"),
         (lambda drone: drone.go_to(x=math.nan, y=0.0, z=1.0), "x is nan and must be finite"),
@@ -124,7 +124,7 @@ def test_idle_keeps_the_authority_before_the_first_command(proxy: ScriptedProxy,
         (lambda drone: drone.go_to(latitude_deg=math.nan, longitude_deg=8.0), "latitude_deg is nan"),
         (lambda drone: drone.command(Position(0.0, 0.0, math.nan)), "NaN"),
         (lambda drone: drone.command(Position(0.0, 0.0, 1.0, speed=-1.0)), "position: speed is -1 m/s"),
-        (lambda drone: drone.command(Position("a", 0.0, 1.0)), "that is no number"),  # type: ignore[arg-type]
+        (lambda drone: drone.command(Position("a", 0.0, 1.0)), "that is not a number"),  # type: ignore[arg-type]
     ],
 )
 def test_unusable_arguments(drone: Drone, call: Callable[[Any], object], message: str) -> None:
@@ -443,7 +443,7 @@ def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
     at = proxy.commands[-1].seq
     assert not drone.velocity(forward=0.2)
     assert not drone.command(Takeoff())
-    with pytest.raises(AuthorityError, match="takeoff was not sent: whoever flies is not known to be there"):
+    with pytest.raises(AuthorityError, match="takeoff was not sent: the person who flies is not known to be present"):
         drone.takeoff(wait=False)
     assert extend.let_go(drone, "the page is gone"), "what ends a flight is sent all the same"
     proxy.until_commanded(Hover())
@@ -836,7 +836,7 @@ def test_a_proxy_of_an_earlier_version_is_never_sent_what_it_does_not_know(proxy
     proxy.capabilities = msgspec.structs.replace(proxy.capabilities, actions=older)
     with flown(proxy) as drone:
         for wait in (True, False):
-            with pytest.raises(UnsupportedError, match="a proxy of an earlier version must be updated"):
+            with pytest.raises(UnsupportedError, match="an older proxy must be updated"):
                 drone.go_to(x=0.0, y=0.0, z=1.0, wait=wait)
         with pytest.raises(UnsupportedError, match="position is not possible"):
             drone.command(Position(0.0, 0.0, 1.0))
@@ -1007,7 +1007,7 @@ def test_a_person_whose_link_is_lost_before_the_answer_is_told_so(proxy: Scripte
         drone._commands.present_until(time.monotonic_ns() + 60_000_000_000)
         proxy.answers[RequestAuthority] = None
         lost = background(lambda: proxy.until(lambda: asked(proxy) > 0, "the request"), proxy.hang_up)
-        with pytest.raises(NoAnswerError, match="the link was lost, or the authority given back"):
+        with pytest.raises(NoAnswerError, match="the link was lost, or the authority released"):
             drone._commands.request(RequestAuthority(), 0.0)
         lost.join(WAIT_S)
     finally:

@@ -309,7 +309,7 @@ def test_nothing_is_sent_to_any_if_one_command_is_wrong(field: Field) -> None:
             drones.send({"alpha": Velocity(0.7), "bravo": Velocity(math.nan)})
         with pytest.raises(UnknownNameError, match="delta"):
             drones.send({"alpha": Velocity(0.7), "delta": Velocity()})
-        with pytest.raises(UsageError, match="a command is one of"):
+        with pytest.raises(UsageError, match="a command must be one of"):
             drones.send({"alpha": "hover"})  # type: ignore[dict-item]
         with pytest.raises(UsageError, match="forward is 'fast'"):
             drones.velocity(forward="fast")  # type: ignore[arg-type]

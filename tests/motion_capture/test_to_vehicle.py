@@ -84,6 +84,6 @@ def test_who_may_tell_and_what() -> None:
             wait_until(lambda: any("sim:// does not accept external poses" in text for text in told), "it was told")
         with (
             skyloop.connect(drone.name, access="observe") as onlooker,
-            pytest.raises(AuthorityError, match="this application observes"),
+            pytest.raises(AuthorityError, match="this application only observes"),
         ):
             onlooker.send_external_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -182,4 +182,4 @@ def test_an_overview_is_not_for_applications_to_send(bench: Bench) -> None:
     app.end.send(OverviewRegistry().packets(0)[0])
     app.sync()
     (told,) = app.told(EventKind.PACKET_MALFORMED)
-    assert "Overview is for the proxy to send" in told.text
+    assert "Overview may only be sent by the proxy" in told.text

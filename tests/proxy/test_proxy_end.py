@@ -241,7 +241,7 @@ def test_what_fails_where_a_proxy_is_given_up_goes_to_the_log(
     monkeypatch.setattr(bench.server, "stop", broken)
     bench.proxy.end(reason="its driver hangs", hangs=True)
     assert bench.driver.closed
-    assert caplog.text.count("proxy bench was given up, and not all of it could be given back") == 2
+    assert caplog.text.count("proxy bench was abandoned, and not all of its resources could be released") == 2
     monkeypatch.undo()
     bench.server.stop()
 

@@ -82,7 +82,7 @@ def test_what_the_library_does_by_itself_takes_nothing_from_others(bench: Bench,
     bench.run(1.0, lambda: pilot.command(action, automatic=True, repeat=True))
     assert bench.driver.told == []
     assert set(pilot.refusals()) == {Refusal.WRONG_STATE}
-    assert "what the library does by itself does not take it back" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+    assert "an automatic command does not take it back" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
     assert bench.proxy.handler.flight.others
     pilot.command(action)
     assert bench.driver.told == [action], "the application's own is a decision"

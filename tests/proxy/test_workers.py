@@ -191,7 +191,7 @@ def test_before_hello_nothing_is_taken(bench: Bench) -> None:
 def test_shares_are_for_the_proxy_to_send(bench: Bench) -> None:
     app = bench.join("one")
     assert app.end.send(encode(ProcessorShare("detector", "front", 0, 1, 1)))
-    assert "ProcessorShare is for the proxy to send" in app.told(EventKind.PACKET_MALFORMED)[0].text
+    assert "ProcessorShare may only be sent by the proxy" in app.told(EventKind.PACKET_MALFORMED)[0].text
 
 
 # The roster ----------------------------------------------------------------------------------------------------

@@ -1,8 +1,8 @@
-"""What an application asks for: checks of its numbers, whether it is done, and which command is sent when. Pure.
+"""Actions of an application: checks of their numbers, completion, and the schedule of sending them. Pure.
 
-The newest set-point wins: it is sent at once and, unless a newer one comes within one and a quarter periods, repeated
-at a steady rate on absolute deadlines. Without a set-point ``Idle`` is repeated, which keeps the authority and leaves
-the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
+The newest set-point wins: it is sent at once and then repeated at a steady rate on absolute deadlines, unless a newer
+one comes within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
+leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
 """
 
 from __future__ import annotations
@@ -38,15 +38,14 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
-AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
+AT_REST_M_S: Final = 0.3  #: a vehicle slower than this at its target has arrived
 _ACTIONS: Final = frozenset(ACTION_NAMES)
-_OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
-OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be asked for again
-OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: by the application itself
+_OLD_PLACE_S: Final = 2.0  #: older feedback is not used to convert a place on the earth
+OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refused: it may be requested again
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: ended by the application itself
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
-#: Actions that are done once the vehicle is in one of these states, where the proxy does not tell; then they are no
-#: longer sent.
+#: States that complete an action, for proxies that report no outcome; after that, it is no longer sent.
 _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
     Land: frozenset({FlightState.LANDED}),
@@ -54,7 +53,7 @@ _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     ReturnToStart: frozenset({FlightState.LANDED}),
     ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
 }
-#: How long such an action is repeated at least, as the known state may be from before it was commanded.
+#: Minimum time of repeating such an action, because the known state may be from before the command.
 _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(0.3),
     Land: nanoseconds(0.3),
@@ -63,25 +62,25 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     ResetEmergency: nanoseconds(0.1),
 }
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
-    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s, and tells whether it may be asked for again
-    Land: nanoseconds(60.0),  # since the proxy told last that it is under way
-    EmergencyStop: nanoseconds(8.0),  # the driver goes on for 10 s: a late repeat must not press it again
+    Takeoff: nanoseconds(21.0),  # the proxy ends it after 20 s and reports whether it may be requested again
+    Land: nanoseconds(60.0),  # since the proxy last reported it as in progress
+    EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
     ResetEmergency: nanoseconds(2.0),
 }
-_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent for so long is not sent later
-_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: a stop is repeated so often, however seldom other commands are
+_UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that could not be sent within this time is not sent later
+_STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: period of a stop's repeats, whatever the rate of other commands
 
 
 def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded, else raise :class:`UsageError`."""
+    """Return ``action`` if it can be commanded; raise :class:`UsageError` otherwise."""
     if type(action) not in _ACTIONS:
-        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
+        raise UsageError(f"a command must be one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
     try:
         finite, problem = action.finite, action.problem
     except OverflowError:
         raise UsageError(f"{action.name} has a number that is too large") from None
     except TypeError as error:
-        raise UsageError(f"{action!r} has something that is no number: {error}") from None
+        raise UsageError(f"{action!r} has a value that is not a number: {error}") from None
     if not finite:
         raise UsageError(f"{action!r} has a number that is NaN or infinite")
     if problem:
@@ -90,10 +89,10 @@ def checked(action: AnyAction) -> AnyAction:
 
 
 def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
-    """Return the action that flies to a place: x east, y north, z up [m], yaw from x [rad], greatest speed [m/s].
+    """Return the action that flies to a target: x east, y north, z up [m], yaw from x [rad], maximum speed [m/s].
 
-    None keeps the present yaw, and is as fast as the limits allow. Raises :class:`UsageError` for what is no number,
-    not finite, or makes no sense.
+    None keeps the current yaw, and flies as fast as the limits allow. Raises :class:`UsageError` for values that are
+    not numbers, not finite, or make no sense.
     """
     place = Position(
         number("x", x),
@@ -107,12 +106,12 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start; None: as the proxy's parameters say.
+    """Return the action that flies back to the start; None: the proxy's parameters decide.
 
-    Raises :class:`UsageError` if something is no number or no bool, or makes no sense.
+    Raises :class:`UsageError` if a value is not a number or bool, or makes no sense.
     """
     if not (land is None or isinstance(land, bool)):
-        raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
+        raise UsageError(f"land is {land!r:.60} and must be True, False or None (the parameter return.land)")
     back = ReturnToStart(None if height_m is None else number("height_m", height_m), land)
     checked(back)
     return back
@@ -124,24 +123,24 @@ def in_world_axes(
     newest: Feedback | None,
     age_s: float,
 ) -> tuple[object, object, object]:
-    """Return x, y, z [m] of a place that is given in either way; the values of the other one are None.
+    """Return x, y, z [m] of a target given in either form; the values of the other form are None.
 
     Args:
         local: x, y, z in world axes [m].
-        earth: Latitude and longitude [°], altitude above mean sea level [m] or None: the present height.
+        earth: Latitude and longitude [°], altitude above mean sea level [m] or None: the current height.
         newest: The newest feedback.
         age_s: Its age [s].
 
     Raises:
-        UsageError: If both ways or neither are given, or something is no number or not on the earth.
-        RefusedError: If the vehicle's place on the earth is not known.
+        UsageError: If both forms or neither are given, or a value is not a number or not on the earth.
+        RefusedError: If the vehicle's place on the earth is unknown.
     """
     if all(one is None for one in earth):
         if any(one is None for one in local):
             raise UsageError("go_to needs x, y and z, or latitude_deg and longitude_deg with or without altitude_m")
         return local
     if any(one is not None for one in local):
-        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, not some of both")
+        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, but not both")
     latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
     if not is_on_earth(latitude_deg, longitude_deg):
         raise UsageError(
@@ -150,8 +149,8 @@ def in_world_axes(
     origin = None if newest is None else newest.origin
     if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
         raise RefusedError(
-            "position: the vehicle does not report its place on the earth (it needs a 3-D fix by satellites, and a "
-            "driver that passes it on): fly it by x, y, z",
+            "position: the vehicle does not report its place on the earth (it needs a 3-D satellite fix, and a "
+            "driver that reports it): use x, y, z",
             code=Refusal.WRONG_STATE,
         )
     z = newest.position_m[2] if earth[2] is None else number("altitude_m", earth[2]) - origin.altitude_m
@@ -160,7 +159,7 @@ def in_world_axes(
 
 
 def above_zero(name: str, value: object) -> float:
-    """Return the value of an argument as a finite float above zero, else raise :class:`UsageError`."""
+    """Return an argument as a finite float above zero; raise :class:`UsageError` otherwise."""
     found = number(name, value)
     if not found > 0.0:
         raise UsageError(f"{name} is {found:g} and must be more than 0")
@@ -168,7 +167,7 @@ def above_zero(name: str, value: object) -> float:
 
 
 def number(name: str, value: object) -> float:
-    """Return the value of an argument as a finite float, else raise :class:`UsageError`."""
+    """Return an argument as a finite float; raise :class:`UsageError` otherwise."""
     if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
         raise UsageError(f"{name} is {value!r:.60} and must be a number")
     try:
@@ -181,9 +180,9 @@ def number(name: str, value: object) -> float:
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
-    """Return whether a vehicle is in the air at a place, and nearly at rest.
+    """Return whether a vehicle is in the air at a target, and nearly at rest.
 
-    The yaw matters where the place has one; a vehicle that tells no velocity counts as at rest.
+    The yaw counts if the target has one; a vehicle that reports no velocity counts as at rest.
     """
     if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False
@@ -195,21 +194,21 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
 
 
 class ReturnWatch:
-    """Whether a return is over; called with each newest feedback."""
+    """Decides whether a return is over; called with each newest feedback."""
 
     def __init__(self) -> None:
-        """Begin before it is commanded."""
+        """Start before the command is sent."""
         self._began = False
 
     def __call__(self, feedback: Feedback) -> bool:
-        """Return whether the vehicle was on its way back, and has landed since or stays above its start."""
+        """Return whether the vehicle has been returning and has since landed, or hovers above its start."""
         phase = feedback.return_phase
         self._began |= phase is not ReturnPhase.NONE
         return self._began and (phase is ReturnPhase.ARRIVED or feedback.state is FlightState.LANDED)
 
 
 class Unsent(NamedTuple):
-    """What was asked for once, and found no room on the way to the proxy."""
+    """A one-off request that the transport had no room for."""
 
     action: AnyAction
     intent: int
@@ -218,7 +217,7 @@ class Unsent(NamedTuple):
 
 
 class CommandSchedule:
-    """Keeps the newest set-point of one application. Times are on this process's clock."""
+    """Stores the newest set-point of one application. Times are on this process's clock."""
 
     def __init__(
         self, *, rate_hz: float = 32.0, stall_s: float = 1.0, min_interval_s: float = 0.005, keep_s: float = 0.5
@@ -227,10 +226,10 @@ class CommandSchedule:
 
         Args:
             rate_hz: Rate of repeats, 1 to 200 Hz.
-            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never. A
-                place to fly to and a return do not decay: the vehicle stops there.
-            min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
-            keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+                Flights to a target and returns do not decay: the vehicle stops there.
+            min_interval_s: Minimum time between two set-points of the application [s], not counting repeats.
+            keep_s: Maximum age of a set-point from a time without a link to be sent when the link is back [s].
 
         Raises:
             UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
@@ -245,24 +244,24 @@ class CommandSchedule:
         self._keep_ns = nanoseconds(keep_s)
         self.action: AnyAction = _IDLE
         self.intent = 0  #: number of the newest intent
-        self.automatic = False  #: the newest set-point is the library's own, not the application's
-        self.over: Outcome | None = None  #: what ended it, once it is over
-        self.owed: Unsent | None = None  #: what was asked for once, and not sent
+        self.automatic = False  #: whether the newest set-point is the library's own
+        self.over: Outcome | None = None  #: what ended it, once it has ended
+        self.owed: Unsent | None = None  #: a one-off request that was not sent
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
-        # period longer, and only commands of the application delay the next one.
+        # period longer, and only the application's commands delay the next one.
         self._first_ns = self._period_ns * 5 // 4
         self._new_sent_ns = -self._min_interval_ns  # when the newest intent was first sent
         self._sent_intent = 0
         self.due_ns = 0  #: when :meth:`next` has something to send
         self._failsafe = Failsafe.NONE
-        self._reset_asked_ns: int | None = None  # while a stop was under way
+        self._reset_asked_ns: int | None = None  # during a stop
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
-        """Make ``action`` the set-point, which :meth:`may_ask` allows; return the number of this intent.
+        """Make ``action``, which :meth:`may_ask` allows, the set-point; return the number of this intent.
 
-        ``automatic``: the application did not ask for it itself.
+        ``automatic``: the library's own action, not the application's.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -282,15 +281,15 @@ class CommandSchedule:
 
     @property
     def stopping(self) -> bool:
-        """Whether an emergency stop is under way, which nothing but another may replace; see :meth:`may_ask`."""
+        """Whether an emergency stop is in progress, which only another one may replace; see :meth:`may_ask`."""
         return isinstance(self.action, EmergencyStop)
 
     def may_ask(self, action: AnyAction) -> bool:
         """Return whether the application may command this now.
 
-        An emergency stop is repeated until the vehicle shows it, or for 8 s: nothing else of this application is sent
-        meanwhile, or one lost packet would end it while sticks are held. ``Idle`` withdraws one that was never sent. A
-        reset is sent once the stop has shown, if that is soon.
+        An emergency stop is repeated until the vehicle shows it, or for 8 s. Until then, nothing else of this
+        application is sent, or a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
+        that was never sent. A reset is sent once the stop has shown, if that is soon.
         """
         if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
@@ -302,7 +301,7 @@ class CommandSchedule:
         return self._new_sent_ns + self._min_interval_ns
 
     def next(self, now_ns: int) -> AnyAction | None:
-        """Return what to send now, under the present :attr:`intent`; None if it is too early."""
+        """Return the action to send now, under the current :attr:`intent`; None if it is too early."""
         if now_ns < self.due_ns:
             return None
         kind, since_ns, is_sent = type(self.action), now_ns - self._asked_ns, self.intent == self._sent_intent
@@ -318,25 +317,25 @@ class CommandSchedule:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
             self.due_ns = now_ns + first_ns
             return self.action
-        # The next deadline follows from the last one, not from the present time, so that the rate is kept; a deadline
-        # missed by more than a period is skipped.
+        # The next deadline follows from the last one rather than from now, so that the rate is kept; a deadline missed
+        # by more than a period is skipped.
         self.due_ns += period_ns
         if self.due_ns <= now_ns:
             self.due_ns = now_ns + period_ns
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
+        """Note that the result of :meth:`next` could not be sent. Later set-points replace it, but not a landing."""
         if isinstance(action, EmergencyStop):
-            if self._new_sent_ns == now_ns:  # its first try: it may still be withdrawn, and is given up soon
+            if self._new_sent_ns == now_ns:  # its first attempt: it may still be withdrawn, and is abandoned soon
                 self._sent_intent = -1
         elif not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it.
+        """Return :attr:`owed` if it must be sent before ``action``, which neither repeats nor revokes it.
 
-        What the library asks for by itself revokes all but a landing.
+        The library's own actions revoke everything except a landing.
         """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
@@ -346,23 +345,23 @@ class CommandSchedule:
         return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
-        """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
+        """Return whether the set-point ``before`` has decayed to hover for lack of calls by the application."""
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
-        """End what is over: by what the proxy tells of this intent, or because a failsafe overruled a set-point."""
+        """End the set-point if the proxy reports its intent as ended, or a failsafe has overruled it."""
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
         if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
             if outcome.over:
                 self._end(outcome)
             elif kind is Land and feedback.state is not FlightState.UNKNOWN:
-                self._asked_ns = now_ns  # the proxy goes on with it, however long it takes
+                self._asked_ns = now_ns  # the proxy continues it, however long it takes
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
         elif (
-            (outcome is None or kind is EmergencyStop)  # a proxy of an earlier version, or anybody's to press
+            (outcome is None or kind is EmergencyStop)  # older proxies report no outcome; anyone may stop
             and feedback.state in done_in
             and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
         ):
@@ -375,7 +374,7 @@ class CommandSchedule:
                 self.clear(Fate.FAILSAFE)
 
     def clear(self, fate: Fate) -> None:
-        """Drop the set-point, which ``fate`` ended here. An emergency stop stays."""
+        """Drop the set-point, ended here by ``fate``. An emergency stop stays."""
         self._end(Outcome(0, self.intent, fate, Refusal.NOT_FRESH, ENDINGS[fate]))
         self.owed = None
 
@@ -386,7 +385,7 @@ class CommandSchedule:
             self.action = _IDLE
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
-        """Start to send (again), on a connection of ``connected_ns``: drop a set-point that is too old."""
+        """Resume sending, on the connection made at ``connected_ns``: drop a set-point that is too old."""
         if now_ns - self._asked_ns > self._keep_ns:  # since the connection only the lease was awaited
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
@@ -394,7 +393,7 @@ class CommandSchedule:
 
     @property
     def wants_flight(self) -> bool:
-        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        """Whether the newest set-point keeps the vehicle in the air or brings it there."""
         return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position | ReturnToStart)
 
 

@@ -1,7 +1,7 @@
-"""What this application knows of its authority from replies, events and feedback, and requests to hand it over.
+"""This application's knowledge of its authority, from replies, events and feedback, and requests to hand it over.
 
-Pure. Replies and events can be lost, and feedback can be older than a grant: lease numbers grow, so the higher one is
-the newer.
+Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow, so the higher one is
+newer.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ TakeoverWay = Literal["now", "ask"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Authority:
-    """How an application asks for the authority over a drone: ``connect("alpha", authority=Authority(priority=4))``.
+    """An application's request for the authority over a drone: ``connect("alpha", authority=Authority(priority=4))``.
 
     Attributes:
-        priority: 0 (highest) to 31 (lowest); a higher one pre-empts a lower one.
+        priority: 0 (highest) to 31 (lowest); a higher priority pre-empts a lower one.
         wait_s: How long to wait in the queue while another application holds the authority [s].
-        for_s: How long the authority is wanted [s], up to a day; then others can get it. None: open.
-        takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks the holder first.
-        stay: Whether to stay in the queue after ``wait_s``, without the authority, instead of failing.
+        for_s: How long to hold the authority [s], up to a day; then others can get it. None: unlimited.
+        takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
+        stay: Whether to stay in the queue after ``wait_s``, without the authority, rather than fail.
 
     Raises:
         UsageError: If a value is out of range.
@@ -58,7 +58,7 @@ class Authority:
 
 
 def check_seconds(what: str, seconds: object) -> None:
-    """Check a time to wait [s]: raise :class:`UsageError` if it is no finite number, or negative."""
+    """Check a time to wait [s]; raise :class:`UsageError` if it is negative or not a finite number."""
     if not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
         raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
 
@@ -69,13 +69,13 @@ class AuthorityStatus:
 
     Attributes:
         state: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command.
-            ``preempted``: taken over by another application, and waiting in the queue to get it back.
-        lease: Number of the lease while held, else 0.
-        priority: Of the last request, 0 (highest) to 31.
-        holder: Name of the application that holds it; None if nobody does or it is not known.
-        position: Position in the queue from 1, the next; 0 if not known.
-        expected_wait_s: Wait if each ahead in the queue keeps to the time it announced [s]; None if not known.
-        until_ns: When the time that this application asked for is over, on the proxy's clock; None: not limited.
+            ``preempted``: taken over by another application; waiting in the queue to get it back.
+        lease: Number of the lease while held, otherwise 0.
+        priority: Priority of the last request, 0 (highest) to 31.
+        holder: Name of the application that holds it; None if there is none or it is unknown.
+        position: Position in the queue, 1 being next; 0 if unknown.
+        expected_wait_s: Wait if all those ahead in the queue keep to their announced times [s]; None if unknown.
+        until_ns: End of the time that this application requested, on the proxy's clock; None: unlimited.
     """
 
     state: AuthorityState = "none"
@@ -88,19 +88,19 @@ class AuthorityStatus:
 
 
 class EndedSessions:
-    """Sessions of this process that have ended, by run of the proxy and number of the application. Any thread.
+    """Ended sessions of this process, by run of the proxy and number of the application. Thread-safe.
 
-    A proxy may hear of the end later than of the next session, and until then the old one has the authority.
+    A proxy may notice the end after the start of the next session, and until then the old one holds the authority.
     """
 
-    MOST = 256  #: those that are remembered
+    MOST = 256  #: number of remembered sessions
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, int], None] = {}
         self._lock = threading.Lock()
 
     def add(self, run_id: int, app_id: int) -> None:
-        """Remember one; the oldest is forgotten."""
+        """Remember a session; forget the oldest one."""
         with self._lock:
             self._known[run_id, app_id] = None
             if len(self._known) > self.MOST:
@@ -113,21 +113,21 @@ class EndedSessions:
 class AuthorityTracker:
     """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
-    #: Feedback that names no owner may be older than the grant for this long.
+    #: How long feedback without an owner may be older than the grant.
     SETTLE_NS = nanoseconds(0.5)
 
     def __init__(self, name: str, ended: EndedSessions | None = None) -> None:
         self._name = name
         self._ended = EndedSessions() if ended is None else ended
         self._run_id = 0
-        self._owner_id = 0  # who had it by the last feedback; 0: nobody
+        self._owner_id = 0  # the owner in the last feedback; 0: none
         self.app_id = 0
-        self.wanted = False  #: the application asked for it and has not given it back
-        self.pending = False  #: asked for on this connection, and not answered yet
+        self.wanted = False  #: the application requested it and has not released it
+        self.pending = False  #: requested on this connection, without an answer yet
         self.status = AuthorityStatus()
-        self.last_request = RequestAuthority()  #: the last request, repeated on another connection
+        self.last_request = RequestAuthority()  #: the last request, which is repeated on another connection
         self.declined = ""  #: why the holder declined
-        #: Whether to request it again by itself after a lost connection, or after the lease was lost by silence.
+        #: Whether to request it again automatically after a lost connection, or after losing the lease by silence.
         self.renews = True
         self._lease = 0  #: the newest lease that this application has held on this connection
         self._granted_ns = 0
@@ -139,33 +139,33 @@ class AuthorityTracker:
 
     @property
     def awaited(self) -> bool:
-        """Whether it is asked for, and nothing shows yet that another application has it."""
+        """Whether it is requested, and nothing shows yet that another application holds it."""
         return self.wanted and (self.status.state == "none" or not self.settled)
 
     @property
     def answered(self) -> bool:
-        """Whether what was asked for is held, waited for, or not wanted any more. A lost link is no answer."""
+        """Whether it is held, queued for, or no longer wanted. A lost link is not an answer."""
         return not self.pending and (self.status.state != "none" or not self.wanted)
 
     @property
     def behind_itself(self) -> bool:
-        """Whether it waits only until the proxy notices that an earlier session of this process has ended."""
+        """Whether it only waits for the proxy to notice the end of an earlier session of this process."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
     def settled(self) -> bool:
-        """Whether it is held, not wanted, or known from feedback to be another application's."""
+        """Whether it is held, not wanted, or known from feedback to belong to another application."""
         return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
 
     def connected(self, app_id: int, run_id: int = 0) -> None:
-        """Reset on a new connection, on which older leases mean nothing, and on another run numbers of applications."""
+        """Reset on a new connection, which invalidates older leases and, in another run, numbers of applications."""
         if run_id != self._run_id:
             self._owner_id = 0
         self.app_id, self._run_id = app_id, run_id
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """The connection is lost, and the authority with it; it stays wanted if it is to be renewed."""
+        """Note a lost connection, which ends the authority; it stays wanted if it is to be renewed."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False
@@ -180,13 +180,13 @@ class AuthorityTracker:
         self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """Note a grant, known from a reply, an event or feedback; one that was lost since is ignored.
+        """Note a grant from a reply, an event or feedback; ignore one that has been lost since.
 
-        ``until_ns``: when its time is over, on the proxy's clock; None: not limited, or known from before.
+        ``until_ns``: the end of its time, on the proxy's clock; None: unlimited, or known from before.
         """
         self.pending = False
         if lease <= self._lease and not self.held:
-            return False  # an old lease, reported late: it was lost since
+            return False  # an old lease, reported late: it has been lost since
         if until_ns is None and lease == self._lease:
             until_ns = self.status.until_ns  # feedback and some events do not repeat it
         self._lease, self._granted_ns = lease, now_ns
@@ -216,13 +216,13 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_DECLINED and ours:
             self.declined = event.text
         lease = _whole(data.get("lease"))
-        late = self.status.state == "preempted" and lease == self._lease  # feedback told of the next holder before
+        late = self.status.state == "preempted" and lease == self._lease  # feedback has already shown the next holder
         if not ours or not (late or (self.held and lease >= self.status.lease)):
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # its time is over: not requested again by itself
+            if data.get("reason") == "expired":  # its time is over: not requested again automatically
                 return self.given_back()
             return self._lost(None)
         return False
@@ -240,7 +240,7 @@ class AuthorityTracker:
             newer = feedback.lease > self.status.lease
             until_ns = self.status.until_ns
             if newer and until_ns is not None and feedback.captured_ns >= until_ns:
-                return self.given_back()  # its time is over, and the event that says so was lost or is late
+                return self.given_back()  # its time is over, and the event was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):
@@ -248,7 +248,7 @@ class AuthorityTracker:
         return False
 
     def _lost(self, holder: str | None) -> bool:
-        """Note that it was taken over by ``holder``, or ended by the proxy because this application was silent."""
+        """Note that ``holder`` took it over, or that the proxy ended it because this application was silent."""
         if not holder and not self.renews:
             return self.given_back()
         state: AuthorityState = "preempted" if holder else "none"
@@ -263,31 +263,31 @@ def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
 
 
-#: True: hand it over; False, or the reason as a text: decline; None: leave it to the proxy.
+#: True: hand it over; False, or a reason as text: decline; None: leave it to the proxy.
 TakeoverAnswer = bool | str | None
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverRequest:
-    """Another application asks for the authority that this one holds."""
+    """Another application's request for the authority that this one holds."""
 
-    by: str  #: name of that application
+    by: str  #: name of the other application
     priority: int  #: 0 is the highest
     within_s: float  #: after this time it wins if its priority is strictly higher
-    for_s: float | None  #: for how long it wants the authority; None: open
+    for_s: float | None  #: how long it wants to hold the authority; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuery:
-    """A request as it came, with what an answer needs."""
+    """A request as received, with the data for an answer."""
 
     request: TakeoverRequest
-    lease: int  #: the lease that is to be given up
-    by_id: int  #: number of the application that asks, in this run of the proxy
+    lease: int  #: the lease to give up
+    by_id: int  #: number of the requesting application, in this run of the proxy
 
 
 def authority_request(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
-    """Return the request for the authority, with the meaning that it has in :class:`Authority`.
+    """Return the request for the authority; its arguments are those of :class:`Authority`.
 
     Raises:
         UsageError: If an argument is out of range.
@@ -308,11 +308,11 @@ def answering(
 ) -> Callable[[Event], None]:
     """Return a callback for events that calls ``function`` when this application is asked to hand the authority over.
 
-    ``answer`` is given the lease, the number of the application that asks, whether it is granted, and the reason.
-    Raises :class:`UsageError` if ``function`` can't be called.
+    ``answer`` is called with the lease, the number of the requesting application, the decision, and the reason. Raises
+    :class:`UsageError` if ``function`` can't be called.
     """
     if not callable(function):
-        raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+        raise UsageError(f"{function!r:.80} can't be called: expected a function with one argument")
 
     def on_event(event: Event) -> None:
         query = takeover_query(event, app_id())
@@ -326,7 +326,7 @@ def answering(
 
 
 def takeover_query(event: Event, app_id: int) -> TakeoverQuery | None:
-    """Return the request that an event makes of the application ``app_id``; None if it makes none of it."""
+    """Return an event's request to the application ``app_id``; None if it has none."""
     data = event.data
     if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != app_id:
         return None

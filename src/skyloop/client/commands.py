@@ -1,4 +1,4 @@
-"""Authority and commands of one application, over whichever connection there is."""
+"""The authority and the commands of one application, over any connection."""
 
 from __future__ import annotations
 
@@ -55,31 +55,31 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
-ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
-#: How long to wait at most for the proxy to notice that an earlier session of this process has ended: more than the
-#: time after which a silent one loses the authority.
+ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
+#: How long to wait for the proxy to notice the end of an earlier session of this process: longer than a silent session
+#: keeps the authority.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
-#: What an application asked for and no hover of the library's own may end.
+#: Requests of an application that no automatic hover of the library may end.
 LANDING: Final = (Land, EmergencyStop)
-_LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
-_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: so ended, the next set-point is most likely refused, too
-#: What a program sends again and again: that one of them is not sent is no error.
+_LATER_ACTIONS: Final = (Position, ReturnToStart)  #: unknown to older proxies
+_REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: after this end, the next set-point is most likely refused, too
+#: Actions that programs send continuously: a single unsent one is not an error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
-_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: what is not sent for a caller who waits no longer
-#: Whether the caller of the present thread, or task, waits no longer; set for threads that wait for somebody else.
+_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: not sent for a caller that has stopped waiting
+#: Whether the caller of the current thread or task has stopped waiting; set for threads that wait on another's behalf.
 cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
 
 
 class GivenUpError(Exception):
-    """The caller waits no longer; nobody sees this."""
+    """Raised when the caller has stopped waiting; never leaves the library."""
 
 
 class CommandSender:
     """Requests and keeps the authority, and sends the newest command at once and then at a steady rate.
 
-    It is the only one that changes its ``authority``.
+    No other object changes its ``authority``.
     """
 
     def __init__(
@@ -96,9 +96,9 @@ class CommandSender:
     ) -> None:
         """Prepare to send; nothing is sent before :meth:`connected`.
 
-        ``emit`` gets the events that are made here. ``changed`` is called when the status of the authority has changed,
-        and ``granted`` with the number of each new lease, on the thread that found out: the receiving one, the
-        supervisor's, or an application's.
+        ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
+        ``granted`` with the number of each new lease, on the thread that noticed: the receiving one, the supervisor's,
+        or an application's.
         """
         self.role = role
         self._authority = authority
@@ -108,16 +108,16 @@ class CommandSender:
         self._emit = emit
         self._changed = changed
         self._granted = granted
-        self._lock = threading.Lock()  # guards all below; never held while waiting or in a callback
+        self._lock = threading.Lock()  # guards everything below; never held while waiting or in a callback
         self._seq = 0
         self._connected_ns = 0  # since when there is this connection
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
-        self.barred = False  #: the end of the flight has begun: only the library's own commands and a stop pass
-        self._impossible: dict[type, str] = {}  # why, of what neither vehicle nor proxy can do
-        self.told: Outcome | None = None  #: the newest that the proxy told of this application's intents
-        self._first_set_point = 0  # number of the first in the present row of set-points; 0: the newest is none
+        self.barred = False  #: the flight is ending: only the library's own commands and an emergency stop pass
+        self._impossible: dict[type, str] = {}  # reasons for what neither vehicle nor proxy supports
+        self.told: Outcome | None = None  #: the proxy's newest report on this application's intents
+        self._first_set_point = 0  # first number in the current series of set-points; 0: there is none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
 
@@ -147,29 +147,29 @@ class CommandSender:
 
     @property
     def newest(self) -> AnyAction:
-        """What is repeated now; idle where nothing is."""
+        """The action being repeated; idle if there is none."""
         return self._schedule.action
 
     @property
     def wants_flight(self) -> bool:
-        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        """Whether the newest set-point keeps the vehicle in the air or brings it there."""
         return self._schedule.wants_flight
 
     def bar(self) -> None:
-        """Let no more commands of the application pass but an emergency stop: when this returns, none is on its way."""
+        """Bar all commands of the application except an emergency stop; when this returns, none is on its way."""
         with self._lock:
             self.barred = True
 
     @property
     def stopping(self) -> bool:
-        """Whether an emergency stop is under way: it is repeated, and nothing else is sent."""
+        """Whether an emergency stop is in progress: it is repeated, and nothing else is sent."""
         return self._schedule.stopping
 
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
-        After a lost connection or lease the authority is no longer requested again by itself, as only that person can
-        tell whether to.
+        After a lost connection or lease, the authority is no longer requested again automatically, because only that
+        person can decide that.
         """
         with self._lock:
             self._authority.renews = False
@@ -178,9 +178,9 @@ class CommandSender:
     def present_until(self, until_ns: int) -> None:
         """Extend the time until which the person who flies is known to be present; never shortens it.
 
-        After that time nothing is repeated, nothing new is flown and no authority is requested, so that the proxy takes
-        the pilot for silent; what ends a flight is still sent, once, and an emergency stop as ever. The sending thread
-        checks this itself, however busy other threads are.
+        After that time, nothing is repeated, nothing new is flown and no authority is requested, so that the proxy
+        considers the pilot silent. Commands that end a flight are still sent once, and emergency stops as always. The
+        sending thread checks this itself, however busy other threads are.
         """
         with self._lock:
             known_ns = self._present_until_ns
@@ -200,27 +200,29 @@ class CommandSender:
         """Return whether the person who flies is known to be present; always True unless one is required."""
         return self._present_until_ns is None or now_ns <= self._present_until_ns
 
-    # The application's side ------------------------------------------------------------------------------------
+    # For the application ---------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
-        """Make ``action``, whose numbers were checked, the newest set-point; see :class:`skyloop.Drone`.
+        """Make ``action``, with numbers already checked, the newest set-point; see :class:`skyloop.Drone`.
 
         Args:
             action: The action.
-            now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
-            automatic: The library asks for it by itself: the proxy takes no vehicle from others for it. It passes when
-                the end of the flight has begun, too.
+            now: Raise if it can't be sent at once. Then a landing is still sent once possible, anything else is
+                dropped.
+            automatic: The library's own action: the proxy takes no vehicle from others for it. It also passes during
+                the end of the flight.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.
-            UnsupportedError: If neither the vehicle nor its proxy can do it.
+            UnsupportedError: If neither the vehicle nor its proxy supports it.
             AuthorityError: If another application holds the authority, none was requested, or this one only observes;
                 with ``now`` also while the authority is still awaited.
-            RefusedError: If an emergency stop keeps back what is to be done once, or what is to be sent ``now``.
+            RefusedError: If an emergency stop blocks a one-off action, or any action with ``now``.
             LinkError: With ``now`` while the link is down.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
+            # A new series of set-points starts after any other command: a refusal from before says nothing about it.
             self._first_set_point = 0
             return sent
         told = self.told
@@ -230,18 +232,19 @@ class CommandSender:
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
         """Make ``action`` the newest set-point as :meth:`command` does; return the number of the intent.
 
-        :meth:`outcome` tells what became of it. ``again`` is the intent that it repeats under a new number; if
-        something else was asked for since, nothing is sent and the number stays.
+        :meth:`outcome` returns its outcome. ``again`` is the intent that it repeats under a new number; if another
+        command was given since, nothing is sent and the number stays.
         """
         return self._put(action, automatic=automatic, again=again)[0]
 
     def _put(
         self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
     ) -> tuple[int, bool]:
-        """Make ``action`` the newest set-point, and send it if it can be; return the intent and whether it was sent.
+        """Make ``action`` the newest set-point and send it if possible; return the intent and whether it was sent.
 
-        It can't be while the link is down, the authority is awaited, an emergency stop has not shown, or nobody is
-        there. Raises :class:`GivenUpError` if the caller waits no longer; see :data:`cancelled`.
+        That is impossible while the link is down, the authority is awaited, an emergency stop has not shown, or the
+        person who flies is absent. Raises :class:`GivenUpError` if the caller has stopped waiting; see
+        :data:`cancelled`.
         """
         connection, schedule, authority = self._connection, self._schedule, self._authority
         if connection.why_closed:
@@ -251,13 +254,15 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            wanted = not automatic or type(action) is Takeoff  # one that is asked for again: its caller still waits
+            # Before schedule.ask(), nothing changes: a call that raises or returns leaves the set-point as it was.
+            wanted = not automatic or type(action) is Takeoff  # a repeated take-off is still awaited by its caller
             if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
-                raise GivenUpError  # before it was sent: what was asked for since then stays
+                raise GivenUpError  # nothing was sent: newer commands stay
             if again is not None and again != schedule.intent:
                 return again, False
+            # The library's own hover must not end the application's landing or stop.
             if automatic and type(action) is not Land and type(schedule.action) in LANDING:
                 return schedule.intent, False
             may_send, connected = authority.status.state == "held" or stop, connection.connected
@@ -271,20 +276,21 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
+            # From here on, the set-point is stored: even if it can't be sent now, tick() may send it within keep_s.
             absent = self._present_until_ns is not None and now_ns > self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
-                    if type(action) is not Land:  # what was refused now must not be carried out later
+                    if type(action) is not Land:  # a command that raised must not be executed later
                         schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
                 return intent, False
             if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
+        connection.poke()  # too soon after the last one: the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
-        """Return what ended an intent; None while it is under way, as far as is known."""
+        """Return the outcome of an ended intent; None while it is in progress, as far as known."""
         with self._lock:
             if intent != self._schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
@@ -292,11 +298,11 @@ class CommandSender:
 
     @property
     def may_ask(self) -> bool:
-        """Whether something may be commanded now: the authority is held, and there is a connection."""
+        """Whether there is a connection with the authority, so that commands can be sent now."""
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
-        """Clear the set-point: nothing of it is sent later."""
+        """Clear the set-point, so that it is not sent later."""
         with self._lock:
             self._schedule.clear(Fate.WITHDRAWN)
 
@@ -304,12 +310,13 @@ class CommandSender:
         """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
 
         Raises:
-            AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
-            NoAnswerError: If the proxy does not answer the request, or the link is lost and not back in time.
-            ClosedError: If the drone is closed meanwhile.
+            AuthorityError: If it is not granted within ``wait_s``, if it is refused, or if this application only
+                observes.
+            NoAnswerError: If the proxy does not answer the request, or the link is lost and does not return in time.
+            ClosedError: If the drone is closed during the wait.
         """
         if self.role is Role.OBSERVER:
-            raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
+            raise AuthorityError("this application only observes", code="observer").with_hint(Hint.FLY)
         authority = self._authority
         with self._lock:
             authority.asked(request)
@@ -321,7 +328,7 @@ class CommandSender:
             self._wait(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
             self._wait(lambda: authority.settled, OWN_S)
         if self._connection.why_closed:
-            raise ClosedError("this drone was closed while it asked for the authority")
+            raise ClosedError("this drone was closed while it requested the authority")
         if not answered:
             self.release(wait=False)
             raise NoAnswerError(f"the proxy did not answer the request for the authority within {ANSWER_S:g} s")
@@ -332,17 +339,17 @@ class CommandSender:
         if refusal is not None:
             raise AuthorityError(f"the authority was refused: {refusal.message}", code=refusal.code.value)
         if status.state == "none":
-            raise NoAnswerError("the link was lost, or the authority given back, while the proxy was asked for it")
+            raise NoAnswerError("the link was lost, or the authority released, during the request for it")
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def _wait(self, ready: Callable[[], bool], timeout_s: float) -> bool:
         return self.notifier.wait_for(lambda: self._connection.why_closed != "" or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
-        """Answer an application that asks for the authority; an answer that is too late changes nothing.
+        """Answer an application that requests the authority; an answer that is too late has no effect.
 
-        With ``wait`` the proxy has it when this returns, or it raises :class:`RefusedError`, if the authority is not
-        held any more, or :class:`LinkError`.
+        With ``wait``, returns once the proxy has it, or raises :class:`RefusedError` if the authority is no longer
+        held, or :class:`LinkError`.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -351,9 +358,9 @@ class CommandSender:
             raise RefusedError(reply.message, code=reply.code.value)
 
     def release(self, *, wait: bool = True) -> None:
-        """Release the authority, or leave the queue. Does nothing if it is neither held nor wanted.
+        """Release the authority, or leave the queue. Does nothing if it is neither held nor requested.
 
-        With ``wait`` it raises :class:`NoAnswerError` if the proxy does not answer.
+        With ``wait``, raises :class:`NoAnswerError` if the proxy does not answer.
         """
         with self._lock:
             known = self._authority.wanted or self.status.state != "none"
@@ -370,14 +377,14 @@ class CommandSender:
     # For the connection ----------------------------------------------------------------------------------------
 
     def connected(self, app_id: int, run_id: int = 0, capabilities: Capabilities | None = None) -> None:
-        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted."""
+        """Reset on a new connection; :meth:`tick` requests the authority again if needed."""
         self._impossible = {} if capabilities is None else impossible(capabilities)
         with self._lock:
             self._authority.connected(app_id, run_id)
             self._seq, self._connected_ns = 0, self._clock()
 
     def disconnected(self) -> None:
-        """Clear the set-point and the authority: nothing old is sent on the next connection."""
+        """Clear the set-point and the authority, so that nothing old is sent on the next connection."""
         with self._lock:
             self._schedule.clear(Fate.LINK)
             self.told = None
@@ -405,7 +412,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send what is due; return when to call again at the latest, on this process's clock [ns]."""
+        """Send everything due; return the latest time of the next call, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
             authority, schedule, present = self._authority, self._schedule, self.is_present(now_ns)
@@ -425,7 +432,7 @@ class CommandSender:
         if last_request is not None:
             self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
-            text = "the application made no call for too long: its set-point decayed to hover"
+            text = "the application made no call for too long, so its set-point decayed to hover"
             self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
         if unshown:
             text = "the emergency stop is no longer sent: the vehicle has not shown it, and may fly"
@@ -462,7 +469,7 @@ class CommandSender:
         with self._lock:
             before = self.status
             if not self._authority.wanted:
-                return  # released in the meantime
+                return  # released since
             if isinstance(answer, AuthorityGranted):
                 changed = self._authority.granted(answer.lease, now_ns, answer.until_ns or None)
             elif isinstance(answer, AuthorityQueued):
@@ -479,7 +486,7 @@ class CommandSender:
             self.notifier.notify()
 
     def _moved(self, before: AuthorityStatus, now_ns: int) -> None:
-        """Handle a changed status: clear the set-point with a lost authority, start sending with a new one."""
+        """Handle a changed status: clear the set-point after losing the authority, start sending after getting it."""
         status = self.status
         with self._lock:
             if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
@@ -498,17 +505,17 @@ class CommandSender:
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status
         if self.role is Role.OBSERVER:
-            return AuthorityError(f"{action.name}: this application observes", code="observer").with_hint(Hint.FLY)
+            return AuthorityError(f"{action.name}: this application only observes", code="observer").with_hint(Hint.FLY)
         if status.state == "preempted":
             return AuthorityError(
                 f"{action.name}: {status.holder or 'another application'} took over the authority; "
-                "it comes back when they give it back",
+                "it returns when they release it",
                 code="no_authority",
             )
         if status.state == "queued":
             return AuthorityError(
-                f"{action.name}: {status.holder or 'another application'} holds the authority and this application "
-                "waits in line",
+                f"{action.name}: {status.holder or 'another application'} holds the authority, and this application "
+                "waits in the queue",
                 code="no_authority",
             )
         return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
@@ -517,7 +524,7 @@ class CommandSender:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""
         not_sent = f"{action.name} was not sent"
         if self._authority.held and self._connection.connected:
-            return AuthorityError(f"{not_sent}: whoever flies is not known to be there", code="no_authority")
+            return AuthorityError(f"{not_sent}: the person who flies is not known to be present", code="no_authority")
         if self._connection.connected:
             text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
             return AuthorityError(text, code="no_authority")
@@ -537,16 +544,16 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
 
 
 def impossible(capabilities: Capabilities) -> dict[type, str]:
-    """Return why actions are not possible, by their types: those that neither the vehicle nor its proxy can do."""
+    """Return the reasons for actions that neither the vehicle nor its proxy supports, by their types."""
     if not capabilities.actions:
-        return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle takes no commands")
+        return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle has no commands")
     found: dict[type, str] = {}
     if ACTION_NAMES[EmergencyStop] not in capabilities.actions:
         found[EmergencyStop] = "the vehicle cannot stop its motors"
-    for kind in _LATER_ACTIONS:  # which proxies of earlier versions would not even decode
+    for kind in _LATER_ACTIONS:  # older proxies can't even decode them
         if ACTION_NAMES[kind] not in capabilities.actions | capabilities.software:
             found[kind] = (
-                f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a place; a proxy of an earlier "
-                "version must be updated"
+                f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a position; an older  "
+                "proxy must be updated"
             )
     return found

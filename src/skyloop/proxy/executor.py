@@ -1,6 +1,6 @@
-"""Carries actions out: what the vehicle takes goes to its driver, the rest to the software autopilot, and a return.
+"""Executes actions: the vehicle's own go to its driver, others to the software autopilot; also flies returns.
 
-Not thread-safe: the command handler's lock is held around every call. Parameters and external poses go past it.
+Not thread-safe: the command handler's lock is held around every call. Parameters and external poses bypass this module.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from skyloop.zones import Vec3
 
 
 class ActionExecutor:
-    """Sends supported actions to the driver and does the rest with the software autopilot, if there is one."""
+    """Sends supported actions to the driver and emulates the others with the software autopilot, if there is one."""
 
     def __init__(
         self,
@@ -52,37 +52,37 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether what the vehicle does on the way to a place must be checked: then the software autopilot flies there.
+        #: Whether the path to a target must be checked: then the software autopilot flies there.
         self.guarded = False
         self._driver = driver
-        self._left_to = ""  # as the driver said last
-        self.unsaid: Exception | None = None  #: why it did not say; the tick clears and raises it
+        self._left_to = ""  # the driver's last answer
+        self.unsaid: Exception | None = None  #: why the driver gave none; the tick clears and raises it
         self._publisher = publisher
-        self.gave_up = ""  #: why the vehicle refused to go on with a software take-off; the reader clears it
+        self.gave_up = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
 
     @property
     def state(self) -> FlightState:
-        """The flight state now, which may be newer than the last feedback."""
+        """The current flight state, which may be newer than the last feedback."""
         return self.flight.state(self._publisher.reported_state)
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may: one that never reports its state does from its first command on."""
+        """Whether the vehicle flies, or may fly: one that never reports its state does so from its first command on."""
         return self.flight.flies(self.state)
 
     @property
     def drifts(self) -> bool:
-        """Whether what the software autopilot flies is not braked, as its velocity is not known."""
+        """Whether the software autopilot can't brake the vehicle because its velocity is unknown."""
         return self.autopilot is not None and self.autopilot.drifts
 
     def seen(self, now_ns: int) -> Snapshot:
-        """What is known of the vehicle now."""
+        """Return the vehicle's known state."""
         vehicle = self._publisher
         state = self.flight.state(vehicle.reported_state)
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
 
     def observe(self, now_ns: int) -> Changed | None:
-        """Look at the vehicle; return what has changed about whose flight it is."""
+        """Observe the vehicle; return a change of hands of its flight, if any."""
         try:
             left_to = self._driver.left_to()
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
@@ -91,13 +91,13 @@ class ActionExecutor:
         return self.flight.observe(self._publisher.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
-        """The newest sample, where it shows how the vehicle is now."""
+        """Return the newest sample if it shows the current state."""
         feedback = self._publisher.feedback_now if self._publisher.link_up else None
         return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
     @property
     def stands(self) -> bool:
-        """Whether the vehicle stands on the ground by its own word, whatever the software autopilot is about to do."""
+        """Whether the vehicle reports to stand on the ground, whatever the software autopilot is about to do."""
         return self._publisher.reported_state is FlightState.LANDED
 
     def stop_autopilot(self) -> None:
@@ -106,10 +106,10 @@ class ActionExecutor:
             self.autopilot.stop("idle")
 
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Carry out a supported action and return what was really applied. Raises what the driver raises.
+        """Execute a supported action and return what was really applied. Raises the driver's errors.
 
-        ``new``: an application newly asked for it; else it repeats what was applied before. Raises
-        :class:`RefusedError` where the vehicle is sure not to do it, as it is now.
+        ``new``: a new request of an application; otherwise a repeat. Raises :class:`RefusedError` if the vehicle is
+        sure not to follow in its present state.
         """
         autopilot = self.autopilot
         try:
@@ -132,21 +132,21 @@ class ActionExecutor:
         return applied
 
     def attempt(self, action: AnyAction, now_ns: int, where: str) -> bool:
-        """Do what no application newly asked for; return whether it was taken. A failure is published, not raised."""
+        """Apply an action that is not a new request; return whether it was accepted. Publishes failures."""
         try:
             self.execute(action, now_ns, new=False)
-        except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
+        except Exception as error:  # noqa: BLE001  it is reported, and the next step retries
             self._publisher.driver_failed(where, error)
             return False
         return True
 
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
-        """Hover or land with nobody in command; returns whether it was taken. A failure is published, not raised."""
+        """Hover or land without a pilot; return whether it was accepted. Failures are published, not raised."""
         if type(action) in self.native:
             taken = False
             try:
                 taken = self._driver.failsafe(action)
-            except Exception as error:  # noqa: BLE001  it is reported, and tried again
+            except Exception as error:  # noqa: BLE001  it is reported and retried
                 self._publisher.driver_failed("failsafe", error)
             if taken and self.autopilot is not None:
                 self.autopilot.stop(action.name)
@@ -162,9 +162,9 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover, for good: nothing is steered from here any more.
+        """Hover for good: nothing is steered from here afterwards.
 
-        A vehicle that does not hover by itself is left at a standstill, as far as one set-point can.
+        A vehicle that does not hover on its own is left at a standstill, as far as a single set-point can achieve that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -176,7 +176,7 @@ class ActionExecutor:
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
-        """Let the software autopilot steer, if it is on; returns what it made the driver apply."""
+        """Let the software autopilot steer, if it is on; return what the driver applied."""
         if self.autopilot is None:
             return None
         action = self.autopilot.step(now_ns, self._shown(now_ns), self._publisher.reported_state)
@@ -184,7 +184,7 @@ class ActionExecutor:
             return None
         try:
             return self._driver.apply(action)
-        except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
+        except Exception as error:  # noqa: BLE001  it is reported, and the next step retries
             self._publisher.driver_failed("autopilot", error)
             if isinstance(error, DriverError):
                 before = self.autopilot.mode
@@ -199,26 +199,26 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start where the failsafe ladder says so, and knows what feedback shows of that."""
+    """Flies the vehicle back to its start for the failsafe ladder, and provides the fields of feedback about it."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
-        self.start: Vec3 | None = None  #: where the vehicle took off, as feedback shows it [m]
-        self.phase = ReturnPhase.NONE  #: how far it is on its way back, as feedback shows it
+        self.start: Vec3 | None = None  #: where the vehicle took off, as in feedback [m]
+        self.phase = ReturnPhase.NONE  #: progress of the return, as in feedback
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._problem = ""  # why the ladder's flight back can't go on
-        self._good_ns = 0  # when that went well last
+        self._problem = ""  # why the ladder's return can't continue
+        self._good_ns = 0  # when it last went well
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
-        """Begin the ladder's flight back; :meth:`update` goes on with it."""
+        """Start the ladder's return; :meth:`update` continues it."""
         self._checks.begin_return(action)
         self._problem, self._good_ns = "", now_ns
 
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
-        """Observe the start, and fly back if the ladder does; return whether feedback has something else to show.
+        """Observe the start, and fly back if the ladder demands it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's; what others fly is not on its way back for us.
+        ``ours``: whether the flight is the proxy's; a vehicle flown by others is not returning for us.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
@@ -229,14 +229,14 @@ class ReturnSupervisor:
         return self.observe()
 
     def observe(self) -> bool:
-        """Observe how far the way back is; return whether feedback has something else to show."""
+        """Observe the progress of the return; return whether feedback must change."""
         before, back = (self.start, self.phase), self._checks.way_back
         self.start = self._checks.start.position
         self.phase = ReturnPhase.NONE if back is None or not self._executor.airborne else back.phase
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't return to the start; empty if it can, or is not to."""
+        """Return why the ladder can't return to the start; empty if it can, or need not."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem
@@ -247,16 +247,16 @@ class ReturnSupervisor:
         return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
     def _fly(self, seen: Snapshot) -> None:
-        """Take the next step of the ladder's flight; what is against it is left to the ladder."""
+        """Take the next step of the ladder's return; objections are left to the ladder."""
         now_ns = seen.now_ns
         if not seen.link_up:
-            self._good_ns = now_ns  # nothing can be said about it, and nothing be done
+            self._good_ns = now_ns  # nothing can be said or done about it
             return
         decision = self._checks.step_return(seen.feedback, now_ns)
         action, problem = decision.action, "" if decision.refusal is None else decision.why
         if isinstance(action, Position):
             if not self._executor.attempt(action, now_ns, "failsafe"):
-                problem = "its driver fails to fly it there"
+                problem = "its driver fails to fly there"
         elif action is None or seen.state is not FlightState.LANDING:
             self._executor.failsafe(action or Hover(), now_ns)
         if not problem:

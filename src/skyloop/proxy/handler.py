@@ -1,4 +1,4 @@
-"""The command handler: what applications ask of the vehicle, under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler: applications' requests to the vehicle, under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 
@@ -54,16 +54,16 @@ from skyloop.proxy.requests import Session
 from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
-_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off that is under way alone; others end it
-#: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
+_LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: they leave a take-off in progress alone; others end it
+#: Echo of a command without a new effect: refused, or held.
 _NOTHING: Final = Idle()
 
 
 class CommandHandler(FlightSupervisor):
-    """What applications ask of one vehicle. Public methods may be called from any thread."""
+    """Handles applications' requests to one vehicle. Public methods are thread-safe."""
 
     def configure(self, settings: FlightSettings) -> None:
-        """Let new values of the parameters take effect. Unchanged settings are the same object as before."""
+        """Apply new values of the parameters. Unchanged settings are the same objects as before."""
         with self._lock:
             airspace, space = self.checks.airspace, settings.airspace.space
             if space is not airspace.settings.space:
@@ -80,7 +80,7 @@ class CommandHandler(FlightSupervisor):
                 self._executor.autopilot.settings = settings.autopilot
 
     def aged(self, command: Command, now_ns: int) -> Command:
-        """Return a command as old as it is: one from before the computer slept looks as if it had just been sent."""
+        """Return a command with its true age: one from before a sleep of the computer looks as if just sent."""
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -89,40 +89,38 @@ class CommandHandler(FlightSupervisor):
         return msgspec.structs.replace(command, sent_ns=command.sent_ns - self._slept_ns)
 
     def problem_with_ceiling(self, altitude: float) -> str:
-        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for a person; empty if it may."""
+        """Return why ``limits.altitude`` must not be lowered to this height [m] now, for people; empty if it may."""
         with self._lock:
             flies = self._executor.airborne
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return why the vehicle must not do something once now, such as a flip, for a person; empty if it may."""
+        """Return why a momentary parameter, such as a flip, must not be written now, for people; empty if it may."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
                 return f"only landing is possible: {REASONS[ladder.barred]}"
             if ladder.step is not Failsafe.NONE:
-                return (
-                    f"a failsafe has the vehicle, because {REASONS.get(ladder.reason, ladder.reason)}: command it first"
-                )
+                return f"a failsafe is active, because {REASONS.get(ladder.reason, ladder.reason)}: command it first"
             return f"{others}: hover, take off or land first to take it over" if others else ""
 
     # The end of a flight ----------------------------------------------------------------------------------------
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end; from now on only landing and emergency stop are accepted.
+        """Land because the proxy is about to end; from now on, only landing and emergency stop are accepted.
 
-        Returns whether anything of the proxy's flies, or may be about to.
+        Returns whether the proxy has a flight, or one may be about to begin.
         """
         with self._lock:
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # again and again: nobody withdraws it later
+                self._rising_until_ns = now_ns  # keep withdrawing it: no one does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
+        """Leave a flying vehicle hovering, as far as it can on its own: the proxy is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -136,12 +134,12 @@ class CommandHandler(FlightSupervisor):
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies, or may, or may be about to, and is the proxy's to land. Takes no lock."""
+        """Whether the vehicle flies, may fly, or may be about to, and is the proxy's to land. Acquires no lock."""
         return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing flies, nobody is in command and nothing is to be done. Takes no lock."""
+        """Whether nothing flies, there is no pilot, and nothing is pending. Acquires no lock."""
         return (
             self.authority.holder is None
             and self.ladder.idle
@@ -153,7 +151,7 @@ class CommandHandler(FlightSupervisor):
     # The authority ----------------------------------------------------------------------------------------------
 
     def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
-        """Give the authority, or a position in the queue, or return who holds it."""
+        """Grant the authority, or a position in the queue, or refuse it with its holder's name."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
         term_ns = None if request.for_s is None else nanoseconds(request.for_s)
@@ -163,7 +161,7 @@ class CommandHandler(FlightSupervisor):
             effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
             self._apply_authority(effects, now_ns)
             holder = authority.holder
-            assert holder is not None  # a request leaves somebody in command
+            assert holder is not None  # a request always leaves a holder
             if holder.app_id == app_id:
                 return AuthorityGranted(authority.lease, authority.until_ns or 0)
             name, position = name_of(self._sessions, holder.app_id), authority.position(app_id)
@@ -171,11 +169,11 @@ class CommandHandler(FlightSupervisor):
         if position:
             wait_s = None if wait_ns is None else seconds(wait_ns)
             return AuthorityQueued(position, name, holder.priority, wait_s, asked)
-        why = f"{name} holds the authority with priority {holder.priority}: ask with a higher one (0 is the highest)"
+        why = f"{name} holds the authority with priority {holder.priority}: use a higher one (0 is the highest)"
         return Refused(Refusal.BUSY, why)
 
     def answer_takeover(self, session: Session, answer: AnswerTakeover, now_ns: int) -> AnyReply:
-        """Let the holder grant or decline what it was asked for."""
+        """Let the holder grant or decline a request to hand the authority over."""
         with self._lock:
             if not self.holds(session, answer.lease):
                 return Refused(Refusal.FOREIGN_LEASE, "only the holder can answer, under its own lease")
@@ -192,7 +190,7 @@ class CommandHandler(FlightSupervisor):
         return Done()
 
     def application_left(self, session: Session, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """An application's connection ended; it must still be among the sessions. ``news``: told once it hovers."""
+        """Handle the end of a connection that is still among the sessions. ``news``: published once it hovers."""
         with self._lock:
             self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
@@ -202,10 +200,10 @@ class CommandHandler(FlightSupervisor):
             holder = self.authority.holder
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease
 
-    # Commands: all but the first is called under the lock ---------------------------------------------------------
+    # Commands: all but the first are called under the lock ----------------------------------------------------------
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
-        """Check a command and carry it out, on the thread that received it."""
+        """Check a command and execute it, on the receiving thread."""
         with self._lock:
             if type(command.action) is EmergencyStop:
                 applied, applied_ns = self._stop_motors(session, command, now_ns)
@@ -213,22 +211,22 @@ class CommandHandler(FlightSupervisor):
                 applied, applied_ns = self._obey(session, command, now_ns)
         self._counts["commands.received"] += 1
         if self._subscribers(COMMANDS):
-            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # others' counters take no more than that
+            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # limits of the echo's field
             action, app_id = command.action, session.app_id
             echo = Applied(command.seq, command.lease, app_id, sent_ns, applied_ns, action, applied)
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Return what was applied, and when: the time of receipt for a command that was refused."""
-        # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
-        # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
+        """Return what was applied, and when; for a refused command, the time of receipt."""
+        # Each function call costs microseconds on a machine that was idle, as it usually was before a command. So
+        # ordinary commands are received, decided and executed here, while errors are worded elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         if flight.whose is not Whose.OURS:
             self._look(now_ns)
         intents = session.intents
-        state = self._observe_intent(session, now_ns)  # what ends intents before this one came does not end this one
+        state = self._observe_intent(session, now_ns)  # an earlier end of intents must not end this one
         refusal = checks.receive(command, intents, session.app_id, now_ns)
         if refusal is not None:
             if session.role is not Role.PILOT:
@@ -243,7 +241,7 @@ class CommandHandler(FlightSupervisor):
         if kind not in _LEAVE_A_TAKEOFF:
             if self._withdraw_takeoff(now_ns):
                 intent.withdrew = kind is Land
-                if kind is Hover:  # it stands, and stays so
+                if kind is Hover:  # it stands, and stays there
                     intent.end(Fate.COMPLETED if new else Fate.WITHDRAWN)
             state = self._executor.state
         if kind is Idle:
@@ -253,15 +251,17 @@ class CommandHandler(FlightSupervisor):
             return _NOTHING, self._count_applied(command)
         if intent.over:
             self._tell(session)
-            if intent.reason is None:  # it was done
+            if intent.reason is None:  # it was carried out
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
         intent.action = action  # a set-point may have decayed to hover
         automatic, fresh = command.automatic, new
-        new = new and not automatic  # what the library does by itself is nobody's decision
+        new = new and not automatic  # the library's own actions are not a person's decision
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
+            # A refusal may bring a substitute, a hover. If the vehicle does not accept that, the previous set-point
+            # must still not continue.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -272,12 +272,12 @@ class CommandHandler(FlightSupervisor):
                 if decision.clamps:
                     self._counts["commands.clamped"] += 1
             try:
-                begins = new or (fresh and decision.takes_off)  # also one that a waiting call asks for again
+                begins = new or (fresh and decision.takes_off)  # also a take-off that a waiting call repeats
                 applied = self._executor.execute(decision.action, now_ns, new=begins)
             except RefusedError as error:
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.WRONG_STATE, str(error), now_ns), now_ns
-            except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
+            except Exception as error:  # noqa: BLE001  it is reported, and the flight continues
                 why = vehicle.driver_refused("apply", error)
                 self._stop_before(kind, now_ns)
                 return self._refuse_intent(session, command, intent, Refusal.DRIVER_FAILED, why, now_ns), now_ns
@@ -290,7 +290,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # Before feedback tells of this intent: beside it, "arrived" would be of the return before this one.
+        # Before feedback shows this intent: an "arrived" beside it would be the previous return's.
         if fresh and self._returns.observe():
             self._stamp()
         self._tell(session)
@@ -301,7 +301,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
+        """Make the flight ours after an application's new command, or if the flight is not others'."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -313,14 +313,14 @@ class CommandHandler(FlightSupervisor):
             self.on_ownership(True)
 
     def _stop_before(self, kind: type[Action], now_ns: int) -> None:
-        """Hover where a set-point is refused, as soon as the driver does: what it took the place of must not go on."""
+        """Hover after a refused set-point, as soon as the driver accepts: the previous set-point must not continue."""
         moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
         if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
             self.ladder.hand_over(now_ns)
             self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
+        """Execute any pilot's emergency stop: without a lease, however old or out of sequence."""
         intents, holds = session.intents, self.holds(session, command.lease)
         refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
         intents.stop(command)
@@ -331,12 +331,12 @@ class CommandHandler(FlightSupervisor):
             return self._refuse(session, command, Refusal.UNSUPPORTED, why), now_ns
         try:
             applied = self._executor.execute(command.action, now_ns)
-        except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
+        except Exception as error:  # noqa: BLE001  it is reported, and the repeats retry
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent meanwhile
-        self._rising_until_ns = None  # nothing but the stop is sent
+            self.authority.last_command_ns = now_ns  # its repeats are a sign of life: nothing else is sent then
+        self._rising_until_ns = None  # only the stop is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
@@ -350,8 +350,8 @@ class CommandHandler(FlightSupervisor):
 
     def _refuse_role(self, session: Session, command: Command) -> AnyAction:
         if session.role is Role.OBSERVER:
-            return self._refuse(session, command, Refusal.OBSERVER, "observers command nothing: connect as a pilot")
-        return self._refuse(session, command, Refusal.PROTOCOL, "the first packet on a connection is a Hello request")
+            return self._refuse(session, command, Refusal.OBSERVER, "observers can't command: connect as a pilot")
+        return self._refuse(session, command, Refusal.PROTOCOL, "the first packet of a connection must be Hello")
 
     def _refuse(self, session: Session, command: Command, reason: Refusal, why: str) -> AnyAction:
         self._counts["commands.refused"] += 1
@@ -364,14 +364,14 @@ class CommandHandler(FlightSupervisor):
     def _refuse_intent(
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
-        """Refuse what the holder asked for, which is over with it: its repeats get the same answer."""
+        """Refuse the holder's intent and end it: its repeats get the same answer."""
         intent.refuse(reason, why)
         self._tell(session)
         kind, seen = type(command.action), self._executor.seen(now_ns)
         if kind is Takeoff:
             self._withdraw_takeoff(now_ns)
         if self.ladder.lands_on and not self.checks.goes_on(kind, seen, automatic=command.automatic):
-            drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is not wanted any more
+            drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is no longer wanted
             self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)
         return self._refuse(session, command, reason, why)

@@ -1,7 +1,8 @@
-"""The proxy: one vehicle's driver made a node that any number of applications see and one at a time flies.
+"""The proxy: makes one vehicle's driver a node that any number of applications observe and one at a time flies.
 
-Threads: the transport's carries out commands and poses, the driver's publish, a ticker (50 Hz) updates authority,
-failsafe and autopilot, another answers requests. The driver's flying calls hold the handler's lock, ``end``'s too.
+Threads: the transport's execute commands and pass on poses, the driver's publish, a ticker (50 Hz) updates authority,
+failsafe and autopilot, and one more answers requests. Flying calls of the driver hold the handler's lock, including
+those of ``end``.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ from skyloop.transport.base import Peer, TransportServer
 MAX_NAME: Final = 64  #: characters of a proxy's name
 
 _POLL_S: Final = 0.2
-_ABANDON_S: Final = 1.0  #: how long the end of a proxy with a driver that hangs waits for what does not
+_ABANDON_S: Final = 1.0  #: how long ending a proxy with a hanging driver waits for its other parts
 _log = logging.getLogger(__name__)
 
 
@@ -77,17 +78,18 @@ class Proxy:
     """Owns a driver and its transport server, from :meth:`start` to :meth:`end`; also a context manager.
 
     Args:
-        driver: the vehicle's driver, not yet open.
-        server_end: where applications connect, not yet started.
-        name: what applications connect to, 1 to 64 characters.
-        clock: the clock of all its samples [ns].
-        ticker: False leaves :meth:`tick` to the caller, for many proxies in a process, for tests, and for
-            time that stands still.
-        jobs: Answers what may wait for the vehicle; by default a thread of its own.
-        slept: For how long the computer has slept, in all [ns]; by default what it says, where the clock is its own.
+        driver: The vehicle's driver, not yet open.
+        server_end: The end that applications connect to, not yet started.
+        name: The name that applications connect to, 1 to 64 characters.
+        clock: The clock of all its samples [ns].
+        ticker: False leaves :meth:`tick` to the caller: for many proxies in a process, for tests, and for simulated
+            time.
+        jobs: Answers requests that may wait for the vehicle; by default on a separate thread.
+        slept: Returns how long the computer has slept in total [ns]; by default the system's value, if the clock is
+            the system's.
 
     Raises:
-        UsageError: for a name that is empty or too long.
+        UsageError: The name is empty or too long.
     """
 
     def __init__(
@@ -102,12 +104,12 @@ class Proxy:
         slept: Clock | None = None,
     ) -> None:
         if not 1 <= len(name) <= MAX_NAME:
-            raise UsageError(f"a proxy's name has 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
+            raise UsageError(f"a proxy's name must have 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
         self.name = name
         self.driver = driver
         self.server = server_end
         self.clock = clock
-        self.run_id = secrets.randbits(63)  #: another number in each run
+        self.run_id = secrets.randbits(63)  #: differs in each run
         self.capabilities = driver.capabilities()
         software = software_actions(self.capabilities.actions)
         if software != self.capabilities.software:
@@ -128,7 +130,7 @@ class Proxy:
             clock=clock,
             capabilities=self.capabilities,
             state_of=flight.state,
-            # Its parameters are read again, now that the vehicle has come.
+            # Read its parameters again, now that the vehicle answers.
             on_link_up=lambda: self._requests.call_later(self._parameter_requests.read_driver),
             scrub=driver.uri.scrub,
         )
@@ -176,29 +178,29 @@ class Proxy:
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = False
-        self.ended = False  #: whether it ends, or has ended
+        self.ended = False  #: whether it is ending, or has ended
         self._trail: AuditTrail | None = None
         self._record: FlightRecord | None = None
         self._decode = decode
         self._command, self._aged = self.handler.command, self.handler.aged
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write who flies when to this trail and close it with the proxy. Call before :meth:`start`."""
+        """Write an audit trail, which is closed with the proxy. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
 
     def keep_record(self, record: FlightRecord) -> None:
-        """Note in this file which flight is the proxy's, and end the one noted there. Call before :meth:`start`."""
+        """Keep a note of the proxy's flight in this file, and end a flight noted there. Call before :meth:`start`."""
         self._record = record
         self.handler.on_ownership = record.set
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start to serve. Raises what transport and driver raise when they cannot be opened; it is stopped then."""
+        """Start to serve. Raises the errors of opening transport and driver, after stopping again."""
         with self._life_lock:
             if self._started:
-                raise UsageError(f"proxy {self.name} was started before: make another one")
+                raise UsageError(f"proxy {self.name} was started before: create another one")
             self._started = True
         leave_to_parent(self)
         self._parameter_requests.read_driver()
@@ -223,7 +225,7 @@ class Proxy:
             self.driver.open(self.publisher)
         except BaseException as error:
             self.end()
-            if self.driver.uri.scrub(str(error)) != str(error):  # of a library that tells what it could not open
+            if self.driver.uri.scrub(str(error)) != str(error):  # the message contains the address
                 raise DriverError(self.driver.uri.scrub(str(error))) from None
             raise
         if self._ticker is not None:
@@ -238,32 +240,33 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight and then the proxy, and give every resource back. Idempotent. Any thread but the driver's own.
+        """End the flight and then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
 
-        First everything is barred but landing and the emergency stop, for good, whether or not the vehicle flies. What
-        flies is landed. What has not landed in time is left hovering if the vehicle hovers by itself; else it is told
-        to stand still, once, as nobody steers it from then on.
+        First, everything except landing and emergency stop is barred for good, whether or not the vehicle flies. Then a
+        flying vehicle is landed. If it has not landed in time, it is left hovering if it can hover on its own;
+        otherwise it is told once to stand still, because nothing steers it afterwards.
 
         Args:
-            within_s: How long it may take to land [s]; 0: it does not land.
-            reason: Why it ends, for people.
-            hurry: Asked several times a second whether to wait for the landing no longer. A vehicle that does not hover
-                by itself is landed all the same, for as long as it may take: without its proxy it would fall.
-            unless_flying: What has not landed in time goes on to land, and the proxy goes on.
-            hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or to hover: what
-                may hang is left to daemon threads, and the vehicle is on its own, as when its proxy is killed.
+            within_s: Time limit for the landing [s]; 0: don't land.
+            reason: The reason, for people.
+            hurry: Called several times a second; True ends the wait for the landing. A vehicle that does not hover on
+                its own is still landed, however long it takes: without its proxy it would fall.
+            unless_flying: If it has not landed in time, the landing continues, and so does the proxy.
+            hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or hover: calls
+                that may hang are left to daemon threads, and the vehicle is on its own, as if its proxy had been
+                killed.
 
         Returns:
-            Whether nothing of the proxy's flies any more.
+            Whether no flight of the proxy remains.
 
         Raises:
-            Exception: What one of the steps raised, when all are done. Where the driver hangs that goes to the log.
+            Exception: The error of a step, after all are done. If the driver hangs, it goes to the log.
         """
         if not self._started or self.ended:
             return True
         try:
             landed = not hangs and self._land(within_s, hurry)
-        except Exception:  # noqa: BLE001  what it can't land is left hovering, and closed
+        except Exception:  # noqa: BLE001  if it can't land, it is left hovering, and closed
             _log.exception("the landing at the end of proxy %s failed", self.name)
             landed = False
         if unless_flying and not landed:
@@ -274,21 +277,21 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # from the last to the first, each of them whatever another one raises
+        with ExitStack() as steps:  # from last to first, each one whatever the others raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
             steps.callback(self._abandon if hangs else self._close)
             steps.callback(self.overview.end)
             steps.callback(self.events.publish, EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-            if not hangs:  # first of all: nothing is obeyed any more, nor steered
+            if not hangs:  # first of all, stop obeying and steering
                 steps.callback(lambda: self.handler.leave_hovering(self.clock()))
                 if self._ticker is not None and self._ticker.is_alive():
                     self._ticker.join()
         return landed
 
     def _land(self, within_s: float, hurry: Callable[[], bool]) -> bool:
-        """Land what flies; return whether nothing of the proxy's flies any more."""
+        """Land a flying vehicle; return whether no flight of the proxy remains."""
         handler, hovers = self.handler, "hover" in self.capabilities.actions
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s and not (hovers and hurry()):
@@ -299,18 +302,18 @@ class Proxy:
         return not handler.airborne
 
     def _close(self) -> None:
-        with ExitStack() as steps:  # from the last to the first
+        with ExitStack() as steps:  # from last to first
             steps.callback(self.server.stop)
             steps.callback(self.publisher.streams.end)
             steps.callback(self.driver.close)
             steps.callback(self._requests.stop)
 
     def forked(self) -> None:
-        """Leave the vehicle and the clients to the parent process; in a child made by ``os.fork``."""
+        """Leave the vehicle and the clients to the parent process; called in a child of ``os.fork``."""
         self.ended = True
 
     def _abandon(self) -> None:
-        """Give back what can be, without waiting for what hangs; what fails goes to the log."""
+        """Release resources without waiting for hanging parts; failures go to the log."""
         parts: tuple[Callable[[], object], ...] = (
             self.server.stop,
             self.driver.close,
@@ -329,8 +332,8 @@ class Proxy:
     def _give_back(self, part: Callable[[], object]) -> None:
         try:
             part()
-        except BaseException:  # noqa: BLE001  nothing else would ever tell
-            _log.exception("proxy %s was given up, and not all of it could be given back", self.name)
+        except BaseException:  # noqa: BLE001  nothing else would ever report it
+            _log.exception("proxy %s was abandoned, and not all of its resources could be released", self.name)
 
     def __enter__(self) -> Proxy:
         self.start()
@@ -342,11 +345,11 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """An application connected; it has no name and no role until its Hello."""
+        """Handle a new connection, which has no name and no role until its Hello."""
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet of an application, on the receiving thread."""
+        """Handle an application's packet, on the receiving thread."""
         now_ns = self.clock()
         session = self._sessions.get(peer.id)
         if session is None or session.ended:
@@ -372,10 +375,10 @@ class Proxy:
         elif isinstance(sample, StreamReport):
             self._malformed(session, self.publisher.streams.report(sample), now_ns)
         else:
-            self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
+            self._malformed(session, f"{kind.__name__} may only be sent by the proxy", now_ns)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Count and publish a packet that the sender's keys do not allow, or whose sender is not connected."""
+        """Count and report a packet that the sender's keys do not allow, or whose sender is not connected."""
         session = self._sessions.get(peer.id)
         name = None if session is None else session.name
         code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
@@ -391,17 +394,17 @@ class Proxy:
         )
 
     def topic_problem(self, topic: str) -> str:
-        """Return why nobody can subscribe to a topic; empty if it exists."""
+        """Return why a topic can't be subscribed to; empty if it can."""
         return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Count what an application asked of the transport in vain as malformed."""
+        """Count an invalid request to the transport as malformed."""
         session = self._sessions.get(peer.id)
         if session is not None and not session.ended:
             self._malformed(session, reason, self.clock())
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """An application's connection ended."""
+        """Handle the end of an application's connection."""
         session = self._sessions.get(peer.id)
         if session is None:
             return
@@ -410,7 +413,7 @@ class Proxy:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
-        if self._stopping.is_set():  # everybody leaves, and the driver may be closed already
+        if self._stopping.is_set():  # everyone leaves, and the driver may already be closed
             self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
@@ -418,7 +421,7 @@ class Proxy:
         del self._sessions[peer.id]
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
-        """Count a packet as malformed if there is a reason to, and end a connection that sends too many."""
+        """Count a packet as malformed if there is a reason, and end a connection that sends too many."""
         if not reason:
             return
         self._counts["packets.malformed"] += 1
@@ -439,8 +442,8 @@ class Proxy:
     # Time ------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """Update what goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, events."""
-        if self._stopping.is_set():  # a tick may come after the end, of one ticker for many, or back from a hang
+        """Update all that depends on time: authority, failsafe, autopilot, feedback of a silent vehicle, events."""
+        if self._stopping.is_set():  # a shared ticker, or one back from a hang, may tick after the end
             return
         self.tick_flight(now_ns)
         self._end_silent(now_ns)
@@ -449,7 +452,7 @@ class Proxy:
         self.overview.tick(now_ns)
 
     def tick_flight(self, now_ns: int) -> None:
-        """Update of what :meth:`tick` does that which a flight needs 50 times a second; the rest may be seldom."""
+        """Do the part of :meth:`tick` that a flight needs 50 times a second; the rest may run less often."""
         if self._stopping.is_set():
             return
         self.handler.tick(now_ns)
@@ -457,17 +460,17 @@ class Proxy:
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing flies, nobody is in command, and feedback shows so: there is nothing to hurry for."""
+        """Whether nothing flies, there is no pilot, and feedback shows both, so that nothing is urgent."""
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
-        """End connections without a Hello: they take places from others."""
+        """End connections without a Hello, because they occupy places."""
         for session in list(self._sessions.values()):
             if session.role is None and not session.ended and now_ns - session.joined_ns > HELLO_NS:
                 session.ended = True
                 self._counts["connections.silent"] += 1
-                why = f"no Hello came within {seconds(HELLO_NS):g} s"
-                text = f"a connection of {session.peer.address} was ended: {why}"
+                why = f"no Hello arrived within {seconds(HELLO_NS):g} s"
+                text = f"a connection of {session.peer.address} was closed: {why}"
                 data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": why, "app_id": session.app_id}
                 draft = partial(EventDraft, EventKind.APPLICATION_LINK, text, data=data)
                 self.events.publish_repeated(("silent",), draft)
@@ -481,13 +484,13 @@ class Proxy:
                 self.tick(self.clock())
             except Exception:  # noqa: BLE001  the vehicle needs its failsafe whatever is wrong here
                 _log.exception("a step of the ticker failed")
-            due_ns = max(due_ns + period_ns, time.monotonic_ns())  # late ones are not made up for
+            due_ns = max(due_ns + period_ns, time.monotonic_ns())  # missed periods are skipped
 
     # Requests that the proxy itself answers --------------------------------------------------------------------
 
     def _greet(self, session: Session, hello: Hello, now_ns: int) -> AnyReply:
         if session.role is not None:
-            return Refused(Refusal.PROTOCOL, "Hello came before on this connection")
+            return Refused(Refusal.PROTOCOL, "Hello was already sent on this connection")
         full = self.server.admit(session.peer, pilot=hello.role is Role.PILOT)
         if full:
             return Refused(Refusal.BUSY, full)
@@ -498,10 +501,10 @@ class Proxy:
         return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
 
     def statistics(self) -> dict[str, float]:
-        """Return all counters by dotted name, as applications get them by ``GetStatistics``. Any thread."""
+        """Return all counters by dotted name, as for ``GetStatistics``. Thread-safe."""
         return self._counters.snapshot(applications=self.applications, **self.server.counters)
 
     @property
     def applications(self) -> int:
-        """How many applications are connected. Any thread."""
+        """Return the number of connected applications. Thread-safe."""
         return sum(session.role is not None for session in list(self._sessions.values()))

@@ -1,11 +1,12 @@
-"""Files that a proxy writes, each on its own thread: the audit trail, and the note of its flight.
+"""Files that a proxy writes, each in its own thread: the audit trail, and the note of its flight.
 
-The audit trail says who flew when, one JSON object a line, only ever appended to. ``docs/sharing.md`` describes it.
-:func:`entry_of` and :func:`tenures` are pure: events to lines, and lines to a table.
+The audit trail records who flew when, one JSON object per line, append-only. ``docs/sharing.md`` describes it.
+:func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
-The note says that a flight is this proxy's: one that was killed ends its own flight when it is back. It is written when
-a flight becomes the proxy's, kept young while it lasts, and removed when it is over, somebody else's, or not looked for
-any more. It is believed for :data:`LIFE_S`: after that somebody else may have begun another flight.
+The note records that a flight is this proxy's, so that a proxy that was killed ends its own flight after its restart.
+It is written when a flight becomes the proxy's, refreshed while it lasts, and removed when it is over, belongs to
+others, or can no longer turn up. It is valid for :data:`LIFE_S`: after that, someone else may have started another
+flight.
 """
 
 from __future__ import annotations
@@ -27,49 +28,49 @@ from skyloop.errors import UsageError
 from skyloop.messages import Event, EventKind, FlightState
 from skyloop.proxy.core.flight import BELIEF_NS
 
-CLOSE_S: Final = 2.0  #: how long the end of a proxy waits for each file
+CLOSE_S: Final = 2.0  #: how long ending a proxy waits for each file
 FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
 _MODE: Final = 0o600
 
-#: How long a note is believed: a supervisor restarts a proxy within seconds, before anybody changes the pilot.
+#: How long a note is valid: a supervisor restarts a proxy within seconds, before anyone changes the pilot.
 LIFE_S: Final = seconds(BELIEF_NS)
-KEEP_S: Final = 2.0  #: how often it is made young
-MAX_BYTES: Final = 4096  #: of an address; a longer file is none of ours
+KEEP_S: Final = 2.0  #: how often it is refreshed
+MAX_BYTES: Final = 4096  #: of an address; a longer file is not ours
 NOTE_SUFFIX: Final = ".flight"
 
 _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line. Which of the fields there are, depends on ``what``."""
+    """One line; ``what`` determines its fields."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
     run: str  #: of the proxy, at random
     what: str  #: ``begin``, ``granted``, ``ended``, ``takeoff``, ``landed``, ``emergency`` or ``end``
     who: str = ""  #: name of the application
-    identity: str = ""  #: what the transport knows of it: process and user, or a certificate's name
+    identity: str = ""  #: the transport's information: process and user, or a certificate's name
     lease: int = 0
     priority: int = 0
-    how: str = ""  #: why a lease, or the run, ended; the vehicle's address at the begin of a run
+    how: str = ""  #: why a lease, or the run, ended; in ``begin``, the vehicle's address
 
 
 class Tenure(msgspec.Struct, frozen=True):
-    """From a grant to its end."""
+    """The time from a grant to its end."""
 
     proxy: str
     who: str
     identity: str
     priority: int
     begin: datetime
-    end: datetime | None  #: None: it goes on, or the proxy was killed
-    how: str  #: how it ended; empty: not ended, as far as the file shows
+    end: datetime | None  #: None: it continues, or the proxy was killed
+    how: str  #: why it ended; empty: not ended, as far as the file shows
     takeoffs: int = 0
 
 
 def entry_of(event: Event, at: datetime, proxy: str, run: str) -> Entry | None:
-    """The line of an event; None for one that is no part of who flew when."""
+    """Return the line for an event; None for events that the trail does not record."""
     data, who = event.data, event.app or ""
     lease = data.get("lease")
     numbered = Entry(at, proxy, run, "", who, lease=lease if isinstance(lease, int) else 0)
@@ -101,7 +102,7 @@ def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
 
 
 def tenures(entries: Iterable[Entry]) -> list[Tenure]:
-    """Who held the authority from when to when, in the order of the grants; entries of several proxies may be mixed."""
+    """Return the times of authority in order of the grants; entries of several proxies may be mixed."""
     done: list[Tenure] = []
     held: dict[str, int] = {}
     for entry in entries:
@@ -123,9 +124,9 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """The entries of a file, and how many of its lines can't be understood (as one that a crash has torn).
+    """Read the entries of a file; return them and the number of unreadable lines (for example, cut by a crash).
 
-    Raises :class:`UsageError` for a file that can't be read.
+    Raises :class:`UsageError` for an unreadable file.
     """
     try:
         lines = path.read_bytes().splitlines()
@@ -141,22 +142,22 @@ def read(path: Path) -> tuple[list[Entry], int]:
 
 
 def audit_folder() -> Path:
-    """Where the files are by default: in the user's state directory."""
+    """Return the default folder of the files, in the user's state directory."""
     import platformdirs
 
     return Path(platformdirs.user_state_dir("skyloop", appauthor=False)) / FOLDER
 
 
 def audit_path(name: str) -> Path:
-    """The file of a proxy."""
+    """Return the file of a proxy."""
     return audit_folder() / (name + SUFFIX)
 
 
 class AuditTrail:
-    """Writes the lines of one proxy's run, on a thread of its own: :meth:`note` never waits for the disk."""
+    """Writes the lines of one proxy's run in its own thread, so that :meth:`note` never waits for the disk."""
 
     def __init__(self, path: Path, proxy: str, run: str, wall: Callable[[], datetime] | None = None) -> None:
-        """Opens the file. Raises ``OSError``."""
+        """Open the file. Raises ``OSError``."""
         self.path = path
         self._proxy = proxy
         self._run = run
@@ -169,17 +170,17 @@ class AuditTrail:
         self._thread.start()
 
     def begin(self, uri: str) -> None:
-        """The proxy's run begins."""
+        """Note the start of the proxy's run."""
         self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:
-        """Take an event. Any thread."""
+        """Note an event. Thread-safe."""
         entry = entry_of(event, self._wall(), self._proxy, self._run)
         if entry is not None:
             self._queue.put(entry)
 
     def close(self) -> None:
-        """Write the remaining lines, for :data:`CLOSE_S` at most."""
+        """Write the remaining lines, within :data:`CLOSE_S`."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
 
@@ -195,7 +196,7 @@ class AuditTrail:
             os.write(self._file, line)  # one call, so that lines of several writers do not mix
             self._failed = False
         except OSError as error:
-            if not self._failed:  # a full disk is logged once, and the flight goes on
+            if not self._failed:  # a full disk is logged once, and the flight continues
                 _log.error("the audit trail %s can't be written: %s", self.path, error)
             self._failed = True
 
@@ -204,23 +205,23 @@ class AuditTrail:
 
 
 def record_path(name: str) -> Path:
-    """The file of a proxy: beside its socket, where only its user may write."""
+    """Return the file of a proxy: beside its socket, where only its user may write."""
     from skyloop.transport.local.directory import find_directory
 
     return find_directory().path / (name + NOTE_SUFFIX)
 
 
 class FlightRecord:
-    """The file of one proxy, written on a thread of its own from :meth:`start` to :meth:`close`.
+    """The file of one proxy, written in its own thread from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: its address, as a note about another vehicle is not believed; ``wall``: the wall clock [s].
+    ``vehicle``: its address, because a note about another vehicle does not count; ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:
         self.path = path
         self._vehicle = vehicle
         self._wall = wall
-        self._ours: bool | None = None  # not known yet: the note stays as it is
+        self._ours: bool | None = None  # unknown yet: the note stays unchanged
         self._written = False
         self._failed = False
         self._closing = False
@@ -228,7 +229,7 @@ class FlightRecord:
         self._thread: threading.Thread | None = None
 
     def left_s(self) -> float:
-        """Return for how long the flight of an earlier run may still be found [s]; 0: there is none.
+        """Return how long the flight of an earlier run may still turn up [s]; 0: there is none.
 
         Call before :meth:`start`.
         """
@@ -238,7 +239,7 @@ class FlightRecord:
                 content = file.read(MAX_BYTES)
         except (OSError, ValueError):
             return 0.0
-        believed = content == self._vehicle and -1.0 <= age_s <= LIFE_S  # a clock is no better than that
+        believed = content == self._vehicle and -1.0 <= age_s <= LIFE_S  # tolerance for an inaccurate clock
         return LIFE_S - max(0.0, age_s) if believed else 0.0
 
     def start(self) -> None:
@@ -247,25 +248,25 @@ class FlightRecord:
         self._thread.start()
 
     def set(self, ours: bool) -> None:
-        """Record whether the flight is this proxy's now. Any thread; never waits."""
+        """Record whether the flight is this proxy's. Thread-safe; never waits."""
         if ours is not self._ours:
             self._ours = ours
             self._changed.set()
 
     def close(self) -> None:
-        """Write the last word. What is left in the air stays noted, so that a new run of the proxy can end it."""
+        """Write the last state. A vehicle left in the air stays noted, so that the next run can end its flight."""
         thread, self._thread = self._thread, None
         if thread is not None:
             self._closing = True
             self._changed.set()
-            thread.join(CLOSE_S)  # a file system may hang: the proxy's end does not
+            thread.join(CLOSE_S)  # a file system may hang, but not the end of the proxy
 
     def _run(self) -> None:
         closing = False
         while not closing:
             self._changed.wait(KEEP_S if self._ours else None)
             self._changed.clear()
-            closing = self._closing  # before the last word is read: what is set while it is written is written too
+            closing = self._closing  # read before the state, so that a change during the write is written, too
             try:
                 self._write()
             except OSError as error:

@@ -1,4 +1,4 @@
-"""A proxy as a process: what ``skyloop proxy`` runs."""
+"""A proxy as a process, as in ``skyloop proxy``."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from skyloop.proxy.records import AuditTrail, FlightRecord, audit_path, record_p
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
-LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy does whose program is gone
+LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits after its program has gone
 _POLL_S: Final = 0.2
-GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is printed about waiting
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then, no waiting is printed
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 K = TypeVar("K")
 
-#: Says what is new about the keys of the network, a sentence each.
+#: Returns news about the keys of the network, one sentence each.
 Look = Callable[[], Sequence[str]]
-#: What runs beside the proxies of a process, such as an endpoint for metrics.
+#: Runs beside the proxies of a process, such as an endpoint for metrics.
 Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
 class LinkLines:
-    """Lines about one proxy's vehicle link for the terminal: one when the link, or the reason, has changed."""
+    """Lines for the terminal about one proxy's vehicle link: one for each change of the link or its reason."""
 
     def __init__(self, name: str, where: str, now_ns: int) -> None:
-        """``where``: what is served and at which address."""
+        """Initialise; ``where``: the vehicle and the address that serves it."""
         self._name = name
         self._where = where
         self._began_ns = now_ns
@@ -51,14 +51,14 @@ class LinkLines:
         self._was_there = False
 
     def first(self, state: LinkState) -> str:
-        """Return the first line, that applications can connect: ``ready`` only if there is a vehicle as well."""
+        """Return the first line, once applications can connect: ``ready`` only if the vehicle answers, too."""
         self._was_there = state in _THERE
         if self._was_there:
             self._written = state, "", ""
         return f"{'ready' if self._was_there else 'serving'} {self._name}: {self._where}"
 
     def changed(self, state: LinkState, reason: str, remedy: str, now_ns: int) -> str:
-        """Return what is new; empty if nothing is."""
+        """Return the line for a change; empty if nothing changed."""
         now = state, reason, remedy
         if now == self._written or (state is LinkState.CONNECTING and now_ns - self._began_ns < GRACE_NS):
             return ""
@@ -72,16 +72,16 @@ class LinkLines:
 
 
 class Shutdown:
-    """Why a process with proxies must end, and how fast."""
+    """The request to end a process with proxies, and its urgency."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
-        self.hurry = threading.Event()  #: do not land first
+        self.hurry = threading.Event()  #: don't land first
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
-        """Ask for the end. Any thread, and signal handlers."""
-        if hurry or self.requested.is_set():  # a second signal means now
+        """Request the end. Thread-safe, also for signal handlers."""
+        if hurry or self.requested.is_set():  # a second signal means: at once
             self.hurry.set()
         self.reason = self.reason or reason
         self.requested.set()
@@ -99,19 +99,18 @@ def serve(
     audit: Path | None = None,
     beside: Beside | None = None,
 ) -> None:
-    """Serve a vehicle to this host's applications under a name; blocks. On the main thread.
+    """Serve a vehicle to this host's applications under a name. Blocks; call on the main thread.
 
-    ``make_end`` makes another transport server, of the name and the vehicle's address: one of the network, or several.
+    ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
 
-    Writes to standard output a line that begins with ``ready`` when applications can connect and the vehicle is there;
-    ``serving`` while it is not, and then, whenever that changes, what is waited for, why it failed last and what to do
-    (not with ``parent_fd``). Ends on SIGINT or
-    SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal waits no longer. With
-    ``parent_fd``, the reading end of a pipe: lands and ends when that reads end of file, which the death of the parent
-    causes, and leaves SIGINT to the parent, as a terminal sends it to both. ``look`` is called some times a second:
-    what it returns about the keys is logged, and published as an event.
+    Writes a line to standard output that starts with ``ready`` when applications can connect and the vehicle answers.
+    Otherwise it writes ``serving`` and then, at each change, the expected event, the last failure and a remedy (not
+    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s];
+    a second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
+    which the death of the parent causes, and leaves SIGINT to the parent, because a terminal sends it to both. ``look``
+    is called several times a second; its news about the keys are logged, and published as an event.
 
-    Raises :class:`UsageError` (also for a name or address that makes no sense, or a name that is taken) and
+    Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
     """
     from skyloop.transport.local import LocalServer
@@ -142,11 +141,10 @@ def run(
 ) -> None:
     """Serve several vehicles from one process, as :func:`serve` does one: several drones of one simulated world.
 
-    The proxies are started here and stopped at the end; lines are written of each, as :func:`serve` does. ``audit``:
-    the file of the audit trail; by default each proxy has one in the user's directory of state, and a private one (with
-    ``parent_fd``) none. ``records``: whether there is an audit trail, and a note of a flight for the next run; by
-    default not for private ones, which are not started again under their name. ``beside``: entered with the proxies
-    before they start, and left when they have ended.
+    Starts the proxies, and stops them at the end; writes lines for each, like :func:`serve`. ``audit``: the file of the
+    audit trail; by default each proxy has one in the user's state directory, and a private one (with ``parent_fd``) has
+    none. ``records``: whether to keep an audit trail, and a note of a flight for the next run; by default not for
+    private proxies, which are never restarted under their name. ``beside``: a context around the proxies' life.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -170,17 +168,17 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            # Nobody starts a private one again, or can fly what it leaves in the air.
+            # No one restarts a private proxy, or could fly a vehicle that it leaves in the air.
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
                 land_within_s = max(land_within_s, ORPHAN_LANDS_WITHIN_S)
-        within_s = land_within_s  # from here on something may fly
+        within_s = land_within_s  # from here on, something may be flying
         lines = [_announced(proxy) for proxy in proxies]
-        # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
+        # Wakes now and then: the kernel may deliver a signal to any thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
                 _publish_keys(proxies, change)
-            if parent_fd is None:  # a parent gets the proxy's events, and may not read what is written here
+            if parent_fd is None:  # a parent gets the proxy's events, and may not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
 
@@ -194,7 +192,7 @@ def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
     """Give a proxy its audit trail.
 
-    Raises :class:`UsageError` where the file that was asked for can't be written; the usual one may be missing.
+    Raises :class:`UsageError` if a requested file can't be written; the default one may be missing.
     """
     chosen = path or audit_path(proxy.name)
     try:
@@ -206,9 +204,9 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 
 
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
-    """End several proxies at the same time, as :meth:`Proxy.end` does each. Raises what one of them does, then.
+    """End several proxies at the same time, with :meth:`Proxy.end`; then raise the first of their errors.
 
-    Ctrl-C, where nothing else handles it, waits no longer for those that land, and is raised when all have ended.
+    Ctrl-C, if nothing else handles it, ends the wait for landings, and is raised when all have ended.
     """
     raised: list[Exception] = []
     with interrupt_deferred() as interrupted:
@@ -234,36 +232,36 @@ def at_once(
     over: Callable[[K], bool] = lambda _: False,
     daemon: bool = False,
 ) -> None:
-    """Call at the same time what ends each of several flights, and wait for all.
+    """Run the ends of several flights at the same time, and wait for all.
 
     Args:
-        ends: What ends each, on a thread of its own; must not raise.
-        tell: Told of those for which there is no thread, before the first of them ends: they do so in turn.
-        over: Whether one is not waited for any more.
+        ends: The functions that end them, each run in its own thread; must not raise.
+        tell: Called with those without a thread, before the first of them ends: they run one after another.
+        over: Returns whether to stop waiting for one.
         daemon: Whether the program may end before them.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
         thread = threading.Thread(target=end, name="skyloop-end", daemon=daemon)
-        with suppress(RuntimeError):  # there is none to be had: it ends all the same
+        with suppress(RuntimeError):  # no thread is available: it still ends, below
             thread.start()
             threads[one] = thread
     left = [one for one in ends if one not in threads]
     for one in left:
         try:
             tell(one)
-        except Exception:  # noqa: BLE001  it is ended all the same
-            _log.exception("one of several that end together could not be told so")
+        except Exception:  # noqa: BLE001  it is still ended
+            _log.exception("could not report that several flights end one after another")
     for one in left:
         ends[one]()
     for one, thread in threads.items():
-        while thread.is_alive() and not over(one):  # looks up now and then, for signals
+        while thread.is_alive() and not over(one):  # wakes now and then, for signals
             thread.join(_POLL_S)
 
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Let SIGINT (unless it is the parent's to handle) and SIGTERM ask for the end. On the main thread."""
+    """Let SIGINT (unless the parent handles it) and SIGTERM request the end. On the main thread."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
@@ -301,5 +299,5 @@ def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
 
 
 def _announce(line: str) -> None:
-    with suppress(OSError):  # nobody reads standard output: the proxy serves all the same
+    with suppress(OSError):  # no one reads standard output: keep serving
         print(line, flush=True)

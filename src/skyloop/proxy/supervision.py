@@ -1,11 +1,11 @@
-"""What time, links and the authority ask of a flight, and the one lock around every decision about it.
+"""The demands of time, links and the authority on a flight, and the one lock around every decision about it.
 
-Every decision is made under this lock, for as long as it and the driver's call last. The transport's threads bring
+Every decision is made under this lock, which is held during the driver's call, too. The transport's threads bring
 commands and requests for the authority (:mod:`skyloop.proxy.handler`), the ticker brings the time. The decisions
 themselves are pure, in :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing that is called under those two calls back
-here; a driver publishes what it receives from any thread without this lock.
+Lock order: this lock first, then the publisher's, then the events'. Nothing called under those two calls back here; a
+driver publishes what it receives from any thread without this lock.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
-_NOTICED_M_S: Final = 0.05  #: a step of the software autopilot that is shortened by less is not worth telling
-#: So much more sleep of the computer than was known is one: shorter ones are not told from a delay.
+_NOTICED_M_S: Final = 0.05  #: smaller reductions of the software autopilot's steps are not reported
+#: Additional sleep of the computer that counts: less can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
 class FlightSupervisor:
-    """Authority, failsafe and ownership of one vehicle. Public methods may be called from any thread.
+    """Authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections by the application's number, read here and changed by the proxy. ``slept``: for how
-    long the computer has slept, in all [ns].
+    ``sessions``: the connections by number of the application, read here and changed by the proxy. ``slept``: returns
+    how long the computer has slept in total [ns].
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class FlightSupervisor:
             why_not=executor.why_not,
             native=executor.native,
         )
-        self.on_ownership: Callable[[bool], None] | None = None  #: called with whether the flight is ours, locked
+        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock: is the flight ours?
         self._returns = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
@@ -109,30 +109,30 @@ class FlightSupervisor:
         self._subscribers = server.subscribers
         self._sessions = sessions
         self._clock = clock
-        self._left = False  # the proxy ends: nothing flies by a decision of it any more
-        self._pilot = "none"  # why nobody holds the authority, or "held"
-        self._breaks_seen = 0  # of the vehicle's link, when last looked at
-        self._heard_ns = -LATEST_NS  # when the vehicle was heard last, as far as a tick noticed
+        self._left = False  # the proxy is ending: it makes no more decisions about the flight
+        self._pilot = "none"  # why there is no holder of the authority, or "held"
+        self._breaks_seen = 0  # breaks of the vehicle link at the last check
+        self._heard_ns = -LATEST_NS  # when the vehicle was last received, as far as a tick noticed
         self._slept = slept
-        self._slept_seen = slept()  # when last looked at, or noticed
-        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # for how long it slept last, and since when it is awake
-        #: Until when a take-off that the vehicle was told of, and does not show yet, has time to; None: there is none.
+        self._slept_seen = slept()  # value at the last check
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and the time of waking
+        #: Deadline for a take-off that the vehicle got but does not show yet; None: there is none.
         self._rising_until_ns: int | None = None
-        self._drifts = False  # what the software autopilot flies; told last
-        self._enforced = True  # whether the safety box and zones could be, at the last set-point
-        self._episodes = Episodes()  # of limits that touch what the proxy does with nobody in command
+        self._drifts = False  # of the software autopilot; as last reported
+        self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
+        self._episodes = Episodes()  # of limits on the proxy's actions without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
-        """Begin the run, before the server starts. A flight of an earlier run waits for its pilot."""
+        """Start the run, before the server starts. A flight of an earlier run waits for its pilot."""
         self.authority.last_command_ns = now_ns
 
     def tick(self, now_ns: int) -> None:
         """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace.
 
-        Raises what the driver raised when it was asked who flies the vehicle, when all else is done.
+        If the driver failed to report who flies the vehicle, raises its error after everything else is done.
         """
         with self._lock:
             if self._left:
@@ -167,13 +167,14 @@ class FlightSupervisor:
             if error is not None:
                 raise error
 
-    # All below is called under the lock: the vehicle's link, and whose the flight is ------------------------------
+    # The vehicle link, and whose flight it is; under the lock -------------------------------------------------------
 
     def _observe_link(self, now_ns: int) -> None:
-        """Act on what happened to the vehicle's link since it was last observed.
+        """Act on changes of the vehicle link since the last call.
 
-        Intents end when it breaks and when it is back, so that nothing asked for in between is done later. Hover is
-        given both times: a driver must not go on with an old set-point. A pilot's landing lasts, as nothing is safer.
+        Intents end when the link breaks and when it returns, so that nothing requested in between is executed later.
+        Both times the vehicle gets a hover, because a driver must not continue an old set-point. A pilot's landing
+        stays, as nothing is safer.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -190,10 +191,10 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Give up a hover or landing when the vehicle has not been heard for long: by then it may be on another flight.
+        """Abandon a hover or landing of a vehicle that has long been silent: it may be on another flight by then.
 
-        A landing that the ladder ordered leaves what is found in the air to others at once: nobody is there to say
-        whose it is. After all else that is given up it does so when the vehicle is heard, as its pilot may be there.
+        After a landing by the ladder, a vehicle found in the air belongs to others at once: no pilot is there to claim
+        it. In all other cases that is decided when the vehicle is received again, because its pilot may be there.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -206,7 +207,7 @@ class FlightSupervisor:
             return
         lands = ladder.lands or (asked is not None and type(asked.action) is Land)
         if asked is not None:
-            self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: ask for it again", Refusal.VEHICLE_LINK_LOST)
+            self._end_intents(Fate.TIMED_OUT, now_ns, f"{UNHEARD}: command it again", Refusal.VEHICLE_LINK_LOST)
         if ladder.step is not Failsafe.LAND:
             ladder.give_up()
         elif not self.flight.forget():
@@ -216,7 +217,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """Act on a sleep of the computer: all that is known is older than its clock says."""
+        """Act on a sleep of the computer: all known times are older than the clock shows."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -228,13 +229,13 @@ class FlightSupervisor:
         self._start_over(Fate.SLEPT, now_ns)
 
     def _observe_position(self, now_ns: int) -> None:
-        """Note where the vehicle is, and hover where that jumped: what was asked for meant another place."""
+        """Note the vehicle's position; hover if it jumped, because the request was meant for another place."""
         airspace = self.checks.airspace
         airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
             return
-        if self._executor.supported and self._executor.airborne and self.flight.ours:  # nobody flies a recording
-            lands = self._asked(Land) is not None or self.ladder.lands_on  # wherever it is
+        if self._executor.supported and self._executor.airborne and self.flight.ours:  # a recording has no pilot
+            lands = self._asked(Land) is not None or self.ladder.lands_on  # a landing is fine anywhere
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
@@ -242,16 +243,16 @@ class FlightSupervisor:
         airspace.jumped_m = 0.0
 
     def _start_over(self, fate: Fate, now_ns: int) -> None:
-        """Hover, and let nothing that was asked for until now be done later."""
+        """Hover, and end all requests so that none is executed later."""
         self._end_intents(fate, now_ns)
         self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
 
     def _look(self, now_ns: int) -> Snapshot:
-        """Look at the vehicle, and act on what has changed about whose flight it is."""
+        """Observe the vehicle, and act on a change of hands of its flight."""
         executor, flight = self._executor, self.flight
         changed = executor.observe(now_ns)
-        if self.on_ownership is not None and not flight.awaited:  # else the note of it stays as it is
+        if self.on_ownership is not None and not flight.awaited:  # otherwise the note stays unchanged
             self.on_ownership(flight.ours)
         if changed is not None:
             self._stamp()
@@ -259,9 +260,9 @@ class FlightSupervisor:
                 executor.stop_autopilot()
                 why = f"{flight.others}: hover, take off or land first to take it over"
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
-            elif changed.why:  # found on a flight that is ours: its pilot may come back, as if it had just commanded
+            elif changed.why:  # a flight of ours turned up: its pilot may return, so the silence starts now
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
-            if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
+            if changed.why and executor.supported:  # a played recording flies on its own, which surprises no one
                 self._events.publish_drafts(ownership_event(changed))
         return executor.seen(now_ns)
 
@@ -269,18 +270,18 @@ class FlightSupervisor:
 
     @property
     def _holder(self) -> Session | None:
-        """The connection of who holds the authority."""
+        """The connection of the holder of the authority."""
         holder = self.authority.holder
         return None if holder is None else self._sessions.get(holder.app_id)
 
     def _asked(self, *kinds: type[Action]) -> Intent | None:
-        """What the holder asks for, where that is of one of these kinds and under way."""
+        """Return the holder's intent if it is of one of these kinds and in progress."""
         session = self._holder
         newest = None if session is None else session.intents.newest
         return newest if newest is not None and type(newest.action) in kinds and not newest.over else None
 
     def _end_intents(self, fate: Fate, now_ns: int, why: str = "", reason: Refusal | None = None) -> None:
-        """End what the holder asked for until now."""
+        """End all of the holder's requests so far."""
         session = self._holder
         if session is not None:
             session.intents.end(fate, why, reason)
@@ -288,11 +289,11 @@ class FlightSupervisor:
         self._withdraw_takeoff(now_ns)
 
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
-        """End, or complete, what a holder asked for by what the vehicle does; return the flight state."""
+        """End or complete the holder's intent by the vehicle's actions; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
-                self._look(now_ns)  # a landing may be others': then that is what ended it
+                self._look(now_ns)  # a landing may be by others: then that ended it
             feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
@@ -305,29 +306,32 @@ class FlightSupervisor:
         return self._executor.state
 
     def _observe_takeoff(self, now_ns: int) -> None:
-        """Withdraw a take-off that has had its time, although a set-point may have taken its place meanwhile."""
+        """Withdraw a take-off past its deadline, even if a set-point has replaced it."""
         if self._rising_until_ns is not None and not self._executor.stands:
             self._rising_until_ns = None  # it has left the ground
         elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
-        """Make the vehicle forget a take-off that it has not begun to show; return whether there was one."""
+        """Cancel a take-off that the vehicle does not show yet; return whether there was one.
+
+        A landing from the ground makes the vehicle forget an arming that is still on its way.
+        """
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
         if self._executor.attempt(_LAND, now_ns, "apply"):
             self.flight.call_off(now_ns)
-        elif self.flight.ours:  # once more, while that take-off may show
+        elif self.flight.ours:  # retry while that take-off may still show
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
     def _tell(self, session: Session) -> None:
-        """Let feedback tell what became of an application's newest intent: soon where it ended."""
+        """Show the outcome of an application's newest intent in feedback, an end soon."""
         self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
-        """Publish what the proxy itself made the vehicle do."""
+        """Publish the echo of one of the proxy's own actions."""
         if self._subscribers(COMMANDS):
             echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
             self._publish(COMMANDS, encode(echo))
@@ -335,7 +339,7 @@ class FlightSupervisor:
     def _report_limits(
         self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
     ) -> None:
-        """Publish what began to be in the way of a command of this application, or of what the proxy does itself."""
+        """Publish limits that start to affect this application's commands, or the proxy's own actions."""
         if enforced is not None and enforced is not self._enforced:
             self._enforced = enforced
             self._events.publish_drafts(enforcement_event(enforced))
@@ -344,7 +348,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that limits, safety box and zones allow in a step of the software autopilot."""
+        """Return the nearest velocity that limits, safety box and zones allow for a step of the software autopilot."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
@@ -355,7 +359,7 @@ class FlightSupervisor:
     # Authority ----------------------------------------------------------------------------------------------------
 
     def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Make the vehicle hover where the authority changes hands, then publish ``news`` and the changes."""
+        """Hover while the authority changes hands, then publish ``news`` and the changes."""
         for effect in effects:
             if not isinstance(effect, Lost | Preempted | Granted):
                 continue
@@ -371,7 +375,7 @@ class FlightSupervisor:
                 session.intents.end(Fate.AUTHORITY)
                 self._tell(session)
                 self._withdraw_takeoff(now_ns)
-        drafts = self._act(now_ns, stamps=True)  # which hovers, before anybody learns of any of this
+        drafts = self._act(now_ns, stamps=True)  # hovers before anyone learns about the changes
         holder = self.authority.holder
         told = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
         ended = [draft for one, draft in told if isinstance(one, Lost | Preempted)]
@@ -379,7 +383,7 @@ class FlightSupervisor:
         self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:
-        """Let feedback show who is in command, the failsafe's step and whose the flight is."""
+        """Show the holder, the failsafe's step and whose flight it is in feedback."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
         self._publisher.stamp(
@@ -398,22 +402,22 @@ class FlightSupervisor:
     # Failsafe -----------------------------------------------------------------------------------------------------
 
     def _update_failsafe(self, now_ns: int) -> None:
-        """Let the ladder decide and act, and publish what it did."""
+        """Let the ladder decide and act, and publish the results."""
         drafts = self._act(now_ns)
         if drafts:
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Let the ladder decide and act; return what is to be published. ``stamps``: who is in command has changed."""
+        """Let the ladder decide and act; return the events to publish. ``stamps``: the holder has changed."""
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._look(now_ns)
-        # One that the software autopilot has steered on, or that was told to land since, is still the same flight.
+        # If the software autopilot has kept steering it, or it was told to land since, it is still the same flight.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._look(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
-            ladder.land_on(now_ns)  # no hover takes its pilot's landing back
+            ladder.land_on(now_ns)  # no hover may take back its pilot's landing
         inputs = FailsafeInputs(
             state=seen.state,
             airborne=flight.flies(seen.state),
@@ -429,7 +433,7 @@ class FlightSupervisor:
         return self._apply_failsafe(effects, now_ns, stamps=stamps) if effects or stamps else []
 
     def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Do what the ladder decided; return what is to be published then, as each event takes its time."""
+        """Execute the ladder's decisions; return the events to publish afterwards, because publishing takes time."""
         if stamps or any(isinstance(effect, StepChange) for effect in effects):
             self._stamp()
         drafts = []

@@ -108,9 +108,9 @@ def test_a_connection_without_its_hello_is_ended_and_told() -> None:
         bench.run(HELLO_NS / 1e9)
         assert silent.closed_by.empty()
         bench.run(0.04)
-        assert "no Hello came within 5 s: connect again" in silent.closed_by.get(timeout=WAIT_S)
+        assert "no Hello arrived within 5 s: connect again" in silent.closed_by.get(timeout=WAIT_S)
         texts = [event.text for event in eye.told(EventKind.APPLICATION_LINK)]
-        assert any("was ended: no Hello came" in text for text in texts)
+        assert any("was closed: no Hello arrived" in text for text in texts)
         assert bench.proxy._counts["connections.silent"] == 1
 
 

@@ -1,12 +1,12 @@
-"""What an application asked for, from its beginning to its one end, and the checks that each command passes. Pure.
+"""An application's intents, from start to end, and the checks that each command passes. Pure.
 
-The library repeats each command many times a second. A repeat asks the intent: it is judged again while the intent is
-under way, and never acts once it is over. :data:`skyloop.messages.command.ENDINGS` lists all that ends one.
+The library repeats each command many times a second. A repeat refers to its intent: it is judged again while the intent
+is in progress, and never acts once it is over. :data:`skyloop.messages.command.ENDINGS` lists everything that ends one.
 
 The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
-whether it is a sign of life of the holder), then whether its intent is under way, the vehicle's link, support, whose
-the flight is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). The rules in words are in
-``docs/proxy.md``.
+whether a command is a sign of life of the holder); then whether its intent is in progress, the vehicle link, support,
+whose flight it is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). ``docs/proxy.md`` has
+the rules in words.
 """
 
 from __future__ import annotations
@@ -47,53 +47,53 @@ from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 from skyloop.proxy.core.settings import Clamp, ReturnSettings
 
-MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may lie: the error of the clocks' offset
+MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be: the error of the clock offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground by then ends, and is withdrawn
-#: A landing that withdrew a take-off is done when the vehicle stood for so long: an arming may have been on its way.
+#: A landing that withdrew a take-off is done once the vehicle has stood this long: an arming may have been on its way.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
-_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: nobody needs to be told that repeats of it do nothing
+_SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: their repeats need no explanation
 _LANDINGS: Final = (Land, ReturnToStart)
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: what may be different with the next repeat
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: the next repeat may succeed
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
-_TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
+_TAKING: Final = (Takeoff, Hover, Land)  #: as new requests, they take over a vehicle that others fly
 
 
 @dataclass(slots=True)
 class Intent:
-    """One thing that an application asked for."""
+    """One request of an application."""
 
     number: int
     action: AnyAction
     asked_ns: int
-    state: FlightState  #: the vehicle's, when it was asked for or looked at last
+    state: FlightState  #: the vehicle's state at the request, or at the last observation
     fate: Fate = Fate.UNDER_WAY
-    begun: bool = False  #: the vehicle was made to do it
-    automatic: bool = False  #: the library asked for it by itself
-    withdrew: bool = False  #: it ended a take-off that had not left the ground
+    begun: bool = False  #: the vehicle has started to execute it
+    automatic: bool = False  #: requested by the library itself
+    withdrew: bool = False  #: whether it ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
 
     @property
     def over(self) -> bool:
-        """Whether it ended; then no repeat acts."""
+        """Whether it has ended; then no repeat acts."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End it, unless it is over already. ``text`` and ``reason``: what its repeats are answered with."""
+        """End it unless it has already ended. ``text`` and ``reason``: the answer to its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
             self.text = "" if silent else text or f"{ENDINGS[fate]}: send a new command"
-            self.fate = fate  # last, as other threads read it
+            self.fate = fate  # last, because other threads read it without a lock
 
     def refuse(self, reason: Refusal, why: str) -> None:
-        """End it because it was refused.
+        """End it with a refusal.
 
-        A hover and a landing go on where only the driver failed or the link is lost, as nothing is safer; a reset does
-        in any case, as the emergency may not be known yet. They are told to be refused until a repeat is carried out.
+        A hover and a landing stay in progress if only the driver failed or the link is lost, as nothing is safer; a
+        reset always does, because the emergency may not be known yet. They count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -101,16 +101,16 @@ class Intent:
             self.end(Fate.REFUSED, why, reason)
 
     def observe(self, state: FlightState, now_ns: int, shown_ns: int | None = None) -> None:
-        """End or complete it by what the vehicle does; ``shown_ns``: when that was so, None for now."""
+        """End or complete it by the vehicle's state; ``shown_ns``: the time of that state, None for now."""
         before = self.state
-        if state is not FlightState.UNKNOWN:  # what was known before that still counts
+        if state is not FlightState.UNKNOWN:  # an unknown state does not replace a known one
             self.state = state
         if self.fate is not Fate.UNDER_WAY:
             return
         kind = type(self.action)
         if state is FlightState.LANDED:
             if kind is Land:
-                # That it stood before it was asked for proves nothing: it may be in the air by now.
+                # That the vehicle stood before the request proves nothing: it may be in the air by now.
                 shown = shown_ns is None or shown_ns >= self.asked_ns
                 if shown and (not self.withdrew or now_ns - self.asked_ns >= SETTLED_NS):
                     self.end(Fate.COMPLETED)
@@ -130,11 +130,11 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """What feedback tells of it; ``name``: of the application, ``state``: the vehicle's in that feedback.
+        """Return its outcome for feedback. ``name``: the application's; ``state``: the vehicle's in that feedback.
 
-        Nothing of a take-off that has just come to be in the air: others may have taken the vehicle on its way up.
+        Nothing for a take-off that has just risen into the air: others may have taken the vehicle on its way up.
         """
-        fate = self.fate  # first, as another thread may end it now
+        fate = self.fate  # first, because another thread may end it now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -147,21 +147,22 @@ NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
 class Intents:
-    """What one connection asked for: its sequence numbers, and its newest intent."""
+    """The requests of one connection: its sequence numbers, and its newest intent."""
 
     __slots__ = ("_ended", "_floor", "_received", "newest", "seq")
 
     def __init__(self) -> None:
         self.seq = -1  #: of the newest command received
         self.newest = NO_INTENT
-        self._received = 0  # the highest number, refused commands included
-        self._floor = -1  # intents up to this one are from before something that ended them,
+        self._received = 0  # highest number, refused commands included
+        self._floor = -1  # intents up to this one precede an event that ended them,
         self._ended = Fate.AUTHORITY  # which was this
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
 
-        ``lease`` is the one in force (0 for none), ``holds`` whether the sender holds it. None: it is a sign of life.
+        ``lease``: the one in force (0 for none); ``holds``: whether the sender holds it. Returns None for a sign of
+        life.
         """
         if command.seq <= self.seq:
             return Refusal.OUT_OF_SEQUENCE
@@ -178,7 +179,7 @@ class Intents:
         return None
 
     def intent_of(self, command: Command, state: FlightState, now_ns: int) -> tuple[Intent, bool]:
-        """Return the intent of a command that :meth:`check` let through, and whether it is newly asked for."""
+        """Return the intent of a command that passed :meth:`check`, and whether it is a new request."""
         newest, number = self.newest, command.intent
         if number == newest.number:
             return newest, False
@@ -192,27 +193,27 @@ class Intents:
 
     @property
     def lands(self) -> bool:
-        """Whether a landing where the vehicle is was asked for, and is under way."""
+        """Whether a landing in place was requested and is in progress."""
         return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
-        """Take an emergency stop, which is carried out whatever its sequence: all that was asked for ends."""
+        """Handle an emergency stop, which is executed whatever its sequence: all requests end."""
         assert type(command.action) is EmergencyStop
         self.seq, self._received = max(self.seq, command.seq), max(self._received, command.intent)
         self.end(Fate.EMERGENCY)
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End all that was received until now, also what has not passed the checks yet."""
+        """End all requests received so far, including those that have not passed the checks."""
         self.newest.end(fate, text, reason)
         self._floor, self._ended = self._received, fate
 
 
 class StatePolicy(Enum):
-    """What becomes of an action in a flight state."""
+    """How an action is handled in a flight state."""
 
     APPLY = auto()
-    HOLD = auto()  #: accepted, and nothing is done: it is so already, or a manoeuvre in progress goes on
-    HOVER = auto()  #: a take-off of what flies already: hover
+    HOLD = auto()  #: accepted without effect: the state is already reached, or a manoeuvre continues
+    HOVER = auto()  #: a take-off of a flying vehicle: hover
     REFUSE = auto()
 
 
@@ -224,7 +225,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: In a state that is not known everything is passed on: some vehicles never report it.
+#: In an unknown state, everything is passed on: some vehicles never report it.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -239,21 +240,21 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
 
 
 class Decision(NamedTuple):
-    """What becomes of a command that the first checks let through."""
+    """The decision about a command that passed the first checks."""
 
-    action: AnyAction | None = None  #: what the vehicle must do; None: nothing new. Of a refused one: instead of it
+    action: AnyAction | None = None  #: the vehicle's new action; None: nothing new. With a refusal: the substitute
     refusal: Refusal | None = None
-    why: str = ""  #: of the refusal, for a person
+    why: str = ""  #: reason of the refusal, for people
     takes_off: bool = False
     clamps: tuple[Clamp, ...] = ()  #: the limits that shortened it
-    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no set-point
+    enforced: bool | None = None  #: whether box and zones could be enforced; None: there are none, or no set-point
 
 
 class CommandChecks:
-    """Decides what becomes of the commands for one vehicle.
+    """Decides what happens to the commands for one vehicle.
 
-    ``supported``: the actions that the vehicle or the software autopilot can do; ``native``: those that the vehicle
-    itself takes; ``why_not``: why others are not, for people.
+    ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
+    ``why_not``: why others are missing, for people.
     """
 
     def __init__(
@@ -269,19 +270,19 @@ class CommandChecks:
         self.airspace = Airspace()
         self.returns = ReturnSettings()
         self.start = StartPoint()
-        self.way_back: ReturnFlight | None = None  #: the flight back to the start; None: it was not asked for
+        self.way_back: ReturnFlight | None = None  #: the return in progress; None: none was requested
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: What a person may ask of a vehicle that is not heard, which may hear us all the same: without it only the
+        #: What a person may command while the vehicle is not received: it may still receive us, and otherwise only the
         #: emergency stop would be left to bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
-        """Check sequence, age, lease and numbers. None: they passed, which keeps the holder's lease."""
+        """Check sequence, age, lease and numbers. Returns None if they pass, which renews the holder's lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
@@ -293,10 +294,9 @@ class CommandChecks:
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide what the vehicle does of a command whose intent is under way. Not for an emergency stop or idle.
+        """Decide about a command whose intent is in progress, other than an emergency stop or idle.
 
-        ``new``: the application newly asked for it; else the library repeats it, or asks for it by itself
-        (``automatic``).
+        ``new``: a new request of the application; otherwise a repeat, or the library's own request (``automatic``).
         """
         now_ns, state, feedback, link, _ = seen
         kind = type(action)
@@ -304,21 +304,21 @@ class CommandChecks:
         if new and kind is ReturnToStart:
             self.way_back = None
         if automatic and (state is FlightState.LANDING or self.goes_on(kind, seen, automatic=True)):
-            policy = StatePolicy.HOLD  # it lands already, and no automatic hover breaks that off
+            policy = StatePolicy.HOLD  # it is already landing, and no automatic hover aborts that
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
-            policy = StatePolicy.APPLY  # that it lands, or stands, was before: it may have heard something else since
+            policy = StatePolicy.APPLY  # landing or standing is old news: it may have received something else since
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
         if lands and is_set_point and not self.goes_on(kind, seen, automatic=automatic):
-            policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
+            policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a returning pilot aborts it
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         if policy is StatePolicy.HOLD:
             if type(action) is Position and (why := self.airspace.objection(action, feedback, now_ns)):
-                return Decision(None, Refusal.OUT_OF_RANGE, why)  # which would be too late after the take-off
+                return Decision(None, Refusal.OUT_OF_RANGE, why)  # after the take-off it would be too late
             return Decision()
         if type(action) is ReturnToStart and policy is not StatePolicy.HOVER:
             if self.way_back is None:
@@ -330,16 +330,16 @@ class CommandChecks:
         action = _HOVER_ACTION if policy is StatePolicy.HOVER else action
         if self._is_judged(action, state):
             verdict = self.airspace.judge(action, feedback, now_ns, new=not intent.begun)
-            if verdict.action is None:  # what was flown before is not wanted any more either
+            if verdict.action is None:  # the previous target is no longer wanted, either
                 instead = _HOVER_ACTION if is_set_point and Hover in self._supported else None
-                return Decision(instead, verdict.refusal, verdict.why)  # without a refusal: until it is known again
+                return Decision(instead, verdict.refusal, verdict.why)  # no refusal: wait for a position
         else:
             verdict = Verdict(action)
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def goes_on(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
-        """Whether what the ladder does goes on beside a command of the holder that is carried out, or ends with it."""
+        """Return whether the ladder's task continues beside an executed command of the holder, rather than ending."""
         ladder = self._ladder
         if automatic:
             return ladder.lands_on or ladder.step is Failsafe.LAND
@@ -348,22 +348,22 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""
+        """Return whether the vehicle's position matters: for a hover in flight, for a take-off on the ground."""
         if type(action) is Hover:
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
     def begin_return(self, action: ReturnToStart) -> None:
-        """Begin a flight back to the start, in place of another one."""
+        """Start a return, replacing any other."""
         self.way_back = ReturnFlight(action, self.start.position, self.returns)
 
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
-        """Decide what the vehicle does now on its flight back to the start."""
+        """Decide the next step of the return."""
         assert self.way_back is not None
         return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
-        """Return why the vehicle could not begin to return to its start now and land there; empty if it could."""
+        """Return why the vehicle could not start a return with a landing now; empty if it could."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
@@ -371,7 +371,7 @@ class CommandChecks:
     def _problem(
         self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
-        """What forbids a command of the holder, whatever the policy of the flight state is."""
+        """Return what forbids a command of the holder, whatever the policy of the flight state."""
         state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic
@@ -385,12 +385,12 @@ class CommandChecks:
             if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and (automatic or policy is not StatePolicy.HOLD) and kind in _TAKING:
-                what = "what the library does by itself" if automatic else "a repeated command"
+                what = "an automatic command" if automatic else "a repeated command"
                 return Refusal.WRONG_STATE, f"{others}, and {what} does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        by_itself = automatic and kind is not Land
-        if self._ladder.step is Failsafe.LAND and self._ladder.lands_for_battery and (by_itself or kind in SET_POINTS):
+        unasked = automatic and kind is not Land
+        if self._ladder.step is Failsafe.LAND and self._ladder.lands_for_battery and (unasked or kind in SET_POINTS):
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:
@@ -402,14 +402,14 @@ class CommandChecks:
 
 
 def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:
-    """Why a command was refused by :meth:`Intents.check`, and what would be right, in words for a person."""
+    """Return why :meth:`Intents.check` refused a command, and what would be right, for people."""
     if reason is Refusal.OUT_OF_SEQUENCE:
         return f"number {command.seq} is not newer than {newest_seq}, the last one received"
     if reason is Refusal.STALE:
         age = seconds(now_ns - command.sent_ns)
         if age < 0:
-            return f"it was sent {-age:.3f} s in the future, at most {seconds(MAX_AHEAD_NS):g} s are allowed"
-        return f"it is {age:.3f} s old, at most {seconds(max_age_ns):g} s are allowed (command.max_age_s)"
+            return f"it was sent {-age:.3f} s in the future, over the limit of {seconds(MAX_AHEAD_NS):g} s"
+        return f"it is {age:.3f} s old, over the limit of {seconds(max_age_ns):g} s (command.max_age_s)"
     if reason is Refusal.FOREIGN_LEASE:
         force = f"lease {lease} is in force" if lease else "no lease is in force"
         return f"it was sent under lease {command.lease}, and {force}"
@@ -419,7 +419,7 @@ def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, 
 
 
 def explain_state(action: Action, state: FlightState) -> str:
-    """Why an action is refused in a flight state."""
+    """Return why an action is refused in a flight state."""
     if state is FlightState.EMERGENCY:
         return f"{action.name} is not possible in an emergency: reset it first"
     if isinstance(action, ResetEmergency):
