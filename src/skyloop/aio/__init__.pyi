@@ -176,8 +176,7 @@ class Drone:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        It asks the proxy for its parameters and, for each camera, for a picture. It flies nothing and needs no
-        authority.
+        Asks the proxy for its parameters, and each camera for a picture. Flies nothing and needs no authority.
 
         Args:
             video_s: Total time to wait for pictures [s]; 0: don't check cameras.
@@ -227,8 +226,7 @@ class Drone:
             NoAnswerError: If the vehicle has not landed in time; the text has its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: Without ``wait``, if the link is down; the landing is still sent if the link is back within half
-                a second.
+            LinkError: Without ``wait``, if the link is down; the landing is still sent if it is back within 0.5 s.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
@@ -268,8 +266,7 @@ class Drone:
             longitude_deg: [°], east positive.
             altitude_m: Above mean sea level [m]; None: the current height.
             yaw: Counter-clockwise from x, reached on the way [rad]; None: keep the current one.
-            speed: Maximum speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
-                always apply.
+            speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
             wait: Wait until the vehicle is there and nearly at rest; otherwise only send the command.
             timeout_s: How long to wait [s].
             tolerance_m: Distance from the position that counts as there [m].
@@ -297,7 +294,7 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. The flight does not avoid
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. It does not avoid
         obstacles.
 
         Args:
@@ -314,8 +311,7 @@ class Drone:
             LinkError: Without ``wait``, if the link is down; then the vehicle does not return later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; then nothing
-                is sent.
+            UsageError: If an argument makes no sense, or with ``wait`` from an inline callback; nothing is sent then.
         """
     async def request_authority(
         self,
@@ -536,8 +532,7 @@ class Drone:
     ) -> bool:
         """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
 
-        Thread-safe, does not wait, and needs no authority. A vehicle that does not accept poses answers with an event
-        (``command_refused``).
+        Thread-safe, does not wait, and needs no authority. Refusals appear as events (``command_refused``).
 
         Args:
             position: x east, y north, z up [m].
@@ -569,8 +564,8 @@ class Drone:
         Args:
             frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the part that drew them; None: this application. Only the newest drawing of each source in
-                each camera counts.
+            source: Name of the part that drew them; None: this application. Only each source's newest in a camera
+                counts.
 
         Returns:
             True if they were handed to the transport.
@@ -1074,8 +1069,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that do not meet it in time have
-        failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
 
         Args:
             wanted: A flight state or its name, several of them, or a predicate on feedback.
@@ -1174,8 +1168,8 @@ def swarm(
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
         on_error: What happens to the others when one fails; see :class:`Swarm`.
-        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``), as long
-            as one is left.
+        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
+            none is left.
         **options: As for :func:`skyloop.connect`, for each drone.
 
     Returns:

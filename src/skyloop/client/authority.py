@@ -1,7 +1,6 @@
 """This application's knowledge of its authority, from replies, events and feedback, and requests to hand it over.
 
-Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow, so the higher one is
-newer.
+Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow with each grant.
 """
 
 from __future__ import annotations

@@ -115,8 +115,7 @@ class Channel(Generic[T]):
 class FollowingChannel(Channel[T], Generic[T, C]):
     """A channel that changes with the proxy's cameras: after a restart with other cameras, it finds another one.
 
-    Callers that name no camera follow the vehicle's first. Consumers are added to the channel found, which delivers to
-    them like to any others.
+    Callers that name no camera follow the vehicle's first. Consumers are added to the channel found.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
@@ -393,9 +392,7 @@ class Notifier:
 def checked_name(processor: str) -> str:
     """Return ``processor`` if it is a valid name of a processor; raise :class:`UsageError` otherwise."""
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
-        raise UsageError(
-            f"the name of a processor must have 1 to 64 letters, digits or any of _ . -, got {processor!r:.80}"
-        )
+        raise UsageError(f"the name of a processor must have 1 to 64 letters, digits or _ . -, not {processor!r:.80}")
     return processor
 
 

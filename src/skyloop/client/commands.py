@@ -56,8 +56,8 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: How long to wait for the proxy to notice the end of an earlier session of this process: longer than a silent session
-#: keeps the authority.
+#: How long to wait for the proxy to notice the end of an earlier session of this process: longer than a silent one
+#: keeps the lease.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: Requests of an application that no automatic hover of the library may end.
@@ -97,8 +97,8 @@ class CommandSender:
         """Prepare to send; nothing is sent before :meth:`connected`.
 
         ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
-        ``granted`` with the number of each new lease, on the thread that noticed: the receiving one, the supervisor's,
-        or an application's.
+        ``granted`` with the number of each new lease, on the noticing thread: the receiving, the supervisor's, or an
+        application's.
         """
         self.role = role
         self._authority = authority
@@ -168,8 +168,8 @@ class CommandSender:
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
-        After a lost connection or lease, the authority is no longer requested again automatically, because only that
-        person can decide that.
+        After a lost connection or lease, the authority is no longer requested again automatically, as only that person
+        decides.
         """
         with self._lock:
             self._authority.renews = False
@@ -207,10 +207,9 @@ class CommandSender:
 
         Args:
             action: The action.
-            now: Raise if it can't be sent at once. Then a landing is still sent once possible, anything else is
-                dropped.
-            automatic: The library's own action: the proxy takes no vehicle from others for it. It also passes during
-                the end of the flight.
+            now: Raise if it can't be sent at once. Only a landing is then still sent later.
+            automatic: The library's own action: the proxy takes no vehicle from others for it. It passes during the
+                flight's end.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.
@@ -243,8 +242,7 @@ class CommandSender:
         """Make ``action`` the newest set-point and send it if possible; return the intent and whether it was sent.
 
         That is impossible while the link is down, the authority is awaited, an emergency stop has not shown, or the
-        person who flies is absent. Raises :class:`GivenUpError` if the caller has stopped waiting; see
-        :data:`cancelled`.
+        person who flies is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
         """
         connection, schedule, authority = self._connection, self._schedule, self._authority
         if connection.why_closed:
@@ -310,8 +308,7 @@ class CommandSender:
         """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
 
         Raises:
-            AuthorityError: If it is not granted within ``wait_s``, if it is refused, or if this application only
-                observes.
+            AuthorityError: If it is refused or not granted within ``wait_s``, or this application only observes.
             NoAnswerError: If the proxy does not answer the request, or the link is lost and does not return in time.
             ClosedError: If the drone is closed during the wait.
         """

@@ -186,8 +186,7 @@ class ProxyConnection:
         Raises:
             NoAnswerError: If there is no answer in time.
             ClosedError: If the drone is closed.
-            LinkError: If called from an inline callback, or the request may have been executed and must not be
-                repeated.
+            LinkError: If called from an inline callback, or the request may have been executed.
         """
         if self.receiving:
             raise LinkError("an inline callback can't wait for an answer that it would itself have to receive")

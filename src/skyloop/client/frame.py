@@ -47,8 +47,7 @@ class Frame(_Base):
     It is a NumPy array, so NumPy and OpenCV accept it directly. Where a plain array is needed, ``numpy.asarray(frame)``
     gives the same memory without the attributes below. If possible it is the memory that the transport received,
     without a copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times are in
-    ns: ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this
-    host's.
+    ns: ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock; ``received_ns`` on ours.
     """
 
     _arrival: Arrival
@@ -97,8 +96,7 @@ class Frame(_Base):
     def feedback(self) -> Feedback | None:
         """The vehicle's state at the time of capture, interpolated between the samples before and after it.
 
-        Until the later sample arrives, it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if nothing
-        is known.
+        Until the later sample arrives, it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if unknown.
         """
         return self._arrival.state_at_capture()[0]
 

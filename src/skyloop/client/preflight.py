@@ -224,11 +224,7 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
     if not state.capabilities.actions:
         why = state.capabilities.why_not or "it accepts no commands"
         yield PreflightFinding(
-            "vehicle",
-            Level.FAIL,
-            f"nothing can be flown: {why}",
-            "it can only be watched",
-            "connect to one that can fly",
+            "vehicle", Level.FAIL, f"nothing can be flown: {why}", "it can only be watched", "connect to another"
         )
     elif feedback is None:
         yield PreflightFinding(

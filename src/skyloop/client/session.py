@@ -133,9 +133,7 @@ class ConnectionHandler(Protocol):
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(
-        self,
-    ) -> Mapping[type, Callable[[Any, int], None]]: ...  #: for other kinds of samples, with the time
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: for the other kinds, and the time
 
 
 class ProxySession:
@@ -266,8 +264,7 @@ class ProxySession:
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
         if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
-            # One ping at a time, sent once: on a stalled path, queued pings and their answers delay everything behind
-            # them.
+            # One ping at a time, sent once: on a stalled path, queued pings and their answers delay all others.
             self._pinged = True
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 

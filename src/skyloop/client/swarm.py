@@ -78,8 +78,8 @@ def swarm(
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
         on_error: What happens to the others when one fails; see :class:`Swarm`.
-        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``), as long
-            as one is left.
+        missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
+            none is left.
         **options: As for :func:`skyloop.connect`, for each drone.
 
     Returns:
@@ -550,8 +550,7 @@ class Swarm:
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that do not meet it in time have
-        failed.
+        A drone with a lost link does not meet it, whatever its last feedback. Drones that miss it have failed.
 
         Args:
             wanted: A flight state or its name, several of them, or a predicate on feedback.
@@ -727,7 +726,7 @@ def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
 def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position:
     if not 3 <= len(numbers) <= 4:
         raise UsageError(
-            f"the position of {name} is {numbers!r:.60} and must be x, y, z [m], and optionally the yaw [rad]"
+            f"the position of {name} is {numbers!r:.60} and must be x, y, z [m], with or without yaw [rad]"
         )
     x, y, z, yaw = (*numbers, None)[:4]
     return position_action(x, y, z, yaw, speed)

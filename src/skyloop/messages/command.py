@@ -181,7 +181,10 @@ ACTION_NAMES: dict[type[Action], str] = {
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True):
-    """One packet of the command channel."""
+    """One packet of the command channel.
+
+    A packet whose ``seq`` is not higher than all before is refused, whatever it asks for, unless it stops the motors.
+    """
 
     seq: Count  #: grows with every packet of a connection
     lease: Count  #: number of the lease it is sent under; 0 for none (emergency stop only)

@@ -260,8 +260,7 @@ class CommandHandler(FlightSupervisor):
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may bring a substitute, a hover. If the vehicle does not accept that, the previous set-point
-            # must still not continue.
+            # A refusal may bring a substitute, a hover. If the vehicle rejects it, the old set-point must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns

@@ -1,8 +1,8 @@
 """The proxy: makes one vehicle's driver a node that any number of applications observe and one at a time flies.
 
 Threads: the transport's execute commands and pass on poses, the driver's publish, a ticker (50 Hz) updates authority,
-failsafe and autopilot, and one more answers requests. Flying calls of the driver hold the handler's lock, including
-those of ``end``.
+    failsafe and autopilot, and one more answers requests. Flying calls of the driver, also in ``end``, hold the
+    handler's lock.
 """
 
 from __future__ import annotations
@@ -82,11 +82,9 @@ class Proxy:
         server_end: The end that applications connect to, not yet started.
         name: The name that applications connect to, 1 to 64 characters.
         clock: The clock of all its samples [ns].
-        ticker: False leaves :meth:`tick` to the caller: for many proxies in a process, for tests, and for simulated
-            time.
+        ticker: False leaves :meth:`tick` to the caller: for many proxies in a process, tests, and simulated time.
         jobs: Answers requests that may wait for the vehicle; by default on a separate thread.
-        slept: Returns how long the computer has slept in total [ns]; by default the system's value, if the clock is
-            the system's.
+        slept: Returns how long the computer has slept in total [ns]; by default the system's, with its clock.
 
     Raises:
         UsageError: The name is empty or too long.
@@ -253,8 +251,7 @@ class Proxy:
                 its own is still landed, however long it takes: without its proxy it would fall.
             unless_flying: If it has not landed in time, the landing continues, and so does the proxy.
             hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or hover: calls
-                that may hang are left to daemon threads, and the vehicle is on its own, as if its proxy had been
-                killed.
+                that may hang are left to daemon threads, as if the proxy had been killed.
 
         Returns:
             Whether no flight of the proxy remains.

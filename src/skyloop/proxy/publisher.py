@@ -60,8 +60,8 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2"
 class VehiclePublisher:
     """The driver's :class:`skyloop.drivers.base.Sink`, and the newest known state of the vehicle.
 
-    It acquires no lock that is held during calls of the driver, so a driver may call it from any thread and from inside
-    its own calls.
+    It acquires no lock that is held during calls of the driver, so a driver may call it on any thread, also
+    re-entrantly.
 
     ``state_of``: returns the flight state for the one that the driver reported, because the software autopilot may know
     better. ``on_link_up``: called on the driver's thread when the vehicle's link has come up. ``scrub``: removes the

@@ -5,8 +5,7 @@ The audit trail records who flew when, one JSON object per line, append-only. ``
 
 The note records that a flight is this proxy's, so that a proxy that was killed ends its own flight after its restart.
 It is written when a flight becomes the proxy's, refreshed while it lasts, and removed when it is over, belongs to
-others, or can no longer turn up. It is valid for :data:`LIFE_S`: after that, someone else may have started another
-flight.
+others, or can no longer turn up. It is valid for :data:`LIFE_S`: after that, others may have taken off.
 """
 
 from __future__ import annotations

@@ -105,8 +105,7 @@ class Answers:
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
         """Note a request as pending, unless it must not be; at most ``most`` are pending at a time.
 
-        Returns whether it has been or is being executed, so that it must not be again, and whether the limit is
-        reached.
+        Returns whether it has been or is being executed, and whether the limit is reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most

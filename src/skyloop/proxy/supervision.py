@@ -174,7 +174,7 @@ class FlightSupervisor:
 
         Intents end when the link breaks and when it returns, so that nothing requested in between is executed later.
         Both times the vehicle gets a hover, because a driver must not continue an old set-point. A pilot's landing
-        stays, as nothing is safer.
+        stays.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:

@@ -157,11 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (
-                ValueError,
-                TypeError,
-                OverflowError,
-            ):  # bad native telemetry, already reported
+            except (ValueError, TypeError, OverflowError):  # native telemetry, as already reported
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1

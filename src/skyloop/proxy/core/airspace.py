@@ -78,10 +78,8 @@ class Airspace:
             feedback: The newest sample; None: none yet.
             now_ns: The present time, on the clock of ``feedback.captured_ns`` [ns].
             new: Whether it is a new request. A permitted target stays permitted while nothing else is requested: if
-                drift brings an obstacle into the straight line, the steps keep clear of it, and under a lower ceiling
-                the target is lowered.
-            planned: Whether it is part of a route that was checked as a whole, so that it may be lowered from the
-                start.
+                drift brings an obstacle into the straight line, the steps avoid it; a lower ceiling lowers the target.
+            planned: Whether it is part of a route that was checked as a whole, so it may be lowered at first.
         """
         self.observe(feedback)
         if isinstance(action, Position):

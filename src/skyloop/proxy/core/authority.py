@@ -305,8 +305,7 @@ class Authority:
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
         """Give the authority to the first in the queue; the holder waits.
 
-        The holder keeps its remaining time, but gets at most the new holder's priority, or it would take it back at
-        once.
+        The holder keeps its remaining time, but gets at most the new holder's priority, or it would win it back.
         """
         holder, lease = self.holder, self.lease
         assert holder is not None
@@ -345,8 +344,7 @@ class Authority:
     def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first in the queue if due.
 
-        It is due if there is no holder, the holder's time is over, or a strictly higher priority need not ask any
-        longer.
+        It is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """
         effects: list[Effect] = []
         holder = self.holder

@@ -7,8 +7,7 @@ or hover there. Both are stepped from outside. ``docs/proxy.md`` has the rules o
 A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
 a velocity loop (proportional and integral, the common cascade of small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
 "Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103: to accelerate
-forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down, which is negative
-roll.
+forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down: negative roll.
 """
 
 from __future__ import annotations

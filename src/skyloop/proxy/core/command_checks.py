@@ -161,8 +161,7 @@ class Intents:
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence.
 
-        ``lease``: the one in force (0 for none); ``holds``: whether the sender holds it. Returns None for a sign of
-        life.
+        ``lease``: the one in force (0 for none); ``holds``: whether the sender holds it. None: a sign of life.
         """
         if command.seq <= self.seq:
             return Refusal.OUT_OF_SEQUENCE

@@ -1,8 +1,7 @@
 """The failsafe ladder: when a flying vehicle without a pilot hovers, and when it lands. Pure: time is an argument.
 
 Steps escalate automatically (none, hover, land), and end only with a fresh command or on the ground. The landing may
-follow a flight back to the start, if parameters demand that and nothing prevents it. ``docs/proxy.md`` has the rules in
-words.
+follow a flight back to the start, if parameters demand that and nothing prevents it. ``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations

@@ -41,8 +41,7 @@ class Limits:
     def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
         """Return the nearest set-point within the limits, and the limits that applied.
 
-        Tilt and horizontal speed are shortened without changing their direction. ``altitude`` of the vehicle [m], if
-        known.
+        Tilt and horizontal speed are shortened without changing their direction. ``altitude`` [m], if known.
         """
         if type(action) is Velocity:
             x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
