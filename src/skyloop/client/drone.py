@@ -232,6 +232,7 @@ class Drone:
         authority: Authority | None = None,
         acquire: bool = True,
         wait_for_state: bool = True,
+        wake_s: float = 0.0,
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
 
@@ -241,6 +242,7 @@ class Drone:
             authority: How a pilot asks for the authority; None: ``Authority()``.
             acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
             wait_for_state: Whether to wait for feedback.
+            wake_s: Time for the vehicle to wake up, once it may be commanded [s], where that is longer.
 
         Raises:
             NoAnswerError: If no answer or no feedback comes in time.
@@ -264,7 +266,7 @@ class Drone:
                 request = authority_request(asked.priority, asked.for_s, asked.takeover)
                 self._commands.request(request, asked.wait_s, stay=asked.stay)
                 if wait_for_state and not state.scheduler.in_step:
-                    self._wait_until_awake(deadline)
+                    self._wait_until_awake(max(deadline, time.monotonic() + wake_s))
             state.scheduler.opened()
         except BaseException:
             self.close()
