@@ -254,7 +254,7 @@ def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_caller
     else:
         proxy.answers[RequestAuthority] = None
         lost_lease(proxy, proxy.until_commanded(Idle()))
-        proxy.until(lambda: isinstance(proxy.requests[-1], RequestAuthority), "the loss is known")
+        drone._state.notifier.wait_for(lambda: drone.authority.state != "held", WAIT_S)
 
     def vehicle() -> None:
         if pressed == "under the lease":
@@ -288,7 +288,7 @@ def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_be
     else:
         proxy.answers[RequestAuthority] = None
         lost_lease(proxy, proxy.until_commanded(Idle()))
-        proxy.until(lambda: isinstance(proxy.requests[-1], RequestAuthority), "the loss is known")
+        drone._state.notifier.wait_for(lambda: drone.authority.state != "held", WAIT_S)
 
     def landings(lease: int) -> list[Command]:
         return [command for command in proxy.commands if (command.action, command.lease) == (Land(), lease)]

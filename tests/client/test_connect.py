@@ -195,15 +195,19 @@ def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatc
     assert proxy._process.wait(20.0) == 0, "it ended by itself"
 
 
-def test_a_vehicle_that_still_wakes_up_is_waited_for(alpha: ScriptedProxy, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_vehicle_that_still_wakes_up_is_waited_for(
+    alpha: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """``connect()`` returned while the firmware could not arm, and nothing said what it waited for."""
     asleep = {"link_reason": f"{WAKING_UP}: the checks before arming do not pass yet"}
     alpha.more |= asleep
+    after_s = 0.0
 
     def wakes_up() -> None:
         deadline_s = time.monotonic() + 30.0
         while not caplog.records and time.monotonic() < deadline_s:
             time.sleep(0.01)
+        time.sleep(after_s)
         for key in asleep:
             del alpha.more[key]
 
@@ -215,6 +219,17 @@ def test_a_vehicle_that_still_wakes_up_is_waited_for(alpha: ScriptedProxy, caplo
     assert [record.getMessage() for record in caplog.records] == [
         "scripted is still waking up: the checks before arming do not pass yet; waiting for it"
     ]
+    caplog.clear()
+    monkeypatch.setattr(CONNECT, "NAME_TIMEOUT_S", 1.5)  # real ones take 42 s: a program without a time-out waits
+    alpha.more |= asleep
+    after_s = 1.5
+    waking = threading.Thread(target=wakes_up)
+    waking.start()
+    begun_s = time.monotonic()
+    with connect("alpha") as drone:
+        assert not drone.feedback().waking_up
+    assert time.monotonic() - begun_s > 2.0
+    waking.join()
     caplog.clear()
     alpha.more |= asleep
     with connect("alpha", timeout_s=1.5) as drone:

@@ -1127,8 +1127,8 @@ def connect(
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
-    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s`` it
-    returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s``, or 60 s,
+    it returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -1136,7 +1136,8 @@ def connect(
             up on this host first and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
+        timeout_s: Time for the proxy to answer and the vehicle to wake up [s]; None or 0: 5 s for a name and 20 s for
+            an address, and then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that

@@ -27,6 +27,7 @@ from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
+WAKE_S: Final = 60.0  #: time limit for a vehicle to wake up: no driver reports that for longer
 #: Entry points named by address schemes: functions from an address to a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
 #: Entry points for transports that reach proxies on other hosts: a module as :class:`NetworkTransport`.
@@ -126,8 +127,8 @@ def connect(
     """Connect to a drone.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. For a vehicle that
-    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s`` it
-    returns anyway, and :meth:`Drone.takeoff` continues the wait.
+    has just started, it waits until it can take off and says so in the log (``skyloop``); after ``timeout_s``, or 60 s,
+    it returns anyway, and :meth:`Drone.takeoff` continues the wait.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -135,7 +136,8 @@ def connect(
             up on this host first and then, if ``network`` allows it, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
+        timeout_s: Time for the proxy to answer and the vehicle to wake up [s]; None or 0: 5 s for a name and 20 s for
+            an address, and then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
@@ -159,7 +161,8 @@ def connect(
     drone, deadline = prepare(
         target, name, timeout_s, network, access=access, rate_hz=rate_hz, stall_s=stall_s, on_exit=on_exit
     )
-    drone._connect(timeout_s=deadline - time.monotonic(), authority=authority)
+    wake_s = 0.0 if timeout_s else WAKE_S
+    drone._connect(timeout_s=deadline - time.monotonic(), authority=authority, wake_s=wake_s)
     return drone
 
 

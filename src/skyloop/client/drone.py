@@ -232,6 +232,7 @@ class Drone:
         authority: Authority | None = None,
         acquire: bool = True,
         wait_for_state: bool = True,
+        wake_s: float = 0.0,
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
@@ -241,6 +242,7 @@ class Drone:
             authority: How a pilot requests the authority; None: ``Authority()``.
             acquire: Whether to request the authority now; if False, the pilot does so later.
             wait_for_state: Whether to wait for feedback.
+            wake_s: Time for the vehicle to wake up, once it may be commanded [s], where that is longer.
 
         Raises:
             NoAnswerError: If no answer or no feedback arrives in time.
@@ -264,7 +266,7 @@ class Drone:
                 request = authority_request(asked.priority, asked.for_s, asked.takeover)
                 self._commands.request(request, asked.wait_s, stay=asked.stay)
                 if wait_for_state and not state.scheduler.in_step:
-                    self._wait_until_awake(deadline)
+                    self._wait_until_awake(max(deadline, time.monotonic() + wake_s))
             state.scheduler.opened()
         except BaseException:
             self.close()

@@ -806,6 +806,11 @@ def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
     told = len(bench.sink.links)
     bench.until(lambda: bench.sink.links[-1] == (LinkState.UP, ""), 6.0)
     assert len(bench.sink.links) == told + 1
+    settles = Bench(BoardSettings(boot_s=5.0, flags=bit("ANGLE")))  # until it knows how it stands
+    settles.until(lambda: settles.sink.newest is not None, 2.0)
+    assert settles.sink.links[-1][1].startswith("still waking up"), "or connect() returns, and it can't be armed"
+    settles.board.settings = replace(settles.board.settings, flags=0)
+    settles.until(lambda: settles.sink.links[-1] == (LinkState.UP, ""), 6.0)
     stays = Bench(BoardSettings(boot_s=5.0, flags=bit("MSP")))
     stays.until(lambda: stays.sink.newest is not None, 2.0)
     assert stays.sink.links[-1] == (LinkState.UP, ""), "what keeps it from being armed does not pass by itself"

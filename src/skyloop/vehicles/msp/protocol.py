@@ -23,7 +23,7 @@ from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, Setup, hindrances
 from skyloop.vehicles.msp.parameters import MspOptions
-from skyloop.vehicles.msp.setpoints import PASSING, Phase, Report, SetpointController
+from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, Phase, Report, SetpointController
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
@@ -246,8 +246,9 @@ class MspSession(VehicleSession):
         report = self.setpoints.report
         if self._wakes_until_ns is None:
             self._wakes_until_ns = now_ns + WAKING_NS
-        passing = bool(report.hindrances) and PASSING.issuperset(report.hindrances)
-        if report.armed or not passing or self.options.override or now_ns >= self._wakes_until_ns:
+        found = PASSING.intersection(report.hindrances)
+        passes = bool(found) and SETTLING.issuperset(found.symmetric_difference(report.hindrances))
+        if report.armed or not passes or self.options.override or now_ns >= self._wakes_until_ns:
             self._wakes_until_ns = 0
         return bool(self._wakes_until_ns)
 

@@ -47,6 +47,7 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     }
 )
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: beside them in its first words, before it knows how it stands
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
 LATE_S: Final = {True: 0.35, False: 0.15}  #: so long after the throttle carried it a lift-off shows, precise or not
 OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ from the one that lifted it

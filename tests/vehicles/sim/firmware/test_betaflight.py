@@ -136,6 +136,24 @@ def test_a_deaf_start_is_ended_and_another_one_begins_at_once(tmp_path: Path, mo
         rig.firmware.close()
 
 
+def test_a_start_whose_flight_control_hangs_is_ended_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It answered, and BOOTGRACE stayed: a take-off was refused for 15 s by "it has just been switched on"."""
+    hangs = tmp_path / "hangs"
+    hangs.mkdir()
+    monkeypatch.setenv("STANDIN_HANGS", str(hangs))
+    monkeypatch.setenv(VARIABLE, str(program(tmp_path, "betaflight")))
+    monkeypatch.setattr(betaflight, "RUN_S", 0.5)
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    (kept / betaflight.SETTINGS_FILE).touch()  # it is configured
+    (hangs / "once").touch()
+    with flying(lambda on_event: Betaflight(on_event, folder=kept)) as rig:
+        text = rig.event(FirmwareEventKind.DEAF)
+        assert text == "Betaflight is started again: its flight control did not run within 0.5 s"
+        rig.event(FirmwareEventKind.STARTED)
+        rig.answered()
+
+
 def test_it_is_set_up_so_that_its_own_driver_has_no_warning() -> None:
     delay = next(line for line in SETTINGS if line.startswith("set failsafe_delay"))
     assert int(delay.split()[-1]) / 10 <= LONG_DELAY_S

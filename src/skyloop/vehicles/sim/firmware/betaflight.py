@@ -44,8 +44,9 @@ from skyloop.child_process import ChildProcess
 from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.instruments import GpsFix, Readings, geodetic
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
-from skyloop.vehicles.msp.wire.frames import Frame, encode
-from skyloop.vehicles.msp.wire.messages import Function
+from skyloop.vehicles.msp.wire.firmwares import flag_names
+from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
@@ -130,14 +131,15 @@ MAX_TEXT: Final = 4096
 
 
 #: The first switch arms, angle mode is always on, the third keeps it from being armed (PARALYZE). MSP is answered as
-#: fast as it is asked, and on a second port too. Without sticks it goes on level with a little less than the throttle
-#: that carries a racer, and lands by that after 2 s.
+#: fast as it is asked, and on a second port too. It can be armed at once, not 5 s after its start. Without sticks it
+#: goes on level with a little less than the throttle that carries a racer, and lands by that after 2 s.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
     "aux 1 1 1 900 2100 0 0",
     "aux 2 45 2 1700 2100 0 0",
     "set serial_update_rate_hz = 2000",
+    "set pwr_on_arm_grace = 0",
     "rxfail 3 s 1420",
     "set failsafe_delay = 20",
     "set failsafe_procedure = AUTO-LAND",
@@ -149,6 +151,9 @@ CONFIGURE_S: Final = 5.0
 #: For the first answer of a start. Healthy ones take 0.8 s; one in ten never answers, by a race between its threads.
 ANSWER_S: Final = 1.5
 LONGEST_ANSWER_S: Final = 6.0  #: as that is doubled with each start in vain, for a computer that is busy
+#: Until its flight control has run, which ends BOOTGRACE: after 5 s with settings of an earlier version. Where its
+#: scheduler drops the loop it answers, and can never be armed.
+RUN_S: Final = 8.0
 START_S: Final = 5.0  #: from the start of its process until its first motors, at most
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
@@ -235,9 +240,12 @@ class Betaflight(CoupledFirmware):
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Ask it something on its serial port."""
-        with self._connected(encode(Frame(Function.API_VERSION)), b"$M>"):
-            pass
+        """Ask it something on its serial port, and whether its flight control has run."""
+        with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
+            try:
+                _until_it_runs(link)
+            except (OSError, DecodeError) as error:
+                raise StartedInVainError(f"its flight control did not run within {RUN_S:g} s") from error
         time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
@@ -351,6 +359,19 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
             raise ConnectionError("it closed its serial port")
         text = (text + data)[-MAX_TEXT:]
     return text
+
+
+def _until_it_runs(link: socket.socket) -> None:
+    """Ask for its state until that shows that its flight control has run. Raises OSError if it does not."""
+    parser, end_s = Parser(), time.monotonic() + RUN_S
+    while time.monotonic() < end_s:
+        link.sendall(encode(Frame(Function.STATUS_EX)))
+        for frame in parser.feed(link.recv(MAX_TEXT)):
+            status = Status.of_betaflight(frame.payload)
+            if "BOOTGRACE" not in flag_names(BETAFLIGHT, status.flags or 0, status.count):
+                return
+        time.sleep(_PAUSE_S)
+    raise TimeoutError
 
 
 def program_path() -> str:

@@ -1,7 +1,8 @@
 """Stands in for Betaflight's program: its command line, its motors and its state, without anything that flies.
 
 STANDIN_PORTS in the environment: its ports for motors, state and MSP. Its motors are those of the other stand-ins.
-STANDIN_DEAF: a folder. A start that finds a file in it removes one, and listens without ever answering.
+STANDIN_DEAF, STANDIN_HANGS: a folder. A start that finds a file in it removes one, and listens without ever answering,
+or answers while its flight control never runs.
 """
 
 import os
@@ -12,10 +13,12 @@ import time
 from pathlib import Path
 
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
-from skyloop.vehicles.msp.wire.messages import Function
+from skyloop.vehicles.msp.wire.messages import Function, Status
 from skyloop.vehicles.sim.firmware.betaflight import decode_state, encode_motors
 
 API_VERSION = encode(Frame(Function.API_VERSION))
+STATUS = encode(Frame(Function.STATUS_EX))
+BOOTGRACE = 1 << 9
 
 assert sys.argv[1] == "127.0.0.1"
 motors_port, state_port, msp_port = map(int, os.environ["STANDIN_PORTS"].split(","))
@@ -32,6 +35,8 @@ def command_line() -> None:
                 link.sendall(b"Entering CLI Mode\r\n\r\n# ")
             elif data == API_VERSION:
                 link.sendall(encode(Frame(Function.API_VERSION, b"\0\1\57", Direction.REPLY)))
+            elif data == STATUS:
+                link.sendall(encode(Frame(Function.STATUS_EX, status.betaflight(), Direction.REPLY)))
             elif data == b"save\r\n":
                 Path("eeprom.bin").write_bytes(text)
                 os._exit(0)
@@ -44,6 +49,11 @@ for deaf in Path(os.environ.get("STANDIN_DEAF", os.devnull)).glob("*"):
     deaf.unlink()
     deaf_server = socket.create_server(("127.0.0.1", msp_port))
     time.sleep(600)
+status = Status(0, 0, flags=0, count=29)
+for hangs in Path(os.environ.get("STANDIN_HANGS", os.devnull)).glob("*"):
+    hangs.unlink()
+    status = Status(0, 0, flags=BOOTGRACE, count=29)
+    break
 threading.Thread(target=command_line, daemon=True).start()
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 link.bind(("127.0.0.1", state_port))
