@@ -172,7 +172,7 @@ class Drone:
         callback. Otherwise it is the delay over all pilots, for which this asks the proxy and waits up to 0.2 s.
         """
     async def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Run the checklist before a flight: what is good, what is not, why it matters, and what to do.
+        """Run the checklist before a flight; each finding has its reason and a remedy.
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
@@ -276,8 +276,7 @@ class Drone:
             NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
-                ends it. Also if latitude and longitude are given and the vehicle does not report its place on the
-                earth.
+                ends it. Also if latitude and longitude are given but the vehicle's place is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
             LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
@@ -294,8 +293,8 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. It does not avoid
-        obstacles.
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
@@ -564,7 +563,7 @@ class Drone:
         Args:
             frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the part that drew them; None: this application. Only each source's newest in a camera
+            source: Name of the part that drew them; None: this application. Only the newest per source and camera
                 counts.
 
         Returns:
@@ -663,7 +662,7 @@ class Drone:
         """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
         Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing picture, the next one is a key picture, which the proxy is asked for. Without
+        key picture. After a missing picture, the next one is a key picture, requested from the proxy. Without
         ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
         encoded by the proxy at the rate that the path carries.
 
@@ -1168,7 +1167,7 @@ def swarm(
         *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
-        on_error: What happens to the others when one fails; see :class:`Swarm`.
+        on_error: Policy for the others when one fails; see :class:`Swarm`.
         missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
             none is left.
         **options: As for :func:`skyloop.connect`, for each drone.

@@ -386,7 +386,7 @@ class CommandSchedule:
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
         """Resume sending, on the connection made at ``connected_ns``: drop a set-point that is too old."""
-        if now_ns - self._asked_ns > self._keep_ns:  # since the connection only the lease was awaited
+        if now_ns - self._asked_ns > self._keep_ns:  # on this connection, only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

@@ -56,8 +56,8 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: How long to wait for the proxy to notice the end of an earlier session of this process: longer than a silent one
-#: keeps the lease.
+#: How long to wait for the proxy to notice the end of an earlier session of this process: more than its lease's
+#: time-out.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 #: Requests of an application that no automatic hover of the library may end.
@@ -97,8 +97,7 @@ class CommandSender:
         """Prepare to send; nothing is sent before :meth:`connected`.
 
         ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
-        ``granted`` with the number of each new lease, on the noticing thread: the receiving, the supervisor's, or an
-        application's.
+        ``granted`` with the number of each new lease, on the thread that noticed.
         """
         self.role = role
         self._authority = authority
@@ -110,7 +109,7 @@ class CommandSender:
         self._granted = granted
         self._lock = threading.Lock()  # guards everything below; never held while waiting or in a callback
         self._seq = 0
-        self._connected_ns = 0  # since when there is this connection
+        self._connected_ns = 0  # start of the current connection
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
@@ -168,8 +167,7 @@ class CommandSender:
     def flown_by_person(self) -> None:
         """Require a person's presence from now on; see :meth:`present_until`.
 
-        After a lost connection or lease, the authority is no longer requested again automatically, as only that person
-        decides.
+        After a lost connection or lease, the authority is no longer requested again automatically, but by that person.
         """
         with self._lock:
             self._authority.renews = False
@@ -188,8 +186,8 @@ class CommandSender:
                 return
             absent, schedule = known_ns < self._clock(), self._schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
-            ends = kind is Land or (kind is Hover and not schedule.automatic)  # as a person asked, who may wait for it
-            if absent and not ends:  # nothing old is repeated, nor flown on by beside the signs of life that follow
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # by a person, who may be waiting for it
+            if absent and not ends:  # later signs of life must not revive an old set-point
                 schedule.clear(Fate.WITHDRAWN)
                 if kind in (Velocity, Attitude):
                     schedule.ask(Hover(), self._clock(), automatic=True)
@@ -208,8 +206,7 @@ class CommandSender:
         Args:
             action: The action.
             now: Raise if it can't be sent at once. Only a landing is then still sent later.
-            automatic: The library's own action: the proxy takes no vehicle from others for it. It passes during the
-                flight's end.
+            automatic: The library's own action: the proxy takes no vehicle from others for it. Passes :meth:`bar`.
 
         Raises:
             ClosedError: Once the drone is closed, and from :meth:`bar` on.

@@ -318,7 +318,7 @@ class ConnectionSupervisor:
         self.connection.poked = False
         try:
             return self._step()
-        except Exception:  # noqa: BLE001  (whatever goes wrong, the link must come back)
+        except Exception:  # noqa: BLE001  (the link must come back after any error)
             _log.exception("the connection's thread failed; reconnecting")
             self._drop(LinkError("an error in the link"), "an error in the link")
             return self._policy.cap_s

@@ -100,7 +100,7 @@ R = TypeVar("R")
 T = TypeVar("T")
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
-EVENT_DEPTH: Final = 256  #: how many events, log entries and the like may wait for a slow callback
+EVENT_DEPTH: Final = 256  #: how many events, log entries and so on may wait for a slow callback
 WHOLE_S: Final = 1.0  #: time for every field of feedback to arrive after a reduced request
 _LOOK_S: Final = 0.5  #: how often a thread that waits for a frame checks that its camera still exists
 _SOON_S: Final = 1.0  #: a vehicle that still wakes up after this time is reported in the log
@@ -576,8 +576,7 @@ class Drone:
             NoAnswerError: If the vehicle is not there in time; the text has its state and, if known, the reason.
             RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
                 outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
-                ends it. Also if latitude and longitude are given and the vehicle does not report its place on the
-                earth.
+                ends it. Also if latitude and longitude are given but the vehicle's place is unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
             LinkError: Without ``wait``, if the link is down; then the vehicle does not fly there later, either.
             AuthorityError: If the authority is not held, or another application takes it over.
@@ -604,8 +603,8 @@ class Drone:
 
         The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
         room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. It does not avoid
-        obstacles.
+        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends it. Obstacles are not
+        avoided.
 
         Args:
             height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
@@ -1034,7 +1033,7 @@ class Drone:
         """Call ``function`` with a camera's encoded pictures, to store or forward them.
 
         Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
-        key picture. After a missing picture, the next one is a key picture, which the proxy is asked for. Without
+        key picture. After a missing picture, the next one is a key picture, requested from the proxy. Without
         ``kbit_s``, ``max_fps`` and ``scale``, pictures arrive as the vehicle encoded them or, if it sends no H.264,
         encoded by the proxy at the rate that the path carries.
 
@@ -1083,7 +1082,7 @@ class Drone:
         Args:
             frame: The frame that the shapes belong to.
             shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the part that drew them; None: this application. Only each source's newest in a camera
+            source: Name of the part that drew them; None: this application. Only the newest per source and camera
                 counts.
 
         Returns:
@@ -1204,7 +1203,7 @@ class Drone:
     # The end ---------------------------------------------------------------------------------------------------
 
     def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Run the checklist before a flight: what is good, what is not, why it matters, and what to do.
+        """Run the checklist before a flight; each finding has its reason and a remedy.
 
         Asks the proxy for its parameters, and each camera for a picture. Flies nothing and needs no authority.
 

@@ -127,7 +127,7 @@ class Frame(_Base):
             raise AttributeError(
                 f"this array was derived from a frame and has no {name}: only the delivered frame has it"
             )
-        if name in _THE_IMAGE:  # for a name without an object, Python adds no guess of its own ("imag")
+        if name in _THE_IMAGE:  # for a name without an object, Python adds no guess ("imag")
             raise AttributeError(f"a frame has no {name}: it is the image itself, a NumPy array", name=name)
         raise AttributeError(f"a frame has no attribute {name!r}")
 

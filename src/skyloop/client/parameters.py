@@ -40,7 +40,7 @@ class Restorer:
 
     Only values, never momentary parameters, and only if no one else can have written since: a lost link alone changes
     nothing at the proxy, and other pilots' newer values stay. Leases are numbered from 1 in each run of the proxy, so a
-    gap between two of our own shows that another application held the authority in between, and may have written.
+    gap between two of our own shows that another application held the authority then, and may have written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:

@@ -335,7 +335,7 @@ class ActionWait:
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
             self._note(told.text)  # cleared once a repeat is executed
-            if not told.over:  # executed: whoever holds the vehicle from now on took it later
+            if not told.over:  # executed: later holders took the vehicle afterwards
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -372,7 +372,7 @@ class ActionWait:
         if outcome.fate in OUTDONE:
             if self._called_off():
                 return _replaced(self._action)
-            return None  # a started take-off ends by itself
+            return None  # a take-off in progress always ends
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
@@ -387,8 +387,7 @@ class ActionWait:
         commands, newest = self._commands, self._state.newest
         if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
             return True
-        # A hover or idle ends a take-off that does not show yet: if the proxy got it and the vehicle still stands, it
-        # is over.
+        # A hover or idle ends a take-off that does not show yet: if the vehicle still stands, it is over.
         stayed, told = commands.latest(Hover, Idle), commands.told
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed

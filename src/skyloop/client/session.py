@@ -118,7 +118,7 @@ class Requests:
 PING_S: Final = 1.0  #: time limit for a ping
 FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responsive proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
-_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
+_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to ask a proxy on another clock for its time
 _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
 _FIRST: Final = 5
 

@@ -77,7 +77,7 @@ def swarm(
         *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
             such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
             either, ``{"left": "sim://?seed=1"}``.
-        on_error: What happens to the others when one fails; see :class:`Swarm`.
+        on_error: Policy for the others when one fails; see :class:`Swarm`.
         missing: Whether a drone without a connection fails the call (``"raise"``) or is left out (``"skip"``) unless
             none is left.
         **options: As for :func:`skyloop.connect`, for each drone.
@@ -174,7 +174,7 @@ class Swarm:
 
     A drone with a lost link gets no commands, and takes part again when the link is back; unless ``on_error`` is
     ``"continue"``, a command that could not be sent is a failure. At the end of the block, all drones land at the same
-    time (or hover, with ``on_exit``), including those set aside, whatever happens to any of them.
+    time (or hover, with ``on_exit``), including those set aside, even if some of them fail.
 
     Commands return a dict from names to the results of the same command of :class:`Drone`. They raise
     :class:`SwarmError` as set by ``on_error``, :class:`UsageError` for numbers that are not finite, and

@@ -174,7 +174,7 @@ class FeedbackDemand:
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # first, so that no sample is missed in between
+            self._connection.subscribe(needed.topic, True)  # first, so that no sample is missed
             self._connection.subscribe(before.topic, False)
 
 

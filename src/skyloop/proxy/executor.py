@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover for good: nothing is steered from here afterwards.
 
-        A vehicle that does not hover on its own is left at a standstill, as far as a single set-point can achieve that.
+        A vehicle without a native hover is left at a standstill, as far as a single set-point can achieve that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -172,7 +172,7 @@ class ActionExecutor:
         last: Velocity | Attitude = Velocity() if Velocity in self.native else Attitude()
         try:
             self._driver.apply(last)
-        except Exception as error:  # noqa: BLE001  it is reported, and there is nothing else to do
+        except Exception as error:  # noqa: BLE001  it is reported; nothing else helps
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
@@ -250,7 +250,7 @@ class ReturnSupervisor:
         """Take the next step of the ladder's return; objections are left to the ladder."""
         now_ns = seen.now_ns
         if not seen.link_up:
-            self._good_ns = now_ns  # nothing can be said or done about it
+            self._good_ns = now_ns  # nothing is known, so nothing speaks against it
             return
         decision = self._checks.step_return(seen.feedback, now_ns)
         action, problem = decision.action, "" if decision.refusal is None else decision.why

@@ -120,7 +120,7 @@ class CommandHandler(FlightSupervisor):
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering, as far as it can on its own: the proxy is ending."""
+        """Leave a flying vehicle hovering, as far as it can without the proxy, which is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:

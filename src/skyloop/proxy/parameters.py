@@ -336,8 +336,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies their values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. They also change on their own: each is always
-    read again, and a change causes no event.
+    ``free``: parameters that any pilot may write without the authority. They also change without being written: each is
+    always read again, and a change causes no event.
     """
 
     def __init__(

@@ -241,14 +241,14 @@ class Proxy:
         """End the flight and then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
 
         First, everything except landing and emergency stop is barred for good, whether or not the vehicle flies. Then a
-        flying vehicle is landed. If it has not landed in time, it is left hovering if it can hover on its own;
-        otherwise it is told once to stand still, because nothing steers it afterwards.
+        flying vehicle is landed. If it has not landed in time, it is left hovering if it can hover without
+        the proxy; otherwise it gets one last set-point of zero speed.
 
         Args:
             within_s: Time limit for the landing [s]; 0: don't land.
             reason: The reason, for people.
-            hurry: Called several times a second; True ends the wait for the landing. A vehicle that does not hover on
-                its own is still landed, however long it takes: without its proxy it would fall.
+            hurry: Called several times a second; True ends the wait for the landing. A vehicle that can't hover
+                without the proxy is still landed, however long it takes: without its proxy it would fall.
             unless_flying: If it has not landed in time, the landing continues, and so does the proxy.
             hangs: The driver hangs or fails. Nothing waits for it then, and it is not asked to land or hover: calls
                 that may hang are left to daemon threads, as if the proxy had been killed.

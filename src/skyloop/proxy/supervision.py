@@ -172,9 +172,8 @@ class FlightSupervisor:
     def _observe_link(self, now_ns: int) -> None:
         """Act on changes of the vehicle link since the last call.
 
-        Intents end when the link breaks and when it returns, so that nothing requested in between is executed later.
-        Both times the vehicle gets a hover, because a driver must not continue an old set-point. A pilot's landing
-        stays.
+        Intents end when the link breaks and when it returns, so that nothing from before is executed later.
+        Both times the vehicle gets a hover, because a driver must not continue an old set-point. A landing stays.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -262,7 +261,7 @@ class FlightSupervisor:
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
             elif changed.why:  # a flight of ours turned up: its pilot may return, so the silence starts now
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
-            if changed.why and executor.supported:  # a played recording flies on its own, which surprises no one
+            if changed.why and executor.supported:  # a replay has no pilot to surprise
                 self._events.publish_drafts(ownership_event(changed))
         return executor.seen(now_ns)
 
@@ -413,7 +412,7 @@ class FlightSupervisor:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._look(now_ns)
-        # If the software autopilot has kept steering it, or it was told to land since, it is still the same flight.
+        # An abandoned flight may be another one by now, unless the software autopilot kept steering it, or it lands.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._look(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:

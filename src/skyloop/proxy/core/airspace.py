@@ -26,9 +26,9 @@ LOST_NS: Final = 2 * NS_PER_S  #: an older position is not worth waiting for
 BLIND_M: Final = 0.5  #: longest flight between walls to a position without a new measured one
 #: A position that changes by more than this, and by more than the vehicle can have flown since, has jumped.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; farther out, only coming back is allowed
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; beyond that, only coming back is allowed
 BRAKE_GAIN: Final = 2.0  #: requested deceleration per excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed of leading a vehicle back that asks to go farther beyond a wall
+RETURN_M_S: Final = 0.5  #: maximum speed of leading back a vehicle that asks to go on beyond a wall
 #: A hovering vehicle this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
@@ -222,7 +222,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
-        # Beyond walls: stop, unless the velocity leads back through at least one of them, and farther beyond none.
+        # Beyond walls: stop, unless the velocity leads back through at least one of them, and further beyond none.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)

@@ -135,7 +135,7 @@ class FailsafeLadder:
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # a flight of others is left alone, whatever is wrong with it
+        if not inputs.ours:  # hands off a flight of others, whatever its problems
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
@@ -262,7 +262,7 @@ class FailsafeLadder:
             return []
         if self._taken and state not in _CONTRADICTIONS[type(wanted)]:
             return []
-        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # each ends safely on its own
+        if isinstance(wanted, Hover) and state in _MANOEUVRES:  # these end safely without it
             return []
         if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []
