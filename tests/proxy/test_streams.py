@@ -392,7 +392,7 @@ def test_what_the_path_does_not_carry_is_encoded_again_and_tried_later_and_later
     assert camera.form.passing
     camera.rate.kbit_s = 300
     assert camera.play(0.2) == []
-    assert camera.form._anew, "what is encoded now begins with a key picture"
+    assert camera.form._needs_encoder, "what is encoded now begins with a key picture"
     camera.rate.kbit_s = 2000
     assert camera.play(4.0) == []
     assert camera.play(3.0)
@@ -423,7 +423,7 @@ def test_a_vehicle_that_stops_to_send_its_own_pictures_has_its_frames_encoded() 
     camera.clock.advance(1.1)
     assert not camera.form.passing
     assert camera.form.wants(header(1), 1)
-    assert camera.form._anew, "what is encoded now begins with a key picture"
+    assert camera.form._needs_encoder, "what is encoded now begins with a key picture"
 
 
 def test_only_a_form_that_asks_for_all_pictures_at_full_size_takes_the_vehicles_own() -> None:

@@ -124,7 +124,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
         self.current = find()
         self._find = find
         self._changes = changes
-        self._looks = self._look
+        self._looks = self._find_again
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
         """Add a consumer; see :meth:`Channel.add`."""
@@ -142,7 +142,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
                 if not self._drops:
                     self._changes.remove(self._looks)
 
-    def _look(self, _: object) -> None:
+    def _find_again(self, _: object) -> None:
         with self._lock, suppress(SkyloopError):  # there is no camera, or the drone was closed
             before, self.current = self.current, self._find()
             for consumer, dropped in self._drops.items() if self.current is not before else ():

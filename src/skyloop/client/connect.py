@@ -34,7 +34,7 @@ CONNECTORS: Final = "skyloop.connectors"
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
-_LOOK_S: Final = 0.05
+_OUTPUT_WAIT_S: Final = 0.05  #: how long to wait for output of the child before checking on it
 ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long the child waits for its vehicle to land
 _numbers = itertools.count(1)
 
@@ -296,7 +296,7 @@ class PrivateProxy:
     def _wait_for_output(self) -> None:
         """Sleep until the child prints something (such as its readiness), ends, or a moment has passed."""
         stdout = self._process.stdout
-        if wait_readable(stdout, _LOOK_S) and not os.read(stdout.fileno(), 4096):
+        if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
             time.sleep(0.005)  # it has closed its output and is about to end
 
 

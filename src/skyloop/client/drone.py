@@ -47,7 +47,7 @@ from skyloop.client.piloting import OnExit, Piloting
 from skyloop.client.preflight import PreflightFinding, inspect
 from skyloop.client.publishing import Logbook, checked_time
 from skyloop.client.results import Result, ResultListener, ResultMailbox, is_old, silence
-from skyloop.client.telemetry import ClientState, LinkStatus, Receiver, Wanted, as_predicate
+from skyloop.client.telemetry import ClientState, LinkStatus, SessionSamples, Wanted, as_predicate
 from skyloop.client.video import StreamChannel, VideoOptions
 from skyloop.errors import (
     AuthorityError,
@@ -102,7 +102,7 @@ UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
 EVENT_DEPTH: Final = 256  #: how many events, log entries and so on may wait for a slow callback
 WHOLE_S: Final = 1.0  #: time for every field of feedback to arrive after a reduced request
-_LOOK_S: Final = 0.5  #: how often a thread that waits for a frame checks that its camera still exists
+_CAMERA_CHECK_S: Final = 0.5  #: how often a thread that waits for a frame checks that its camera still exists
 _SOON_S: Final = 1.0  #: a vehicle that still wakes up after this time is reported in the log
 _ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
@@ -219,7 +219,7 @@ class Drone:
             role, authority, schedule, connection, scheduler, emit=state.emit, changed=changed, granted=restorer.granted
         )
         self._piloting = Piloting(connection, state, self._commands, on_exit, self.close)
-        receiver = Receiver(state, connection, self._commands, restorer)
+        receiver = SessionSamples(state, connection, self._commands, restorer)
         self._supervisor = ConnectionSupervisor(
             connection, receiver, dial, Hello(app, role), policy=policy, clock=scheduler.clock, begin=scheduler.begin
         )
@@ -817,7 +817,7 @@ class Drone:
             channel = self._state.video.channel(camera)
             channel.keep()
             self._connection.check_may_wait()
-            left_s = min(_LOOK_S, deadline - time.monotonic())
+            left_s = min(_CAMERA_CHECK_S, deadline - time.monotonic())
             while channel.notifier.wait_for(lambda: channel.unread or self.closed, left_s):  # noqa: B023
                 self._connection.check_open()
                 frame = channel.read()

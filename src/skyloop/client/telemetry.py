@@ -319,7 +319,7 @@ class ClientState:
         self.notifier.notify()
 
 
-class Receiver:
+class SessionSamples:
     """Handles the samples and the connection changes of every session.
 
     ``feedback``, ``frame`` and the other samples arrive on the receiving thread, the rest on the supervisor's.

@@ -56,9 +56,9 @@ class ActionExecutor:
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
-        self.unsaid: Exception | None = None  #: why the driver gave none; the tick clears and raises it
+        self.observe_error: Exception | None = None  #: why the driver gave none; the tick clears and raises it
         self._publisher = publisher
-        self.gave_up = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
+        self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
 
     @property
     def state(self) -> FlightState:
@@ -87,7 +87,7 @@ class ActionExecutor:
             left_to = self._driver.left_to()
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
         except Exception as error:  # noqa: BLE001  the failsafe comes first, whatever the driver's code does
-            self.unsaid = error
+            self.observe_error = error
         return self.flight.observe(self._publisher.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
@@ -189,7 +189,7 @@ class ActionExecutor:
             if isinstance(error, DriverError):
                 before = self.autopilot.mode
                 self.autopilot.refused(self._publisher.reported_state)
-                self.gave_up = str(error) if self.autopilot.mode is not before else ""
+                self.autopilot_refusal = str(error) if self.autopilot.mode is not before else ""
             return None
 
     def _start(self, action: AnyAction, now_ns: int) -> None:

@@ -124,7 +124,7 @@ class CommandHandler(FlightSupervisor):
         with self._lock:
             self.ladder.order_landing()
             try:
-                self._look(now_ns)
+                self._observe_vehicle(now_ns)
                 executor, withdrew = self._executor, self._withdraw_takeoff(now_ns)
                 lands = executor.state is FlightState.LANDING and (Land in executor.native or not withdrew)
                 if self.flight.ours and executor.airborne and not lands:
@@ -224,7 +224,7 @@ class CommandHandler(FlightSupervisor):
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
         if flight.whose is not Whose.OURS:
-            self._look(now_ns)
+            self._observe_vehicle(now_ns)
         intents = session.intents
         state = self._observe_intent(session, now_ns)  # an earlier end of intents must not end this one
         refusal = checks.receive(command, intents, session.app_id, now_ns)
@@ -247,10 +247,10 @@ class CommandHandler(FlightSupervisor):
         if kind is Idle:
             if type(intents.newest.action) is Takeoff:
                 intents.newest.end(Fate.WITHDRAWN)
-            self._tell(session)
+            self._report_intent(session)
             return _NOTHING, self._count_applied(command)
         if intent.over:
-            self._tell(session)
+            self._report_intent(session)
             if intent.reason is None:  # it was carried out
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
@@ -292,7 +292,7 @@ class CommandHandler(FlightSupervisor):
         # Before feedback shows this intent: an "arrived" beside it would be the previous return's.
         if fresh and self._returns.observe():
             self._stamp()
-        self._tell(session)
+        self._report_intent(session)
         applied_ns = self._count_applied(command)
         ladder = self.ladder
         if not (ladder.idle or checks.goes_on(kind, seen, automatic=automatic)):
@@ -365,11 +365,11 @@ class CommandHandler(FlightSupervisor):
     ) -> AnyAction:
         """Refuse the holder's intent and end it: its repeats get the same answer."""
         intent.refuse(reason, why)
-        self._tell(session)
+        self._report_intent(session)
         kind, seen = type(command.action), self._executor.seen(now_ns)
         if kind is Takeoff:
             self._withdraw_takeoff(now_ns)
-        if self.ladder.lands_on and not self.checks.goes_on(kind, seen, automatic=command.automatic):
+        if self.ladder.continues_landing and not self.checks.goes_on(kind, seen, automatic=command.automatic):
             drafts = self._apply_failsafe(self.ladder.fresh_command(), now_ns)  # the landing is no longer wanted
             self._events.publish_drafts(*drafts)
             self.ladder.hand_over(now_ns)

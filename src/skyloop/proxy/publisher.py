@@ -94,7 +94,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._told: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -148,7 +148,7 @@ class VehiclePublisher:
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
         """Set the outcome of an intent in feedback; an end shows by the next tick."""
         self._newest = intent, app_id, name
-        if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._told:
+        if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
@@ -176,7 +176,7 @@ class VehiclePublisher:
         state = self.state_of(raw.state)
         intent, app_id, name = self._newest
         outcome = intent.outcome(app_id, name, state)
-        self._told = outcome.fate, outcome.reason
+        self._shown_outcome = outcome.fate, outcome.reason
         sample = _replace(
             raw,
             state=state,

@@ -95,7 +95,7 @@ class StreamForm:
         self._thread: threading.Thread | None = None
         self._ended = False
         self._encoder: H264Encoder | None = None
-        self._anew = False  # a new encoder is needed
+        self._needs_encoder = False  # a new encoder is needed
         self._own_kbit_s = 0.0  # rate of the vehicle's own pictures; 0: unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
@@ -113,7 +113,7 @@ class StreamForm:
 
     def _encode_again(self) -> None:
         """Switch to encoding, starting with a key picture. The lock is held."""
-        self._passing, self._wants_key, self._anew = False, True, True
+        self._passing, self._wants_key, self._needs_encoder = False, True, True
 
     def asked(self) -> None:
         """Note a new subscription. A subscriber that returns after a lost link acknowledges no earlier pictures."""
@@ -224,8 +224,8 @@ class StreamForm:
         kbit_s = self._follow_path(picture.header)
         header = resized_header(picture.header, *_even(picture.header, self._scale))
         with self._changed:
-            encoder = None if self._anew else self._encoder
-            self._anew = False
+            encoder = None if self._needs_encoder else self._encoder
+            self._needs_encoder = False
         size = (header.width, header.height)
         if encoder is None or (encoder.width, encoder.height) != size or not encoder.carries(kbit_s):
             varies = self._rate is not None

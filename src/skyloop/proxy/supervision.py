@@ -159,11 +159,11 @@ class FlightSupervisor:
                 if drifts is not self._drifts:
                     self._drifts = drifts
                     self._events.publish_repeated((0, "drift", drifts), lambda: drift_event(drifts))
-            why, executor.gave_up = executor.gave_up, ""
+            why, executor.autopilot_refusal = executor.autopilot_refusal, ""
             if why and session is not None:
                 session.intents.newest.end(Fate.REFUSED, why, Refusal.WRONG_STATE)
-                self._tell(session)
-            error, executor.unsaid = executor.unsaid, None
+                self._report_intent(session)
+            error, executor.observe_error = executor.observe_error, None
             if error is not None:
                 raise error
 
@@ -184,7 +184,7 @@ class FlightSupervisor:
             self._start_over(Fate.LINK, now_ns)
             return
         if landing.begun or self._publisher.link_up:
-            self.ladder.land_on(now_ns)
+            self.ladder.continue_landing(now_ns)
         else:
             self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
@@ -234,7 +234,7 @@ class FlightSupervisor:
         if not airspace.jumped_m:
             return
         if self._executor.supported and self._executor.airborne and self.flight.ours:  # a recording has no pilot
-            lands = self._asked(Land) is not None or self.ladder.lands_on  # a landing is fine anywhere
+            lands = self._asked(Land) is not None or self.ladder.continues_landing  # a landing is fine anywhere
             event = position_jumped_event(airspace.jumped_m, lands=lands)
             self._events.publish_repeated((0, "jumped"), lambda: event)
             if not lands:
@@ -247,7 +247,7 @@ class FlightSupervisor:
         self.ladder.hand_over(now_ns)
         self._update_failsafe(now_ns)
 
-    def _look(self, now_ns: int) -> Snapshot:
+    def _observe_vehicle(self, now_ns: int) -> Snapshot:
         """Observe the vehicle, and act on a change of hands of its flight."""
         executor, flight = self._executor, self.flight
         changed = executor.observe(now_ns)
@@ -284,7 +284,7 @@ class FlightSupervisor:
         session = self._holder
         if session is not None:
             session.intents.end(fate, why, reason)
-            self._tell(session)
+            self._report_intent(session)
         self._withdraw_takeoff(now_ns)
 
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
@@ -292,11 +292,11 @@ class FlightSupervisor:
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
-                self._look(now_ns)  # a landing may be by others: then that ended it
+                self._observe_vehicle(now_ns)  # a landing may be by others: then that ended it
             feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
-                self._tell(session)
+                self._report_intent(session)
                 if intent.fate is not Fate.COMPLETED:
                     self._withdraw_takeoff(now_ns)
         if self._rising_until_ns is None:
@@ -325,7 +325,7 @@ class FlightSupervisor:
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
-    def _tell(self, session: Session) -> None:
+    def _report_intent(self, session: Session) -> None:
         """Show the outcome of an application's newest intent in feedback, an end soon."""
         self._publisher.tell(session.intents.newest, session.app_id, session.name)
 
@@ -366,13 +366,13 @@ class FlightSupervisor:
             if isinstance(effect, Lost):
                 self._pilot = effect.reason
                 if session is not None and session.intents.lands and self.flight.ours:
-                    self.ladder.land_on(now_ns)
+                    self.ladder.continue_landing(now_ns)
             elif isinstance(effect, Granted):
                 self._pilot = "held"
                 self.ladder.hand_over(now_ns)
             if session is not None:
                 session.intents.end(Fate.AUTHORITY)
-                self._tell(session)
+                self._report_intent(session)
                 self._withdraw_takeoff(now_ns)
         drafts = self._act(now_ns, stamps=True)  # hovers before anyone learns about the changes
         holder = self.authority.holder
@@ -411,12 +411,12 @@ class FlightSupervisor:
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight
-        seen = self._look(now_ns)
+        seen = self._observe_vehicle(now_ns)
         # An abandoned flight may be another one by now, unless the software autopilot kept steering it, or it lands.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
-            seen = self._look(now_ns)
+            seen = self._observe_vehicle(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
-            ladder.land_on(now_ns)  # no hover may take back its pilot's landing
+            ladder.continue_landing(now_ns)  # no hover may take back its pilot's landing
         inputs = FailsafeInputs(
             state=seen.state,
             airborne=flight.flies(seen.state),

@@ -341,9 +341,9 @@ class CommandChecks:
         """Return whether the ladder's task continues beside an executed command of the holder, rather than ending."""
         ladder = self._ladder
         if automatic:
-            return ladder.lands_on or ladder.step is Failsafe.LAND
+            return ladder.continues_landing or ladder.step is Failsafe.LAND
         if kind is Land:
-            return ladder.lands_on
+            return ladder.continues_landing
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:

@@ -183,7 +183,7 @@ class FailsafeLadder:
             self._want(Hover(), now_ns)
 
     @property
-    def lands_on(self) -> bool:
+    def continues_landing(self) -> bool:
         """Whether it continues a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
@@ -192,7 +192,7 @@ class FailsafeLadder:
         """Whether it makes the vehicle land, here or at its start, whoever requested that."""
         return isinstance(self._wanted, Land | ReturnToStart)
 
-    def land_on(self, now_ns: int) -> None:
+    def continue_landing(self, now_ns: int) -> None:
         """Continue a landing whose pilot leaves, or while the vehicle link is lost."""
         if not self.lands:
             self._want(Land(), now_ns)

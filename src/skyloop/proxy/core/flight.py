@@ -194,7 +194,7 @@ class Flight:
         newest sample, if the link is up and the sample is fresh; None: no current data.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
-            self._look(reported, left_to, feedback.altitude_m)
+            self._observe_unsteered(reported, left_to, feedback.altitude_m)
         state, before = self.state(reported), self.whose
         flies = self.flies(state)
         if self._believed_until_ns is not None and now_ns >= self._believed_until_ns:
@@ -213,9 +213,9 @@ class Flight:
                 self.whose = Whose.OURS if self.awaited or not self._shared else Whose.OTHERS
             if flies:
                 self._believed_until_ns = None
-        return None if self.whose is before else Changed(self.whose, self._words(before))
+        return None if self.whose is before else Changed(self.whose, self._change_text(before))
 
-    def _look(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
+    def _observe_unsteered(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
         """Observe a vehicle without a concept of flight while nothing is steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
@@ -235,7 +235,7 @@ class Flight:
             self.whose, self.left_to, self._claimed_until_ns = Whose.NOBODYS, "", None
             self._seen_up = self._sent_up = False
 
-    def _words(self, before: Whose) -> str:
+    def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
             return ""  # the driver reported who took it, or the flight is over, or it can only be ours
         if self.whose is Whose.OURS:
