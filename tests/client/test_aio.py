@@ -1,4 +1,4 @@
-"""The asyncio face."""
+"""The asyncio API."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_frames(proxy: ScriptedProxy) -> None:
     run(look())
 
 
-def test_frames_that_are_too_old_do_not_begin_the_time_anew(proxy: ScriptedProxy) -> None:
+def test_frames_that_are_too_old_do_not_restart_the_time_out(proxy: ScriptedProxy) -> None:
     async def look() -> None:
         async with aio.connect("me") as drone:
             sending = background(lambda: _send(proxy, 200))
@@ -155,7 +155,7 @@ def test_frames_that_are_too_old_do_not_begin_the_time_anew(proxy: ScriptedProxy
             with pytest.raises(NoAnswerError, match="no frame of front"):
                 async for _ in drone.frames(timeout_s=0.3, max_age_s=0.0):
                     pass
-            assert sending.is_alive(), "they still came"
+            assert sending.is_alive(), "frames still arrived"
             assert time.monotonic() - begun_s < WAIT_S
             sending.join(WAIT_S)
 
@@ -183,7 +183,7 @@ def test_frames_follow_a_proxy_that_is_restarted_with_another_camera(proxy: Scri
     run(look())
 
 
-def test_what_is_waited_for_ends_when_the_drone_is_closed(proxy: ScriptedProxy) -> None:
+def test_waits_end_when_the_drone_is_closed(proxy: ScriptedProxy) -> None:
     async def look() -> None:
         async with aio.connect("me") as drone:
 
@@ -208,7 +208,7 @@ def _send(proxy: ScriptedProxy, count: int, *camera: str) -> None:
         pause.wait(0.005)
 
 
-def test_a_broken_jpeg_is_passed_over(proxy: ScriptedProxy) -> None:
+def test_a_broken_jpeg_is_skipped(proxy: ScriptedProxy) -> None:
     pytest.importorskip("cv2")
 
     async def look() -> None:
@@ -311,7 +311,7 @@ def test_processors_are_plain_functions(proxy: ScriptedProxy) -> None:
     run(listen())
 
 
-def test_a_cancelled_wait_gives_the_loop_back_at_once(proxy: ScriptedProxy) -> None:
+def test_a_cancelled_wait_frees_the_loop_at_once(proxy: ScriptedProxy) -> None:
     async def wait() -> None:
         async with aio.connect("me") as drone:
             with pytest.raises(TimeoutError):
@@ -323,7 +323,7 @@ def test_a_cancelled_wait_gives_the_loop_back_at_once(proxy: ScriptedProxy) -> N
 
 def test_a_cancelled_connect_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, closed = threading.Event(), threading.Event()
-    connect: Any = skyloop.client.connect  # the one that was put in its place
+    connect: Any = skyloop.client.connect  # the one put in its place
 
     def slow(target: str, **options: Any) -> skyloop.client.Drone:
         go_on.wait(WAIT_S)
@@ -344,7 +344,7 @@ def test_a_cancelled_connect_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: 
 def test_a_connect_cancelled_as_it_succeeds_leaves_no_drone(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The loop was busy while the connection was made: result and cancellation come in the same round."""
+    """A busy loop: the result of the connection and its cancellation arrive in the same round."""
     made, closed = threading.Event(), threading.Event()
     connect: Any = skyloop.client.connect
 
@@ -371,7 +371,7 @@ def test_a_connect_cancelled_as_it_succeeds_leaves_no_drone(
 
 def test_a_connect_whose_loop_has_ended_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on, closed = threading.Event(), threading.Event()
-    connect: Any = skyloop.client.connect  # the one that was put in its place
+    connect: Any = skyloop.client.connect  # the one put in its place
 
     def slow(target: str, **options: Any) -> skyloop.client.Drone:
         go_on.wait(WAIT_S)
@@ -389,7 +389,7 @@ def test_a_connect_whose_loop_has_ended_leaves_no_drone(proxy: ScriptedProxy, mo
     assert closed.wait(WAIT_S)
 
 
-def test_errors_come_out(proxy: ScriptedProxy) -> None:
+def test_errors_propagate(proxy: ScriptedProxy) -> None:
     async def ask() -> None:
         async with aio.connect("me") as drone:
             with pytest.raises(KeyError):
@@ -401,7 +401,7 @@ def test_errors_come_out(proxy: ScriptedProxy) -> None:
     run(ask())
 
 
-def test_the_asyncio_face_has_all_that_the_other_has() -> None:
+def test_the_asyncio_api_has_all_that_the_synchronous_one_has() -> None:
     def public(kind: type) -> set[str]:
         return {name for name in dir(kind) if not name.startswith("_")}
 
@@ -428,23 +428,23 @@ def _methods(face: type, kind: type) -> list[tuple[Any, Any]]:
     ],
     ids=lambda function: function.__qualname__,
 )
-def test_both_faces_have_the_same_arguments(ours: Callable[..., Any], theirs: Callable[..., Any]) -> None:
-    """Names, defaults, and which are given by name alone."""
+def test_both_apis_have_the_same_arguments(ours: Callable[..., Any], theirs: Callable[..., Any]) -> None:
+    """Names, defaults, and which arguments are keyword-only."""
 
     def arguments(function: Callable[..., Any]) -> list[tuple[str, object, object]]:
         found = inspect.signature(function).parameters.values()
         return [(one.name, one.kind, one.default) for one in found]
 
     assert arguments(ours) == arguments(theirs)
-    assert ours.__doc__ or ours.__name__ == "__len__", "it has a text"
+    assert ours.__doc__ or ours.__name__ == "__len__", "it has a docstring"
 
 
-def test_the_stub_says_what_the_code_says() -> None:
+def test_the_stub_matches_the_code() -> None:
     stub = ast.parse(aio_stub.STUB.read_text(encoding="utf-8"))
     assert ast.dump(stub) == ast.dump(ast.parse(aio_stub.stub())), "make stubs"
 
 
-def test_a_callback_that_would_hold_up_the_receiving_thread_is_refused(proxy: ScriptedProxy) -> None:
+def test_a_callback_that_would_block_the_receiving_thread_is_refused(proxy: ScriptedProxy) -> None:
     async def listen() -> None:
         async with aio.connect("me") as drone:
             with pytest.raises(UsageError, match="inline must be False"):
@@ -457,7 +457,7 @@ def test_a_callback_that_would_hold_up_the_receiving_thread_is_refused(proxy: Sc
 
 
 def test_a_coroutine_function_as_predicate_is_refused(proxy: ScriptedProxy) -> None:
-    """What it returns is true: the wait was over at once, whatever the vehicle did."""
+    """Its result is truthy, so the wait ended at once, whatever the vehicle did."""
 
     async def is_there(_: object) -> bool:
         return False
@@ -470,7 +470,7 @@ def test_a_coroutine_function_as_predicate_is_refused(proxy: ScriptedProxy) -> N
     run(wait())
 
 
-def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> None:
+def test_clocks_poses_and_own_events_work_as_on_the_drone(proxy: ScriptedProxy) -> None:
     async def fly() -> None:
         async with aio.connect("me") as drone:
             assert not drone.closed
@@ -487,7 +487,7 @@ def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> Non
 
 
 @pytest.mark.parametrize(("state", "instead"), [(FlightState.LANDED, Idle()), (FlightState.TAKING_OFF, Hover())])
-def test_a_cancelled_take_off_is_not_carried_out(proxy: ScriptedProxy, state: FlightState, instead: AnyAction) -> None:
+def test_a_cancelled_take_off_is_not_executed(proxy: ScriptedProxy, state: FlightState, instead: AnyAction) -> None:
     """Cancelling takeoff() left it climbing."""
     proxy.state = state
 
@@ -504,7 +504,7 @@ def test_a_cancelled_take_off_is_not_carried_out(proxy: ScriptedProxy, state: Fl
     run(fly())
 
 
-def test_a_cancelled_flight_of_a_swarm_is_not_carried_out(proxy: ScriptedProxy) -> None:
+def test_a_cancelled_flight_of_a_swarm_is_not_executed(proxy: ScriptedProxy) -> None:
     async def fly() -> None:
         drone = await aio.connect("me", on_exit="hover")
         with pytest.raises(TimeoutError):
@@ -518,10 +518,10 @@ def test_a_cancelled_flight_of_a_swarm_is_not_carried_out(proxy: ScriptedProxy) 
     run(fly())
 
 
-def test_an_interrupted_flight_of_a_swarm_is_not_carried_out(
+def test_an_interrupted_flight_of_a_swarm_is_not_executed(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C, while each drone is waited for on a thread of its own."""
+    """Ctrl-C while each drone is awaited on its own thread."""
     drone = skyloop.client.connect("me")
 
     def interrupt(_thread: threading.Thread, _timeout_s: float | None = None) -> None:
@@ -538,8 +538,8 @@ def test_an_interrupted_flight_of_a_swarm_is_not_carried_out(
     drone.close()
 
 
-def test_a_command_cancelled_before_it_was_sent_is_not_sent_any_more(proxy: ScriptedProxy) -> None:
-    """Its thread came to it after the hover that the program had asked for meanwhile."""
+def test_a_command_cancelled_before_it_was_sent_is_never_sent(proxy: ScriptedProxy) -> None:
+    """Its thread sent it after the hover that the program had commanded since."""
     proxy.state = FlightState.FLYING
     go_on, ended = threading.Event(), threading.Event()
 
@@ -567,7 +567,7 @@ def test_a_command_cancelled_before_it_was_sent_is_not_sent_any_more(proxy: Scri
 
 
 def test_a_command_within_another_wait_that_is_cancelled_ends_with_it(proxy: ScriptedProxy) -> None:
-    """A coroutine that a thread waits for went on flying when nobody waited for that thread any more."""
+    """A coroutine awaited by a thread kept flying after no one waited for that thread any more."""
     proxy.state = FlightState.FLYING
     go_on = threading.Event()
 
@@ -594,8 +594,8 @@ def test_a_command_within_another_wait_that_is_cancelled_ends_with_it(proxy: Scr
     run(fly())
 
 
-def test_a_cancelled_flight_leaves_alone_what_was_asked_for_since(proxy: ScriptedProxy) -> None:
-    """Its hover, some milliseconds later, ended the new one."""
+def test_a_cancelled_flight_leaves_later_commands_alone(proxy: ScriptedProxy) -> None:
+    """Its hover, some milliseconds later, ended the new flight."""
     proxy.state = FlightState.FLYING
 
     async def fly() -> None:

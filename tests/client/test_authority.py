@@ -1,4 +1,4 @@
-"""Who may fly, as an application knows it."""
+"""The authority, as known to an application."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def test_granted_by_reply_event_or_feedback() -> None:
         assert not authority.pending
         status = authority.status
         assert (status.state, status.lease, status.priority, status.holder) == ("held", 5, 7, "me")
-        assert not authority.granted(5, NOW), "told again, nothing changed"
+        assert not authority.granted(5, NOW), "a repeated grant changes nothing"
 
 
-def test_not_wanted_is_not_taken_from_feedback() -> None:
+def test_an_unwanted_authority_is_not_taken_from_feedback() -> None:
     authority = AuthorityTracker("me")
     authority.connected(3)
     assert not authority.feedback(owned(3, 5, "me"), NOW)
@@ -83,10 +83,10 @@ def test_pre_emption_by_event_and_by_feedback(held: AuthorityTracker) -> None:
     assert held.feedback(owned(9, 8, "boss"), NOW)
     assert held.status.state == "preempted"
     assert held.queued(1, "boss")
-    assert held.status.state == "preempted", "still said to be taken away, not just waiting"
+    assert held.status.state == "preempted", "still pre-empted, not just queued"
 
 
-def test_an_old_lease_told_late_changes_nothing(held: AuthorityTracker) -> None:
+def test_a_late_report_of_an_old_lease_changes_nothing(held: AuthorityTracker) -> None:
     assert not held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=4, by="boss"), NOW)
     held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=5, by="boss"), NOW)
     assert not held.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=5), NOW)
@@ -103,36 +103,36 @@ def test_feedback_from_before_the_grant_does_not_end_it(held: AuthorityTracker) 
 def test_lost_by_silence(held: AuthorityTracker) -> None:
     assert held.feedback(owned(), LATER)
     assert held.status.state == "none"
-    assert held.wanted, "it is to be asked for again"
+    assert held.wanted, "it will be requested again"
     held.granted(6, LATER)
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=6, reason="silent"), LATER)
     assert held.status.state == "none"
 
 
-def test_lost_by_silence_and_the_event_was_lost_too(held: AuthorityTracker) -> None:
+def test_loss_by_silence_with_the_event_lost_too(held: AuthorityTracker) -> None:
     kept = owned(3, 0, "me")  # the name stays on the vehicle, without a lease
     assert not held.feedback(kept, NOW + 1), "it may be from before the grant"
     assert held.feedback(kept, LATER)
     assert (held.status.state, held.wanted) == ("none", True)
 
 
-def test_the_time_it_was_asked_for_and_the_expected_wait(authority: AuthorityTracker) -> None:
+def test_the_requested_time_and_the_expected_wait(authority: AuthorityTracker) -> None:
     assert authority.queued(2, "other", 40.0)
     assert authority.status.expected_wait_s == 40.0
     assert authority.event(event(EventKind.AUTHORITY_QUEUED, app_id=3, position=1, wait_s=10.0), NOW)
     assert (authority.status.position, authority.status.expected_wait_s) == (1, 10.0)
     assert authority.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=7, until_ns=99), NOW)
     assert authority.status.until_ns == 99
-    assert not authority.granted(7, NOW), "told again without the time"
+    assert not authority.granted(7, NOW), "a repeated grant without the time"
     assert authority.status.until_ns == 99
 
 
-def test_who_lost_it_because_the_time_is_over_does_not_ask_again(held: AuthorityTracker) -> None:
+def test_after_its_time_is_over_it_is_not_requested_again(held: AuthorityTracker) -> None:
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="expired", by="other"), NOW)
     assert (held.status.state, held.wanted) == ("none", False)
 
 
-def test_feedback_may_overtake_the_event_that_the_time_is_over(held: AuthorityTracker) -> None:
+def test_feedback_may_overtake_the_event_of_expiry(held: AuthorityTracker) -> None:
     """Shown as pre-empted, it would wait for ever in a queue that it is not in."""
     assert held.feedback(owned(9, 6, "next"), NOW)
     assert held.status.state == "preempted"
@@ -140,20 +140,20 @@ def test_feedback_may_overtake_the_event_that_the_time_is_over(held: AuthorityTr
     assert (held.status.state, held.wanted) == ("none", False)
 
 
-def test_feedback_may_overtake_the_event_that_it_was_silent(held: AuthorityTracker) -> None:
+def test_feedback_may_overtake_the_event_of_silence(held: AuthorityTracker) -> None:
     assert held.feedback(owned(9, 6, "next"), NOW)
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="silent"), NOW)
-    assert (held.status.state, held.wanted) == ("none", True), "it is to be asked for again"
+    assert (held.status.state, held.wanted) == ("none", True), "it will be requested again"
 
 
-def test_the_event_that_the_time_is_over_may_be_lost(authority: AuthorityTracker) -> None:
+def test_the_event_of_expiry_may_be_lost(authority: AuthorityTracker) -> None:
     authority.asked(RequestAuthority(for_s=1.0))
     authority.granted(7, NOW, until_ns=500)
     assert authority.feedback(Feedback(captured_ns=501, owner_id=9, lease=8, owner="next"), NOW)
     assert (authority.status.state, authority.wanted) == ("none", False)
 
 
-def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authority: AuthorityTracker) -> None:
+def test_a_refusal_by_the_holder_is_remembered_until_the_next_request(authority: AuthorityTracker) -> None:
     assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 4}), NOW)
     assert authority.declined == ""
     assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 3}), NOW)
@@ -162,20 +162,20 @@ def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authorit
     assert authority.declined == ""
 
 
-def test_given_back_and_refused(held: AuthorityTracker) -> None:
+def test_released_and_refused(held: AuthorityTracker) -> None:
     assert held.given_back()
     assert (held.status.state, held.wanted) == ("none", False)
     assert not held.given_back()
 
 
-def test_a_new_connection_begins_anew(held: AuthorityTracker) -> None:
+def test_a_new_connection_starts_over(held: AuthorityTracker) -> None:
     assert held.disconnected()
     assert (held.status.state, held.wanted, held.status.priority) == ("none", True, 16)
     held.connected(1)
     assert held.granted(1, LATER), "a restarted proxy counts its leases from 1"
 
 
-def test_a_lost_link_is_no_answer(authority: AuthorityTracker) -> None:
+def test_a_lost_link_is_not_an_answer(authority: AuthorityTracker) -> None:
     assert not authority.answered
     authority.disconnected()
     assert not authority.answered
@@ -185,7 +185,7 @@ def test_a_lost_link_is_no_answer(authority: AuthorityTracker) -> None:
     assert authority.answered
 
 
-def test_an_earlier_session_is_known_by_its_number_in_the_same_run() -> None:
+def test_an_earlier_session_is_recognised_by_its_number_in_the_same_run() -> None:
     ended = EndedSessions()
     earlier, authority = AuthorityTracker("me", ended), AuthorityTracker("me", ended)
     earlier.connected(3, run_id=70)
@@ -193,7 +193,7 @@ def test_an_earlier_session_is_known_by_its_number_in_the_same_run() -> None:
     authority.connected(4, run_id=70)
     authority.asked(RequestAuthority(16))
     authority.queued(1, "me")
-    assert not authority.settled  # nobody knows yet whose it is
+    assert not authority.settled  # whose it is, is still unknown
     assert not authority.behind_itself
     assert authority.feedback(owned(3, 5, "me"), NOW)
     assert authority.behind_itself
@@ -202,7 +202,7 @@ def test_an_earlier_session_is_known_by_its_number_in_the_same_run() -> None:
     assert not authority.behind_itself
     assert authority.settled
     authority.disconnected()
-    authority.connected(1, run_id=71)  # the proxy was restarted, and numbers begin again
+    authority.connected(1, run_id=71)  # the proxy restarted, with new numbers
     authority.asked(RequestAuthority(16))
     authority.queued(1, "other")
     authority.feedback(owned(3, 1, "other"), NOW)
@@ -223,10 +223,10 @@ def test_the_oldest_ended_session_is_forgotten() -> None:
 @pytest.mark.parametrize(
     ("reason", "state", "wanted"), [("expired", "none", False), ("silent", "none", True), ("gone", "none", True)]
 )
-def test_feedback_that_overtakes_the_loss_does_not_make_it_a_takeover(
+def test_feedback_before_the_event_of_a_loss_does_not_make_it_a_takeover(
     held: AuthorityTracker, reason: str, state: str, wanted: bool
 ) -> None:
-    """It was shown as "preempted" for ever, and asked for nothing any more."""
+    """It showed "preempted" for ever, and requested nothing any more."""
     assert held.feedback(owned(9, 6, "other"), NOW)
     assert held.status.state == "preempted"
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason=reason, by="other"), LATER)

@@ -1,4 +1,4 @@
-"""Listeners: their own pace, their own errors."""
+"""Listeners: each has its own pace and its own errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_slow_listener_gets_the_newest_and_a_quick_one_everything(bench: Bench) -> None:
+def test_a_slow_listener_gets_the_newest_and_a_fast_one_everything(bench: Bench) -> None:
     entered, go_on, done = threading.Event(), threading.Event(), threading.Event()
     slow_got: list[int] = []
     quick_got: list[int] = []
@@ -54,7 +54,7 @@ def test_a_slow_listener_gets_the_newest_and_a_quick_one_everything(bench: Bench
         assert bench.channel.dropped == 8
     assert slow_got == [0, 9]
     assert quick_got == list(range(10))
-    assert bench.channel.dropped == 8, "drops of listeners that are gone still count"
+    assert bench.channel.dropped == 8, "drops of removed listeners still count"
 
 
 def test_the_first_subscribes_and_the_last_unsubscribes(bench: Bench) -> None:
@@ -68,7 +68,9 @@ def test_the_first_subscribes_and_the_last_unsubscribes(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("inline", [True, False])
-def test_a_raising_listener_is_told_and_goes_on(bench: Bench, caplog: pytest.LogCaptureFixture, inline: bool) -> None:
+def test_a_raising_listener_is_reported_and_goes_on(
+    bench: Bench, caplog: pytest.LogCaptureFixture, inline: bool
+) -> None:
     seen = threading.Semaphore(0)
 
     def raising(number: int) -> None:
@@ -85,7 +87,7 @@ def test_a_raising_listener_is_told_and_goes_on(bench: Bench, caplog: pytest.Log
             bench.channel.publish(number)
             assert seen.acquire(timeout=WAIT_S)
     assert (listener.errors, listener.delivered) == (3, 3)
-    assert bench.reports == [("mine", "no 0")], "one that always fails is told once a second"
+    assert bench.reports == [("mine", "no 0")], "a failing listener is reported once a second"
     assert other == [0, 1, 2]
     assert "RuntimeError('no 0')" in caplog.text
 

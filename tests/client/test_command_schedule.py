@@ -1,4 +1,4 @@
-"""Which command goes out when."""
+"""The schedule of commands."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def wanted(commander: CommandSchedule) -> AnyAction:
 
 
 class Bench:
-    """A commander with a clock, that notes what went out and when [s]."""
+    """A schedule with a clock that notes what is sent and when [s]."""
 
     def __init__(self, **settings: float) -> None:
         self.clock = ManualClock()
@@ -53,7 +53,7 @@ class Bench:
         self.step(0.0)
 
     def step(self, seconds: float) -> None:
-        """Let time pass in steps of 1 ms, as a ticker that wakes when something is due."""
+        """Let time pass in steps of 1 ms, like a ticker that wakes when something is due."""
         for _ in range(max(1, round(seconds * 1000))):
             if seconds:
                 self.clock.advance(0.001)
@@ -66,14 +66,14 @@ class Bench:
         return [action for _, action in self.sent]
 
 
-def test_idle_is_repeated_while_nothing_is_wanted() -> None:
+def test_idle_is_repeated_without_a_set_point() -> None:
     bench = Bench(rate_hz=32.0)
     bench.step(1.0)
     assert set(bench.actions) == {Idle()}
     assert len(bench.sent) in (32, 33)
 
 
-def test_a_set_point_goes_out_at_once_and_is_repeated_on_a_steady_beat() -> None:
+def test_a_set_point_is_sent_at_once_and_repeated_at_a_steady_rate() -> None:
     bench = Bench(rate_hz=20.0)
     bench.step(0.02)
     bench.sent.clear()
@@ -87,7 +87,7 @@ def test_a_set_point_goes_out_at_once_and_is_repeated_on_a_steady_beat() -> None
 
 
 @pytest.mark.parametrize("call_hz", [32.0, 30.0, 15.0, 50.0])
-def test_repeats_never_hold_up_an_application_whatever_its_own_beat(call_hz: float) -> None:
+def test_repeats_never_delay_an_application_at_any_rate(call_hz: float) -> None:
     commander = CommandSchedule(rate_hz=32.0, min_interval_s=0.005)
     commander.resume(0)
     now_ns, calls = 0, 0
@@ -106,10 +106,10 @@ def test_deadlines_are_absolute() -> None:
     commander.resume(0)
     late_ns = 0
     for beat in range(50):
-        late_ns = (late_ns + 37_000_000) % 60_000_000  # served up to 60 ms late, always differently
+        late_ns = (late_ns + 37_000_000) % 60_000_000  # up to 60 ms late, by a different time in each period
         assert commander.next(beat * 100_000_000 + late_ns) == Idle()
         assert commander.due_ns == (beat + 1) * 100_000_000
-    assert commander.next(60 * 100_000_000 + 1) == Idle()  # a second late: one, not ten
+    assert commander.next(60 * 100_000_000 + 1) == Idle()  # a second late: one command, not ten
     assert commander.due_ns == 61 * 100_000_000 + 1
 
 
@@ -126,7 +126,7 @@ def test_set_points_are_spaced_and_the_newest_of_a_burst_wins() -> None:
     assert len(times) == 3
 
 
-def test_a_take_off_is_never_replaced_before_it_went_out() -> None:
+def test_a_take_off_is_never_replaced_before_it_is_sent() -> None:
     bench = Bench()
     bench.ask(FORWARD)
     bench.ask(Takeoff())
@@ -143,19 +143,19 @@ def not_sent(bench: Bench, action: AnyAction) -> None:
 
 
 def owed(bench: Bench, action: AnyAction = FORWARD) -> AnyAction | None:
-    """What goes out before an action that is asked for now."""
+    """Return what is sent before an action that is requested now."""
     bench.commander.ask(action, bench.clock())
     first = bench.commander.first(action, bench.clock())
     return None if first is None else first.action
 
 
-def test_a_landing_for_which_there_was_no_room_goes_before_the_set_points_after_it() -> None:
+def test_a_landing_without_room_is_sent_before_later_set_points() -> None:
     bench = Bench()
     not_sent(bench, Land())
     assert bench.commander.first(Land(), bench.clock()) is None, "its repeat is the same"
     assert owed(bench) == Land()
     bench.clock.advance(0.6)
-    assert owed(bench) is None, "as late as that nobody expects it"
+    assert owed(bench) is None, "by then no one expects it"
 
 
 @pytest.mark.parametrize(
@@ -166,15 +166,15 @@ def test_a_landing_for_which_there_was_no_room_goes_before_the_set_points_after_
         (Land(), Hover(), None),  # revoked
     ],
 )
-def test_what_there_was_no_room_for(unsent: AnyAction, then: AnyAction, first: AnyAction | None) -> None:
+def test_actions_without_room(unsent: AnyAction, then: AnyAction, first: AnyAction | None) -> None:
     bench = Bench()
     not_sent(bench, unsent)
     assert owed(bench, then) == first
 
 
 @pytest.mark.parametrize(("unsent", "first"), [(Takeoff(), None), (Land(), Land())])
-def test_letting_go_sends_no_take_off_that_found_no_room(unsent: AnyAction, first: AnyAction | None) -> None:
-    """It went out just before the command that withdrew it."""
+def test_letting_go_sends_no_unsent_take_off(unsent: AnyAction, first: AnyAction | None) -> None:
+    """It was sent just before the command that withdrew it."""
     bench = Bench()
     not_sent(bench, unsent)
     bench.commander.ask(Idle(), bench.clock(), automatic=True)
@@ -182,7 +182,7 @@ def test_letting_go_sends_no_take_off_that_found_no_room(unsent: AnyAction, firs
     assert (None if found is None else found.action) == first
 
 
-def test_nothing_takes_the_place_of_an_emergency_stop_and_nothing_else_outlives_the_authority() -> None:
+def test_nothing_replaces_an_emergency_stop_and_nothing_else_outlives_the_authority() -> None:
     bench = Bench()
     not_sent(bench, Land())
     bench.commander.clear(Fate.AUTHORITY)
@@ -194,7 +194,7 @@ def test_nothing_takes_the_place_of_an_emergency_stop_and_nothing_else_outlives_
     assert set(bench.actions[-3:]) == {EmergencyStop()}, "it is repeated until there is room"
 
 
-def test_a_hover_goes_out_at_once_but_not_a_stream_of_them() -> None:
+def test_a_hover_is_sent_at_once_but_not_a_stream_of_them() -> None:
     bench = Bench()
     bench.ask(FORWARD)
     bench.ask(Hover())
@@ -228,7 +228,7 @@ def test_a_stalled_application_ends_in_hover() -> None:
     assert bench.actions[-1] == Hover()
 
 
-def test_hover_and_patience_without_end_do_not_decay() -> None:
+def test_hover_and_infinite_patience_do_not_decay() -> None:
     bench = Bench(stall_s=math.inf)
     bench.ask(FORWARD)
     bench.step(3.0)
@@ -248,7 +248,7 @@ def test_hover_and_patience_without_end_do_not_decay() -> None:
         (ResetEmergency(), FlightState.EMERGENCY, FlightState.LANDED),
     ],
 )
-def test_manoeuvres_are_repeated_until_they_are_done(action: AnyAction, during: FlightState, done: FlightState) -> None:
+def test_manoeuvres_are_repeated_until_complete(action: AnyAction, during: FlightState, done: FlightState) -> None:
     bench = Bench()
     bench.ask(action)
     bench.step(0.5)
@@ -278,16 +278,16 @@ def test_manoeuvres_are_not_repeated_for_ever() -> None:
     ("state", "lasts"),
     [(FlightState.LANDING, True), (FlightState.HOVERING, True), (FlightState.UNKNOWN, False)],
 )
-def test_a_landing_is_repeated_for_as_long_as_the_proxy_goes_on_with_it(state: FlightState, lasts: bool) -> None:
-    """From high up it takes minutes. After 60 s nobody asked for it any more, and its caller still waited."""
+def test_a_landing_is_repeated_for_as_long_as_the_proxy_continues_it(state: FlightState, lasts: bool) -> None:
+    """From high up, it takes minutes. After 60 s it was no longer requested, while its caller still waited."""
     commander = CommandSchedule()
     intent = commander.ask(Land(), 0)
     under_way = Feedback(captured_ns=0, state=state, outcome=Outcome(7, intent))
     for second in range(100):
         commander.observe(under_way, second * 10**9, 7)
         action = commander.next(second * 10**9)
-    assert action == (Land() if lasts else Idle()), "where nothing shows the landing, nothing shows its end either"
-    assert commander.next(200 * 10**9) == Idle(), "nobody tells of it any more"
+    assert action == (Land() if lasts else Idle()), "if nothing shows the landing, nothing shows its end either"
+    assert commander.next(200 * 10**9) == Idle(), "it is no longer reported"
 
 
 def test_a_failsafe_ends_the_set_point_but_not_the_calls_after_it() -> None:
@@ -303,7 +303,7 @@ def test_a_failsafe_ends_the_set_point_but_not_the_calls_after_it() -> None:
     assert wanted(bench.commander) == Idle()
 
 
-def test_an_emergency_ends_the_set_point_and_a_cleared_stop_goes_on() -> None:
+def test_an_emergency_ends_the_set_point_and_a_cleared_stop_continues() -> None:
     bench = Bench()
     bench.ask(FORWARD)
     bench.commander.observe(feedback(FlightState.EMERGENCY), bench.clock())
@@ -314,7 +314,7 @@ def test_an_emergency_ends_the_set_point_and_a_cleared_stop_goes_on() -> None:
 
 
 @pytest.mark.parametrize(("age_s", "kept"), [(0.4, True), (0.6, False)])
-def test_what_was_asked_while_the_link_was_down(age_s: float, kept: bool) -> None:
+def test_commands_given_while_the_link_was_down(age_s: float, kept: bool) -> None:
     clock = ManualClock()
     commander = CommandSchedule()
     commander.ask(FORWARD, clock())
@@ -357,7 +357,7 @@ def test_unusable_settings(settings: dict[str, float]) -> None:
 
 
 @given(st.lists(st.tuples(st.booleans(), st.floats(0.0, 0.1)), max_size=100))
-def test_never_faster_than_allowed_and_never_slower_than_the_beat(steps: list[tuple[bool, float]]) -> None:
+def test_never_faster_than_allowed_and_never_slower_than_the_rate(steps: list[tuple[bool, float]]) -> None:
     clock, commander = ManualClock(), CommandSchedule(rate_hz=50.0, min_interval_s=0.005)
     commander.resume(clock())
     intents = {0}

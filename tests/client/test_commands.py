@@ -1,4 +1,4 @@
-"""Commands and authority against a proxy that is played by the test."""
+"""Commands and authority with a scripted proxy."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
         yield drone
 
 
-def test_a_command_goes_out_at_once_and_is_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_command_is_sent_at_once_and_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
     sent_ns = time.monotonic_ns()
     up: Any = np.float32(0.25)
     assert drone.velocity(forward=0.5, left=1, up=up, yaw_rate=-0.5)
@@ -154,7 +154,7 @@ def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land for ever")
 
 
-def test_a_landing_that_finds_no_room_is_sent_before_the_next_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_landing_without_room_is_sent_before_the_next_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
     connection = drone._connection
     transmit, full = connection.transmit, threading.Event()
 
@@ -174,7 +174,7 @@ def test_a_landing_that_finds_no_room_is_sent_before_the_next_set_point(proxy: S
 
 
 def refuse(proxy: ScriptedProxy, command: Command, reason: Refusal, text: str, fate: Fate = Fate.REFUSED) -> None:
-    """Feedback tells from now on that this intent is over."""
+    """Report in feedback that this intent is over."""
     assert proxy.owner is not None
     proxy.more["outcome"] = Outcome(proxy.owner[0], command.intent, fate, reason, text)
 
@@ -207,7 +207,7 @@ def lost_lease(proxy: ScriptedProxy, _: Command) -> None:
 
 
 def lost_lease_to_others(proxy: ScriptedProxy, command: Command) -> None:
-    """A pilot takes it by hand while the application has no lease."""
+    """A pilot takes the vehicle by hand while the application has no lease."""
     proxy.more["others"] = "the vehicle is in LOITER, which was not chosen here"
     proxy.feedback()
     lost_lease(proxy, command)
@@ -216,7 +216,7 @@ def lost_lease_to_others(proxy: ScriptedProxy, command: Command) -> None:
 @pytest.mark.parametrize(
     "ending", [failsafe, failsafe_before_others, not_fresh, lost_link, lost_lease, lost_lease_to_others]
 )
-def test_a_landing_that_something_ended_is_asked_for_anew(
+def test_an_ended_landing_is_requested_again(
     proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
 ) -> None:
     def vehicle() -> None:
@@ -235,15 +235,15 @@ def test_a_landing_that_something_ended_is_asked_for_anew(
     assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
     again = [command for command in proxy.commands if command.action == Land()][-1]
     kept = ending in (failsafe_before_others, lost_link, lost_lease_to_others)
-    assert again.automatic is kept, "a pilot who took it meanwhile keeps it; else who asked for it still does"
+    assert again.automatic is kept, "a pilot who took the vehicle since keeps it; otherwise its requester does"
 
 
 @pytest.mark.parametrize("pressed", ["before the lease is back", "long before the lease is back", "under the lease"])
-def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_callers_also_when_repeated(
+def test_a_landing_requested_during_an_autopilots_return_stays_the_callers_when_repeated(
     proxy: ScriptedProxy, drone: Drone, pressed: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was asked for again as if the library had done so by itself, and refused."""
-    # When the lease is back, all that waited for it is too old to be sent as it is, or nothing is.
+    """It was requested again as the library's own, and refused."""
+    # Once the lease is back, everything that waited for it is too old to be sent, or nothing is.
     monkeypatch.setattr(drone._commands._schedule, "_keep_ns", -1 if pressed.startswith("long") else 10 * NS_PER_S)
     in_rtl = "the vehicle is in RTL, which was not chosen here"
     proxy.state = FlightState.FLYING
@@ -276,10 +276,10 @@ def test_a_landing_asked_for_during_a_return_of_the_autopilots_own_is_the_caller
 
 
 @pytest.mark.parametrize("had", ["the lease", "no lease"])
-def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_before(
+def test_a_pilot_who_takes_over_a_landing_by_hand_keeps_it_whoever_had_the_vehicle(
     proxy: ScriptedProxy, drone: Drone, had: str
 ) -> None:
-    """It was compared with what had it when land() was called: the same words, or whatever came before its lease."""
+    """It was compared with the controller at the time of land(): the same words, or whatever preceded its lease."""
     others = "the vehicle is flown by others"
     proxy.state = FlightState.FLYING
     if had == "the lease":
@@ -297,7 +297,7 @@ def test_a_pilot_who_takes_a_landing_by_hand_keeps_it_whoever_had_the_vehicle_be
         if had == "no lease":
             drone._state.notifier.wait_for(lambda: drone._commands.newest == Land(), WAIT_S)
             del proxy.answers[RequestAuthority]
-        # One that was on its way when the lease was lost may come first.
+        # A landing on its way when the lease was lost may arrive first.
         proxy.until(lambda: proxy.owner is not None and landings(proxy.owner[2]) != [], "it lands under its lease")
         assert proxy.owner is not None
         first = landings(proxy.owner[2])[0]
@@ -325,8 +325,8 @@ def _told(drone: Drone) -> int:
     return 0 if told is None else told.intent
 
 
-def test_a_landing_that_was_given_up_after_a_minute_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
-    """Whoever waited for it may have forgotten it, and what is heard by then may be another flight."""
+def test_a_landing_abandoned_after_a_minute_is_not_requested_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Its caller may have forgotten it, and a vehicle that is back by then may be on another flight."""
 
     def vehicle() -> None:
         first = proxy.until_commanded(Land())
@@ -341,7 +341,7 @@ def test_a_landing_that_was_given_up_after_a_minute_is_not_asked_for_anew(proxy:
     assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
 
 
-def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_landing_ended_by_a_newer_command_is_over(proxy: ScriptedProxy, drone: Drone) -> None:
     def change_of_mind() -> None:
         proxy.until_commanded(Land())
         drone.hover()
@@ -358,10 +358,10 @@ def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, dron
 
 
 @pytest.mark.parametrize("ending", [Land(), EmergencyStop(), Hover(), Idle()])
-def test_a_take_off_that_the_application_itself_ends_raises_at_once(
+def test_a_take_off_that_the_application_ends_raises_at_once(
     proxy: ScriptedProxy, drone: Drone, ending: AnyAction
 ) -> None:
-    """It waited for its whole time-out, though another thread had landed the vehicle or stopped its motors."""
+    """It waited for its whole time-out, although another thread had landed the vehicle or stopped its motors."""
 
     def change_of_mind() -> None:
         proxy.until_commanded(Takeoff())
@@ -376,11 +376,11 @@ def test_a_take_off_that_the_application_itself_ends_raises_at_once(
     changing.join(WAIT_S)
     assert raised.value.code == "replaced"
     assert time.monotonic() - begun_s < 2 * WAIT_S
-    assert drone._commands.newest in (ending, Idle()), "what was asked for since is left alone"
+    assert drone._commands.newest in (ending, Idle()), "later commands are left alone"
 
 
 @pytest.mark.parametrize("behind", [Hover(), Idle(), Velocity(forward=0.1)])
-def test_what_is_asked_for_behind_a_take_off_that_has_begun_does_not_end_it(
+def test_commands_behind_a_started_take_off_do_not_end_it(
     proxy: ScriptedProxy, drone: Drone, behind: AnyAction
 ) -> None:
     def vehicle() -> None:
@@ -399,10 +399,10 @@ def test_what_is_asked_for_behind_a_take_off_that_has_begun_does_not_end_it(
 
 
 @pytest.mark.parametrize("since", [Hover(), Idle(), Velocity(forward=0.1), Land()])
-def test_a_take_off_is_not_asked_for_anew_over_what_was_asked_for_a_moment_before(
+def test_a_take_off_is_not_repeated_over_a_newer_command(
     proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch, since: AnyAction
 ) -> None:
-    """Between the look at what became of it and the repeat another thread asked for something else: it took off."""
+    """Another thread gave a command between the check of the outcome and the repeat: the vehicle took off."""
     commands, looks = drone._commands, 0
     outcome = commands.outcome
 
@@ -411,7 +411,7 @@ def test_a_take_off_is_not_asked_for_anew_over_what_was_asked_for_a_moment_befor
         found = outcome(intent)
         if found is not None and found.reason is Refusal.DRIVER_FAILED:
             looks += 1
-            if looks == 2:  # the one that asks again
+            if looks == 2:  # the repeat
                 time.sleep(0.6)
                 drone.command(since)
         return found
@@ -428,10 +428,8 @@ def test_a_take_off_is_not_asked_for_anew_over_what_was_asked_for_a_moment_befor
     assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
 
 
-def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
-    proxy: ScriptedProxy, drone: Drone
-) -> None:
-    """A page that received nothing flew on by its sticks: each of their messages was a new command, sent at once."""
+def test_a_page_not_known_to_be_present_sends_no_flying_commands(proxy: ScriptedProxy, drone: Drone) -> None:
+    """A page without reception flew on by its sticks: each of their messages was a new command, sent at once."""
     proxy.state = FlightState.FLYING
     drone.wait("flying", WAIT_S)
     commands = extend.commands(drone)
@@ -445,7 +443,7 @@ def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
     assert not drone.command(Takeoff())
     with pytest.raises(AuthorityError, match="takeoff was not sent: the person who flies is not known to be present"):
         drone.takeoff(wait=False)
-    assert extend.let_go(drone, "the page is gone"), "what ends a flight is sent all the same"
+    assert extend.let_go(drone, "the page is gone"), "a command that ends a flight is still sent"
     proxy.until_commanded(Hover())
     later = [command.action for command in proxy.commands if command.seq > at]
     assert Velocity(forward=0.2) not in later
@@ -454,8 +452,8 @@ def test_who_flies_by_a_page_that_is_not_known_to_be_there_is_not_sent_flying(
     proxy.until_commanded(EmergencyStop())
 
 
-def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
-    """The link was up for 4 s, and the error still said that it was connecting."""
+def test_a_reason_is_no_older_than_the_last_change_of_its_subject(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The link had been up for 4 s, and the error still said that it was connecting."""
 
     def vehicle() -> None:
         command = proxy.until_commanded(Takeoff())
@@ -480,7 +478,7 @@ def test_a_reason_is_no_older_than_the_last_change_of_what_it_speaks_of(proxy: S
     ],
 )
 @pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.LANDING, FlightState.HOVERING])
-def test_a_take_off_that_a_failsafe_or_a_new_lease_ended_raises_at_once_and_is_not_asked_for_anew(
+def test_a_take_off_ended_by_a_failsafe_or_a_new_lease_raises_at_once_and_is_not_repeated(
     proxy: ScriptedProxy,
     drone: Drone,
     ending: Callable[[ScriptedProxy, Command], None],
@@ -499,7 +497,7 @@ def test_a_take_off_that_a_failsafe_or_a_new_lease_ended_raises_at_once_and_is_n
 
     taking_off = background(vehicle)
     if state is FlightState.HOVERING:
-        drone.takeoff(timeout_s=100.0)  # what rose by then ends in a hover, which is what was asked for
+        drone.takeoff(timeout_s=100.0)  # a vehicle that has risen by then ends in a hover, as requested
     else:
         with pytest.raises(RefusedError, match=f"takeoff was ended because .*{why}: take off again") as raised:
             drone.takeoff(timeout_s=100.0)
@@ -509,7 +507,7 @@ def test_a_take_off_that_a_failsafe_or_a_new_lease_ended_raises_at_once_and_is_n
     assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
 
 
-def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> None:
     with pytest.raises(NoAnswerError, match=r"takeoff was not completed within 0\.05 s: the vehicle is landed$"):
         drone.takeoff(timeout_s=0.05)
     proxy.commands.clear()
@@ -525,7 +523,7 @@ def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> No
     thread.join(WAIT_S)
 
 
-def test_a_reason_is_no_older_than_the_link_that_it_speaks_of(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_reason_is_no_older_than_the_link_state_it_names(proxy: ScriptedProxy, drone: Drone) -> None:
     """Betaflight's take-off failed with "the link is connecting", seconds after it was up."""
     proxy.more["vehicle_link"] = "connecting"
     drone.wait(lambda feedback: feedback.vehicle_link is LinkState.CONNECTING, WAIT_S)
@@ -546,7 +544,7 @@ def test_a_reason_is_no_older_than_the_link_that_it_speaks_of(proxy: ScriptedPro
         drone.takeoff(timeout_s=0.2)
 
 
-def test_a_reason_is_over_with_the_take_off_that_it_kept_back(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_reason_ends_with_the_take_off_that_it_delayed(proxy: ScriptedProxy, drone: Drone) -> None:
     def vehicle() -> None:
         first = proxy.until_commanded(Takeoff())
         refuse(proxy, first, Refusal.DRIVER_FAILED, "me: BOOTGRACE")
@@ -559,7 +557,7 @@ def test_a_reason_is_over_with_the_take_off_that_it_kept_back(proxy: ScriptedPro
     rises.join(WAIT_S)
 
 
-def test_a_vehicle_that_still_wakes_up_is_not_asked_again_and_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_waking_vehicle_is_not_asked_repeatedly(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.more |= {"vehicle_link": "up", "link_reason": f"{WAKING_UP}: its own checks do not pass yet"}
     drone.wait(lambda feedback: feedback.waking_up, WAIT_S)
 
@@ -576,7 +574,7 @@ def test_a_vehicle_that_still_wakes_up_is_not_asked_again_and_again(proxy: Scrip
 @pytest.mark.parametrize(
     ("reason", "error"), [(Refusal.UNSUPPORTED, UnsupportedError), (Refusal.WRONG_STATE, RefusedError)]
 )
-def test_take_off_that_is_refused_for_good(
+def test_a_take_off_that_is_refused_for_good(
     proxy: ScriptedProxy, drone: Drone, reason: Refusal, error: type[Exception]
 ) -> None:
     def vehicle() -> None:
@@ -593,16 +591,16 @@ def test_take_off_that_is_refused_for_good(
     proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
 
 
-def test_what_was_refused_in_an_earlier_session_concerns_nobody(proxy: ScriptedProxy, drone: Drone) -> None:
-    """After a reconnect it made land(), takeoff() and go_to() raise within a millisecond; so did another's, by name."""
+def test_a_refusal_from_an_earlier_session_has_no_effect(proxy: ScriptedProxy, drone: Drone) -> None:
+    """After a reconnection it made land(), takeoff() and go_to() raise within a millisecond, even under another's name."""
     proxy.more["outcome"] = Outcome(drone.app_id + 1, 1, Fate.REFUSED, Refusal.WRONG_STATE, "me: never")
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
     with pytest.raises(NoAnswerError, match=r"within 0\.3 s: the vehicle is landed$"):
         drone.takeoff(timeout_s=0.3)
 
 
-def test_what_came_of_another_command_does_not_concern_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
-    """A controller's velocity, refused on the ground: takeoff() raised its refusal."""
+def test_the_outcome_of_another_command_does_not_affect_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
+    """A controller's velocity was refused on the ground, and takeoff() raised its refusal."""
 
     def vehicle() -> None:
         proxy.until_commanded(Takeoff())
@@ -617,8 +615,8 @@ def test_what_came_of_another_command_does_not_concern_a_take_off(proxy: Scripte
 
 
 @pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.TAKING_OFF])
-def test_a_take_off_that_runs_out_of_time_is_withdrawn(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
-    """It raised at 4 s and took off at 14.6 s, the program waiting for a person."""
+def test_a_take_off_that_times_out_is_withdrawn(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
+    """It raised at 4 s and took off at 14.6 s, while the program waited for a person."""
     proxy.state = state
     drone.wait(state.value, WAIT_S)
     with pytest.raises(NoAnswerError):
@@ -627,7 +625,7 @@ def test_a_take_off_that_runs_out_of_time_is_withdrawn(proxy: ScriptedProxy, dro
     number = drone._commands.intent
     later = proxy.from_now_on(instead)
     assert Takeoff() not in [command.action for command in later]
-    assert {command.intent for command in later} == {number}, "no new intent: it takes the vehicle from nobody"
+    assert {command.intent for command in later} == {number}, "no new intent: it takes the vehicle from no one"
 
 
 def test_another_priority_under_the_same_lease_does_not_withdraw_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -653,10 +651,10 @@ def interrupt(_: Feedback) -> bool:
         (Land(), FlightState.LANDING, Land()),
     ],
 )
-def test_an_interrupted_call_leaves_nothing_to_happen_later(
+def test_an_interrupted_call_leaves_nothing_for_later(
     proxy: ScriptedProxy, drone: Drone, action: AnyAction, state: FlightState, instead: AnyAction
 ) -> None:
-    """Ctrl-C in go_to() or takeoff() stopped nothing: it flew on, or took off 6 s later. A landing goes on."""
+    """Ctrl-C in go_to() or takeoff() stopped nothing: the vehicle flew on, or took off 6 s later. A landing continues."""
     proxy.state = state
     drone.wait(state.value, WAIT_S)
     with pytest.raises(KeyboardInterrupt):
@@ -664,7 +662,7 @@ def test_an_interrupted_call_leaves_nothing_to_happen_later(
     assert {command.action for command in proxy.from_now_on(instead)} == {instead}
 
 
-def test_a_take_off_that_is_not_possible_yet_is_asked_for_anew_until_its_time_is_over(
+def test_a_take_off_that_is_not_possible_yet_is_repeated_until_its_time_is_over(
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
     """The driver gave up after 25 s, the vehicle was ready at 43 s, and the call waited for nothing until 120 s."""
@@ -682,18 +680,18 @@ def test_a_take_off_that_is_not_possible_yet_is_asked_for_anew_until_its_time_is
     assert 2 <= len({command.intent for command in proxy.commands if command.action == Takeoff()}) <= 3
 
 
-def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_caller_waits(
+def test_a_take_off_ended_by_the_proxy_after_20_s_is_repeated_while_its_caller_waits(
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
-    """The library withdrew it before that, and the call waited for nothing until its 120 s were over."""
-    assert actions._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's word comes first"
+    """The library withdrew it earlier, and the call waited for nothing until its 120 s were over."""
+    assert actions._AT_MOST_NS[Takeoff] >= TAKEOFF_NS + 500_000_000, "the proxy's report comes first"
 
     def vehicle() -> None:
         first = proxy.until_commanded(Takeoff())
         assert not first.automatic
         refuse(proxy, first, Refusal.NOT_FRESH, "me: it stands", Fate.TIMED_OUT)
         proxy.until(lambda: proxy.commands[-1].intent > first.intent and proxy.commands[-1].action == Takeoff())
-        assert proxy.commands[-1].automatic, "nobody decided anew to take it from others"
+        assert proxy.commands[-1].automatic, "no one decided again to take it from others"
         del proxy.more["outcome"]
         proxy.state = FlightState.FLYING
 
@@ -702,13 +700,13 @@ def test_a_take_off_that_the_proxy_ended_after_20_s_is_asked_for_anew_while_its_
     flying.join(WAIT_S)
 
 
-def test_no_take_off_is_asked_for_anew_once_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_no_take_off_is_repeated_once_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
     drone._commands.bar()
     with pytest.raises(ClosedError, match="too late"):
         drone._commands.ask(Takeoff(), automatic=True)
 
 
-def test_a_refused_take_off_that_nobody_waits_for_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_refused_take_off_without_a_waiting_call_is_not_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.takeoff(wait=False)
     refuse(proxy, proxy.until_commanded(Takeoff()), Refusal.DRIVER_FAILED, "me: not yet")
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
@@ -726,11 +724,11 @@ def test_a_set_point_returns_false_while_set_points_are_refused(proxy: ScriptedP
     assert not drone.velocity(forward=0.3)
     proxy.until_commanded(Velocity(forward=0.3))
     assert drone.hover()
-    assert drone.velocity(forward=0.4), "a hover may have taken it back"
+    assert drone.velocity(forward=0.4), "a hover may have taken the vehicle back"
 
 
-def test_a_landing_is_repeated_until_the_proxy_tells_that_it_is_done(proxy: ScriptedProxy, drone: Drone) -> None:
-    """Feedback from before it said "landed": one packet was sent, then Idle, and if that one was lost it hovered on."""
+def test_a_landing_is_repeated_until_the_proxy_reports_it_as_complete(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Earlier feedback said "landed": one packet was sent, then Idle, and if that one was lost, the vehicle kept hovering."""
     proxy.more["outcome"] = Outcome()
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
     landing = background(lambda: drone.land(timeout_s=WAIT_S))
@@ -793,7 +791,7 @@ def test_go_to_need_not_wait_and_does_not_decay(proxy: ScriptedProxy) -> None:
         (Refusal.DRIVER_FAILED, RefusedError),
     ],
 )
-def test_a_place_that_is_refused(
+def test_a_refused_place(
     proxy: ScriptedProxy, drone: Drone, reason: Refusal, error: type[RefusedError | UnsupportedError]
 ) -> None:
     proxy.state = FlightState.FLYING
@@ -810,7 +808,7 @@ def test_a_place_that_is_refused(
     proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
 
 
-def test_a_failsafe_and_another_command_end_the_way(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_failsafe_and_another_command_end_a_flight_to_a_place(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.state = FlightState.FLYING
     failing = background(lambda: failsafe(proxy, proxy.until_commanded(PLACE)))
     with pytest.raises(RefusedError, match="position was ended by a failsafe or a lost link"):
@@ -831,7 +829,7 @@ def test_losing_the_authority_ends_the_way(proxy: ScriptedProxy, drone: Drone) -
     taking_over.join(WAIT_S)
 
 
-def test_a_proxy_of_an_earlier_version_is_never_sent_what_it_does_not_know(proxy: ScriptedProxy) -> None:
+def test_an_older_proxy_is_never_sent_unknown_actions(proxy: ScriptedProxy) -> None:
     older = frozenset({"takeoff", "land", "hover", "velocity"})
     proxy.capabilities = msgspec.structs.replace(proxy.capabilities, actions=older)
     with flown(proxy) as drone:
@@ -866,7 +864,7 @@ def test_a_vehicle_that_cannot_fly() -> None:
                 call()
 
 
-def test_a_stalled_application_hovers_and_is_told(proxy: ScriptedProxy) -> None:
+def test_a_stalled_application_hovers_and_is_notified(proxy: ScriptedProxy) -> None:
     events: list[Event] = []
     with flown(proxy, stall_s=0.1) as drone, drone.on_event(events.append):
         drone.velocity(forward=1.0)
@@ -892,20 +890,20 @@ def test_pre_emption_and_return(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.give_back(drone.app_id, "me")
     drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
     proxy.until(lambda: len(proxy.commands) > before + 3)
-    assert set(proxy.actions()[before:]) == {Idle()}, "the old set-point is not taken up again"
+    assert set(proxy.actions()[before:]) == {Idle()}, "the old set-point is not resumed"
     assert proxy.commands[-1].lease == drone.authority.lease == 3
     assert drone.velocity(forward=0.7)
     assert proxy.until_commanded(Velocity(forward=0.7)).lease == 3
 
 
-def test_pre_emption_whose_event_was_lost_shows_in_feedback(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_pre_emption_with_a_lost_event_shows_in_feedback(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.grant(99, "boss")
     drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
     proxy.grant(drone.app_id, "me")
     drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
 
 
-def test_a_lease_lost_by_silence_is_asked_for_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_lease_lost_by_silence_is_requested_again(proxy: ScriptedProxy, drone: Drone) -> None:
     assert proxy.owner is not None
     app_id, _, lease = proxy.owner
     proxy.owner = None
@@ -924,7 +922,7 @@ def test_a_failsafe_ends_the_set_point(proxy: ScriptedProxy, drone: Drone) -> No
     assert set(proxy.actions()[before + 1 :]) == {Idle()}
 
 
-def test_what_a_listener_commands_in_answer_to_a_failsafe_stays(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_listeners_command_in_response_to_a_failsafe_stays(proxy: ScriptedProxy, drone: Drone) -> None:
     def answer(feedback: Feedback) -> None:
         if feedback.failsafe is Failsafe.HOVER and not answered:
             answered.append(drone.velocity(left=0.5))
@@ -950,7 +948,7 @@ def test_released_and_requested_again(proxy: ScriptedProxy, drone: Drone) -> Non
     drone.release_authority()
 
 
-def test_somebody_else_flies(proxy: ScriptedProxy) -> None:
+def test_another_application_flies(proxy: ScriptedProxy) -> None:
     proxy.grant(99, "ada")
     with pytest.raises(AuthorityError, match=r"ada holds the authority: wait longer.*access=\"observe\"") as error:
         open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
@@ -960,7 +958,7 @@ def test_somebody_else_flies(proxy: ScriptedProxy) -> None:
     proxy.until(lambda: isinstance(proxy.requests[-1], ReleaseAuthority), "leaving the line")
 
 
-def test_waiting_in_line(proxy: ScriptedProxy) -> None:
+def test_waiting_in_the_queue(proxy: ScriptedProxy) -> None:
     proxy.grant(99, "ada")
     answered = background(
         lambda: proxy.until(lambda: any(isinstance(request, RequestAuthority) for request in proxy.requests)),
@@ -982,11 +980,11 @@ def test_refused_and_not_answered(proxy: ScriptedProxy, monkeypatch: pytest.Monk
 
 
 def asked(proxy: ScriptedProxy) -> int:
-    """How often the authority was asked for."""
+    """Return how often the authority was requested."""
     return sum(isinstance(request, RequestAuthority) for request in list(proxy.requests))
 
 
-def test_a_link_that_is_lost_before_the_answer_is_no_answer(proxy: ScriptedProxy) -> None:
+def test_a_link_lost_before_the_answer_is_not_an_answer(proxy: ScriptedProxy) -> None:
     proxy.answers[RequestAuthority] = None
     lost = background(
         lambda: proxy.until(lambda: asked(proxy) > 0, "the request"),
@@ -999,7 +997,7 @@ def test_a_link_that_is_lost_before_the_answer_is_no_answer(proxy: ScriptedProxy
     assert asked(proxy) > 1
 
 
-def test_a_person_whose_link_is_lost_before_the_answer_is_told_so(proxy: ScriptedProxy) -> None:
+def test_a_link_lost_before_the_answer_is_reported(proxy: ScriptedProxy) -> None:
     drone = Drone(proxy.server.dial, app="me", policy=QUICK)
     drone._connect(timeout_s=WAIT_S, acquire=False)
     try:
@@ -1014,7 +1012,7 @@ def test_a_person_whose_link_is_lost_before_the_answer_is_told_so(proxy: Scripte
         drone.close()
 
 
-def test_who_reconnects_waits_until_the_earlier_session_is_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_reconnection_waits_until_the_earlier_session_is_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
     old = drone.authority.lease
     proxy.forgets = False
     before = asked(proxy)
@@ -1022,14 +1020,14 @@ def test_who_reconnects_waits_until_the_earlier_session_is_forgotten(proxy: Scri
     proxy.until(lambda: asked(proxy) > before, "the request of the next session")
     drone.wait(lambda _: drone.authority.state == "queued", WAIT_S)
     assert drone.authority.holder == "me"
-    assert drone.velocity(forward=0.1) is False  # and raises nothing: it is only a matter of time
+    assert drone.velocity(forward=0.1) is False  # nothing is raised: it is only a matter of time
     assert drone.authority.lease != old
     proxy.give_back(2, "me")
     drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
     assert drone.velocity(forward=0.1)
 
 
-def test_another_who_came_meanwhile_is_no_earlier_session(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_another_application_that_came_since_is_not_an_earlier_session(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.forgets = False
     proxy.hang_up()
     drone.wait(lambda _: drone.authority.state == "queued", WAIT_S)
@@ -1039,10 +1037,10 @@ def test_another_who_came_meanwhile_is_no_earlier_session(proxy: ScriptedProxy, 
         drone.hover()
 
 
-def test_who_connects_anew_waits_until_the_earlier_drone_is_forgotten(proxy: ScriptedProxy) -> None:
+def test_a_new_connection_waits_until_the_earlier_drone_is_forgotten(proxy: ScriptedProxy) -> None:
     proxy.forgets = False
     with flown(proxy):
-        proxy.answers[ReleaseAuthority] = Done()  # it is said, and not done
+        proxy.answers[ReleaseAuthority] = Done()  # answered, but not done
     before = asked(proxy)
     free = background(
         lambda: proxy.until(lambda: asked(proxy) > before, "the request"), lambda: proxy.give_back(2, "me")
@@ -1063,7 +1061,7 @@ def test_an_earlier_session_that_is_not_forgotten_is_named(
         pass
 
 
-def test_an_observer_only_looks_on(proxy: ScriptedProxy) -> None:
+def test_an_observer_only_observes(proxy: ScriptedProxy) -> None:
     with flown(proxy, access="observe") as drone:
         assert drone.authority.state == "none"
         for call in (drone.hover, drone.emergency_stop, drone.request_authority):
@@ -1090,7 +1088,7 @@ def test_emergency_stop_needs_no_authority(proxy: ScriptedProxy, drone: Drone) -
     assert drone.reset_emergency()
 
 
-def test_an_answer_to_who_asks_for_the_authority_is_waited_for(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_an_answer_to_a_takeover_request_can_be_awaited(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.answers[AnswerTakeover] = Done()
     extend.commands(drone).answer(1, 7, False, "a" * 10_000, wait=True)
     asked = proxy.requests[-1]

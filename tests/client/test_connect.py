@@ -1,4 +1,4 @@
-"""Connecting by name and by address, with stand-ins for proxies' processes."""
+"""Connecting by name and by address, with stand-ins for the proxies' processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the local trans
 ROOT = Path(__file__).parents[2]
 CONNECT = sys.modules["skyloop.client.connect"]  # the module: its function has the same name
 
-#: A stand-in for ``skyloop proxy``: a scripted proxy on the local transport, that ends with its parent.
+#: A stand-in for ``skyloop proxy``: a scripted proxy on the local transport that ends with its parent.
 CHILD = """
 import os, sys
 sys.path.insert(0, {root!r})
@@ -114,7 +114,7 @@ def test_unusable_arguments(arguments: dict[str, object]) -> None:
     "wish",
     [{"priority": 32}, {"wait_s": -1.0}, {"wait_s": "1"}, {"for_s": 0.0}, {"takeover": "grab"}],
 )
-def test_unusable_wishes_for_the_authority(wish: dict[str, Any]) -> None:
+def test_invalid_authority_options(wish: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=next(iter(wish))):
         skyloop.Authority(**wish)
 
@@ -128,12 +128,12 @@ def test_unusable_wishes_for_the_authority(wish: dict[str, Any]) -> None:
     ],
 )
 @pytest.mark.parametrize("function", [skyloop.connect, skyloop.swarm])
-def test_old_options_say_how_they_are_written_now(function: Any, old: dict[str, Any], now: str) -> None:
+def test_old_options_name_their_replacement(function: Any, old: dict[str, Any], now: str) -> None:
     with pytest.raises(UsageError, match=re.escape(now)):
         function("alpha", **old)
 
 
-def test_how_the_network_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_search_options_of_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("zenoh")
     monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
     for off in (None, False, skyloop.Network(False)):
@@ -160,7 +160,7 @@ def test_script_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_collector_of_frames_never_starves(alpha: ScriptedProxy) -> None:
-    """Frames lie in the transport's memory; beyond a few of them, they are copies."""
+    """Frames are in the transport's memory; beyond a few of them, they are copies."""
     with skyloop.connect("alpha", access="observe") as drone:
         drone.frame()
         drone.wait(lambda _: alpha.server.subscribers("video/front") == 1, 10.0)
@@ -184,21 +184,21 @@ def test_a_private_proxy_ends_with_the_drone() -> None:
 
 
 @pytest.mark.process
-def test_a_private_proxy_that_still_lands_its_vehicle_is_left_to_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who closes a drone in the air waits for a moment only, and its proxy is not terminated meanwhile."""
+def test_a_private_proxy_may_finish_its_landing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closing a drone in the air waits only for a moment, and does not terminate its proxy."""
     monkeypatch.setattr(CONNECT, "GRACE_S", 0.1)
     lands = CHILD.replace("os.read(descriptor, 1)", "os.read(descriptor, 1); import time; time.sleep(1.0)")
     proxy = PrivateProxy("fake://", command(lands))
     drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
     drone.close()
     assert alive(proxy.pid)
-    assert proxy._process.wait(20.0) == 0, "it ended by itself"
+    assert proxy._process.wait(20.0) == 0, "it ended without help"
 
 
-def test_a_vehicle_that_still_wakes_up_is_waited_for(
+def test_connect_waits_for_a_waking_vehicle(
     alpha: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``connect()`` returned while the firmware could not arm, and nothing said what it waited for."""
+    """``connect()`` returned while the firmware could not arm, without saying what it waited for."""
     asleep = {"link_reason": f"{WAKING_UP}: the checks before arming do not pass yet"}
     alpha.more |= asleep
     after_s = 0.0
@@ -233,7 +233,7 @@ def test_a_vehicle_that_still_wakes_up_is_waited_for(
     caplog.clear()
     alpha.more |= asleep
     with connect("alpha", timeout_s=1.5) as drone:
-        assert drone.feedback().waking_up, "it is connected all the same"
+        assert drone.feedback().waking_up, "it is connected nevertheless"
     assert caplog.records[-1].getMessage().endswith("do not pass yet: it can't take off yet")
     with connect("alpha", access="observe") as drone:
         pass  # at once
@@ -249,7 +249,7 @@ def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.process
-def test_a_private_proxy_that_dies_is_told_with_what_it_said() -> None:
+def test_a_private_proxy_that_dies_is_reported_with_its_output() -> None:
     proxy = PrivateProxy("fake://", command(CHILD))
     drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
     try:
@@ -311,7 +311,7 @@ def test_a_private_proxy_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
         process.kill()
         process.wait(10.0)
         ended, _, _ = select.select([descriptor], [], [], 10.0)
-        assert ended, "the child lives on"
+        assert ended, "the child is still running"
     finally:
         os.close(descriptor)
         process.stdout.close()

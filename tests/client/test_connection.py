@@ -1,4 +1,4 @@
-"""Links that fail and come back, against a proxy that is played by the test."""
+"""Links that fail and return, with a scripted proxy."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 
 class Told:
-    """What a drone's on_link listener heard."""
+    """The calls of a drone's on_link listener."""
 
     def __init__(self, drone: Drone) -> None:
         self.states: list[LinkState] = []
@@ -82,7 +82,7 @@ def restarted(proxy: ScriptedProxy) -> None:
     proxy.start()
 
 
-def test_a_restarted_proxy_finds_everything_put_back(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_restarted_proxy_gets_everything_back(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     events: list[Event] = []
     frames: list[int] = []
@@ -96,7 +96,7 @@ def test_a_restarted_proxy_finds_everything_put_back(proxy: ScriptedProxy, drone
     at = told.until(LinkState.LOST)
     assert "stopped" in told.reasons[at - 1]
     assert drone.authority.state == "none"
-    assert drone.velocity(forward=0.3) is False, "nothing is raised, the packet just did not go"
+    assert drone.velocity(forward=0.3) is False, "nothing is raised, the packet was just not sent"
     proxy.commands.clear()
     proxy.requests.clear()
     started_s = time.monotonic()
@@ -130,7 +130,7 @@ def test_old_set_points_are_not_resumed(proxy: ScriptedProxy, drone: Drone) -> N
     assert set(proxy.actions()) == {Idle()}
 
 
-def test_what_was_asked_just_before_the_return_goes_out(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_command_just_before_the_return_of_the_link_is_sent(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     proxy.stop()
     told.until(LinkState.LOST)
@@ -142,7 +142,7 @@ def test_what_was_asked_just_before_the_return_goes_out(proxy: ScriptedProxy, dr
     assert Velocity(forward=0.4) not in proxy.actions()
 
 
-def test_again_and_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_repeated_losses(proxy: ScriptedProxy, drone: Drone) -> None:
     told, at = Told(drone), 0
     for _ in range(5):
         restarted(proxy)
@@ -166,20 +166,20 @@ def test_a_silent_proxy_is_degraded_then_lost_then_back(proxy: ScriptedProxy, dr
     drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
 
 
-def test_a_proxy_without_feedback_is_pinged_and_asked_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_proxy_without_feedback_is_pinged_and_resubscribed(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     proxy.beating.clear()
     at = told.until(LinkState.DEGRADED)
     assert "no feedback" in told.reasons[at - 1]
     proxy.until(lambda: any(isinstance(request, Ping) for request in proxy.requests))
-    time_out = time.monotonic() + 0.6  # twice what a silent one is given
+    time_out = time.monotonic() + 0.6  # twice the time of a silent one
     proxy.notifier.wait_for(lambda: time.monotonic() > time_out, 0.7)
     assert LinkState.LOST not in told.states
     proxy.beating.set()
     told.until(LinkState.UP, at)
 
 
-def test_a_proxy_that_is_restarted_with_another_camera_is_read_by_that(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_readers_follow_a_proxy_that_restarts_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
     """The reader waited for the old camera for ever."""
     found: list[str] = []
     reads = background(lambda: found.append(next(drone.frames(timeout_s=WAIT_S)).camera))
@@ -201,10 +201,10 @@ def test_a_proxy_that_is_restarted_with_another_camera_is_read_by_that(proxy: Sc
 
 
 @pytest.mark.parametrize("kept", [False, True], ids=["another one", "another one first"])
-def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
+def test_callbacks_follow_a_proxy_that_restarts_with_another_camera(
     proxy: ScriptedProxy, drone: Drone, kept: bool
 ) -> None:
-    """Where they asked for no camera by name; readers did so already."""
+    """If they named no camera; readers already did so."""
     frames: list[str] = []
     inline: list[str] = []
     named: list[str] = []
@@ -228,7 +228,7 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
             frame = mailboxes.frame()
             if frame is not None and frames and inline:
                 break
-            assert seq < 100 * WAIT_S, "no frame came"
+            assert seq < 100 * WAIT_S, "no frame arrived"
             time.sleep(0.01)
         assert frame is not None
         assert frame.camera == "top"
@@ -243,7 +243,7 @@ def test_callbacks_follow_a_proxy_that_is_restarted_with_another_camera(
     assert not drone._state.on_welcome.consumed
 
 
-def test_a_processor_follows_a_proxy_that_is_restarted_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_processor_follows_a_proxy_that_restarts_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.answers[JoinProcessor] = Done()
     membership = extend.join_processor(drone, "found", code="1")
     top = msgspec.structs.replace(proxy.capabilities.cameras[0], name="top")
@@ -268,13 +268,13 @@ def test_garbage_restarts_the_connection(proxy: ScriptedProxy, drone: Drone) -> 
     assert drone.stats["feedback"].malformed >= 5
 
 
-def test_what_a_proxy_never_sends_is_malformed(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_kinds_that_proxies_never_send_are_malformed(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.server.publish(EVENTS, encode(Command(1, 1, 1, 0, Hover())))
     drone.wait(lambda _: drone.stats["feedback"].malformed == 1, WAIT_S)
     assert drone.link.application in (LinkState.UP, LinkState.DEGRADED)
 
 
-def test_a_camera_that_stops_is_asked_for_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_stalled_camera_is_resubscribed(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.frame()
     drone.wait(lambda _: proxy.server.subscribers(video("front")) == 1, WAIT_S)
     client = next(iter(proxy.server._clients.values()))
@@ -294,7 +294,7 @@ def test_loss_and_disorder(caplog: pytest.LogCaptureFixture) -> None:
     assert "Traceback" not in caplog.text
 
 
-def test_nobody_there_at_first() -> None:
+def test_no_proxy_at_first() -> None:
     proxy = ScriptedProxy()
     with pytest.raises(LinkError, match="has no server"):
         open_drone(proxy.server.dial, app="me")
@@ -312,7 +312,7 @@ def test_a_proxy_that_refuses(proxy: ScriptedProxy) -> None:
         open_drone(proxy.server.dial, app="me")
 
 
-def test_a_proxy_that_knows_nothing_of_its_vehicle(proxy: ScriptedProxy) -> None:
+def test_a_proxy_without_feedback(proxy: ScriptedProxy) -> None:
     proxy.beating.clear()
     proxy._ended.set()
     with pytest.raises(NoAnswerError, match="scripted answered, but reported no vehicle state"):
@@ -327,14 +327,14 @@ def test_take_off_over_a_lost_link(proxy: ScriptedProxy, drone: Drone) -> None:
         drone.takeoff(timeout_s=0.05)
     proxy.start()
     proxy.until(lambda: proxy.actions().count(Idle()) > 3, "the drone commands nothing")
-    assert Takeoff() not in proxy.actions(), "the call gave up: nothing takes off after it"
+    assert Takeoff() not in proxy.actions(), "the call has ended: no take-off follows"
 
 
-def test_a_take_off_that_is_not_sent_raises_and_is_not_carried_out_later(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_an_unsent_take_off_raises_and_is_not_executed_later(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     proxy.stop()
     told.until(LinkState.LOST)
-    assert drone.command(Takeoff()) is False  # it would be sent if the link were back soon
+    assert drone.command(Takeoff()) is False  # it would be sent if the link returned soon
     with pytest.raises(LinkError, match=r"takeoff was not sent: the link to the proxy is lost \("):
         drone.takeoff(wait=False)
     proxy.start()
@@ -342,9 +342,7 @@ def test_a_take_off_that_is_not_sent_raises_and_is_not_carried_out_later(proxy: 
     assert Takeoff() not in proxy.actions()
 
 
-def test_a_landing_that_is_not_sent_raises_and_is_sent_if_the_link_is_back_soon(
-    proxy: ScriptedProxy, drone: Drone
-) -> None:
+def test_an_unsent_landing_raises_and_is_sent_if_the_link_returns_soon(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     proxy.stop()
     told.until(LinkState.LOST)
@@ -365,7 +363,7 @@ def test_a_take_off_before_the_authority_is_confirmed_raises(proxy: ScriptedProx
         drone.takeoff(wait=False)
 
 
-def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_requests_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, drone: Drone) -> None:
     told = Told(drone)
     proxy.stop()
     told.until(LinkState.LOST)
@@ -377,7 +375,7 @@ def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, dr
     assert got == [0.35]
 
 
-def test_questions_end_with_the_time_or_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_requests_end_with_the_time_out_or_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.answers[GetParameter] = None
     with pytest.raises(NoAnswerError, match=r"GetParameter.*0\.1 s"):
         drone._connection.call(lambda: GetParameter("x"), 0.1)
@@ -397,7 +395,7 @@ def test_questions_end_with_the_time_or_the_drone(proxy: ScriptedProxy, drone: D
     assert len(ended) == 1
 
 
-def test_an_error_of_ours_in_the_link_s_thread_does_not_end_it(
+def test_an_internal_error_in_the_link_s_thread_does_not_end_it(
     proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     told = Told(drone)
@@ -429,7 +427,7 @@ def test_a_connection_that_ends_during_hello(proxy: ScriptedProxy) -> None:
 
 
 class OtherClock:
-    """An end whose proxy's clock seems to be an hour ahead."""
+    """An end whose proxy's clock appears to be an hour ahead."""
 
     same_clock = False
 

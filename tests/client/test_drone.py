@@ -1,4 +1,4 @@
-"""A drone against a proxy that is played by the test: reading, listening, waiting, statistics, the end."""
+"""A drone with a scripted proxy: reading, listening, waiting, statistics, closing."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def subscribed(proxy: ScriptedProxy, topic: str) -> bool:
     return proxy.server.subscribers(topic) > 0
 
 
-def test_what_it_is(drone: Drone) -> None:
+def test_properties(drone: Drone) -> None:
     assert (drone.name, drone.uri, drone.app_id) == ("scripted", "scripted://", 1)
     assert [camera.name for camera in drone.capabilities.cameras] == ["front", "bottom"]
     assert drone.link == LinkStatus(LinkState.UP, LinkState.UP)
@@ -127,12 +127,12 @@ def test_frames_as_an_iterator(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.wait(lambda _: not subscribed(proxy, video("bottom")), WAIT_S)
 
 
-def test_an_iterator_that_gets_nothing_says_so(drone: Drone) -> None:
+def test_an_iterator_without_frames_raises(drone: Drone) -> None:
     with pytest.raises(NoAnswerError, match=r"no frame of front arrived within 0\.02 s"):
         next(iter(drone.frames(timeout_s=0.02)))
 
 
-def test_frames_that_are_too_old_are_left_out_and_counted(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_frames_that_are_too_old_are_skipped_and_counted(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     with drone.on_frame(lambda frame: got.append(frame.seq), inline=True, max_age_s=0.0):
         drone.wait(lambda _: subscribed(proxy, video("front")), WAIT_S)
@@ -149,14 +149,14 @@ def test_frames_that_are_too_old_are_left_out_and_counted(proxy: ScriptedProxy, 
         next(drone.frames(max_age_s=-1))
 
 
-def test_where_no_frame_comes_because_of_the_vehicle_the_reason_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_missing_frame_has_the_vehicles_reason(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.more = {"vehicle_link": "lost", "link_reason": "no camera there", "link_remedy": "plug it in"}
     drone.wait(lambda _: drone.link.vehicle is LinkState.LOST, WAIT_S)
     with pytest.raises(NoAnswerError, match=r"0\.02 s: the vehicle's link is lost: no camera there: plug it in$"):
         drone.next_frame(timeout_s=0.02)
 
 
-def test_in_a_fork_a_drone_neither_lands_nor_releases_what_its_parent_flies(proxy: ScriptedProxy) -> None:
+def test_in_a_fork_a_drone_neither_lands_nor_releases_its_parents_flight(proxy: ScriptedProxy) -> None:
     with flown(proxy) as drone:
         proxy.state = FlightState.HOVERING
         drone.wait("hovering", WAIT_S)
@@ -238,7 +238,7 @@ def test_processors_each_at_their_own_pace(proxy: ScriptedProxy, drone: Drone) -
         drone.on_frame(think, depth=0)
 
 
-def test_callbacks_with_frames_are_listeners_like_the_others(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_frame_callbacks_are_listeners_like_the_others(proxy: ScriptedProxy, drone: Drone) -> None:
     events: list[Event] = []
     drone.on_event(events.append, inline=True)
     raising = drone.on_frame(lambda frame: 1 // 0, "bottom", inline=True)
@@ -250,7 +250,7 @@ def test_callbacks_with_frames_are_listeners_like_the_others(proxy: ScriptedProx
     assert [event.data["where"] for event in events if event.kind is EventKind.CALLBACK_ERROR] == ["frames of bottom"]
 
 
-def test_a_pose_from_outside_goes_to_the_proxy_as_it_is(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_an_external_pose_reaches_the_proxy_unchanged(proxy: ScriptedProxy, drone: Drone) -> None:
     quaternion = (0.1, 0.3, 0.5, 0.8062257748298549)
     assert drone.send_external_pose((1.0, 2.0, 3.0), quaternion, at_ns=7, position_std_m=0.01)
     proxy.until(lambda: bool(proxy.others))
@@ -261,7 +261,7 @@ def test_a_pose_from_outside_goes_to_the_proxy_as_it_is(proxy: ScriptedProxy, dr
         drone.send_external_pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 0.5))
 
 
-def test_frames_that_cannot_be_understood(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_undecodable_frames(proxy: ScriptedProxy, drone: Drone) -> None:
     pytest.importorskip("cv2")
     got: list[int] = []
     with drone.on_frame(lambda frame: got.append(frame.seq), inline=True):
@@ -329,7 +329,7 @@ def test_a_raising_listener_is_an_event(proxy: ScriptedProxy, drone: Drone) -> N
     assert "RuntimeError: boo" in events[0].text
 
 
-def test_a_raising_event_listener_does_not_feed_itself(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_raising_event_listener_does_not_trigger_itself(proxy: ScriptedProxy, drone: Drone) -> None:
     def raising(event: Event) -> None:
         raise RuntimeError("boo")
 
@@ -437,7 +437,7 @@ def test_statistics(proxy: ScriptedProxy, drone: Drone) -> None:
     assert stats["feedback"].age_s is not None
     assert stats["video/front"].count == 0
     assert stats["video/front"].age_s is None
-    proxy.answers[GetStatistics] = None  # a proxy that does not answer costs a moment, and the figure
+    proxy.answers[GetStatistics] = None  # without an answer, it takes a moment and lacks the figure
     assert drone.stats["command"].delay_s is None
 
 
@@ -456,7 +456,7 @@ def test_the_end_of_the_block_lands(proxy: ScriptedProxy) -> None:
         assert drone.closed
 
 
-def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
+def test_the_end_of_the_block_hovers_if_requested(proxy: ScriptedProxy) -> None:
     with flown(proxy, on_exit="hover") as drone:
         proxy.state = FlightState.FLYING
         drone.wait("flying", WAIT_S)
@@ -466,7 +466,7 @@ def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
     assert "land" not in [action.name for action in proxy.actions()]
 
 
-def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
+def test_an_error_in_the_block_propagates_and_a_failed_landing_is_logged(
     proxy: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_landing(*_: object, **__: object) -> bool:
@@ -480,7 +480,7 @@ def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
     assert "it did not land" in caplog.text
 
 
-def test_a_landed_drone_is_just_left(proxy: ScriptedProxy) -> None:
+def test_a_landed_drone_is_just_closed(proxy: ScriptedProxy) -> None:
     with flown(proxy) as drone, drone:
         pass
     assert {action.name for action in proxy.actions()} <= {"idle"}
@@ -492,10 +492,10 @@ def test_unusable_options(proxy: ScriptedProxy, options: dict[str, str]) -> None
         Drone(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]
 
 
-def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_authority(
+def test_closing_waits_for_all_listeners_together_and_wakes_requests_for_the_authority(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """2 s for each listener in turn; and 8 s, with another error, for a request of the authority."""
+    """It took 2 s for each listener in turn, and 8 s, with a different error, for a request for the authority."""
     monkeypatch.setattr("skyloop.client.drone.JOIN_S", 0.4)
     go_on, asked = threading.Event(), threading.Event()
     errors: list[Exception] = []
@@ -523,8 +523,8 @@ def test_closing_waits_for_all_listeners_together_and_wakes_who_asks_for_the_aut
     go_on.set()
 
 
-def test_channels_that_nobody_reads_are_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
-    """Each rate and size that was ever asked for was kept for good."""
+def test_unread_channels_are_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
+    """Each rate and size ever requested was kept for good."""
     state = drone._state
     watched = drone._state.video.channel(scale=0.5)
     with drone.on_frame(lambda _: None, scale=0.5), drone.on_feedback(lambda _: None, max_hz=7.0):
@@ -542,7 +542,7 @@ def test_channels_that_nobody_reads_are_forgotten(proxy: ScriptedProxy, drone: D
     assert len(state.video.streams) <= IDLE_KEPT
 
 
-def test_two_threads_that_ask_for_the_same_channel_get_the_same(drone: Drone) -> None:
+def test_two_threads_that_request_the_same_channel_get_the_same(drone: Drone) -> None:
     start, found = threading.Barrier(8), set()
 
     def ask() -> None:

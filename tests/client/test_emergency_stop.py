@@ -1,4 +1,4 @@
-"""An emergency stop of an application goes on until it shows, whatever else the application asks for."""
+"""An application's emergency stop continues until it shows, whatever else the application commands."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 
 class LossyProxy(ScriptedProxy):
-    """Loses the first packets with an emergency stop on their way to it."""
+    """Loses the first packets with an emergency stop."""
 
     def __init__(self, lost: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class LossyProxy(ScriptedProxy):
 
 
 def test_a_lost_packet_does_not_end_a_stop_while_sticks_are_held() -> None:
-    """The ordinary way to press it: the other hand still holds the sticks, whose set-points go on coming."""
+    """The usual way to press it: the other hand still holds the sticks, whose set-points keep coming."""
     proxy = LossyProxy(lost=3)
     proxy.state = FlightState.FLYING
     proxy.start()
@@ -86,7 +86,7 @@ def test_a_lost_packet_does_not_end_a_stop_while_sticks_are_held() -> None:
             at = len(proxy.commands)
             proxy.until(lambda: len(proxy.commands) >= at + 10)
             assert proxy.left == 0
-            assert set(proxy.actions()[at:]) == {EmergencyStop()}, "until it shows nothing else is sent"
+            assert set(proxy.actions()[at:]) == {EmergencyStop()}, "until it shows, nothing else is sent"
             proxy.state = FlightState.EMERGENCY
             drone.wait("emergency", WAIT_S)
             released.set()
@@ -96,7 +96,7 @@ def test_a_lost_packet_does_not_end_a_stop_while_sticks_are_held() -> None:
         proxy.stop()
 
 
-def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_commands_blocked_by_a_stop_are_reported(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.state = FlightState.FLYING
     assert drone.emergency_stop()
     assert [drone.hover(), drone.idle(), drone.velocity(forward=0.1), drone.attitude(roll=0.1)] == [False] * 4
@@ -110,7 +110,7 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
         with pytest.raises(RefusedError, match="emergency stop of this application has not shown") as error:
             once()
         assert error.value.code == "wrong_state"
-    assert drone.emergency_stop(), "another press is one more"
+    assert drone.emergency_stop(), "another press counts"
     assert set(proxy.actions()) <= {EmergencyStop(), Idle()}
     proxy.state = FlightState.EMERGENCY
     drone.wait("emergency", WAIT_S)
@@ -118,8 +118,8 @@ def test_what_a_stop_keeps_back_is_told(proxy: ScriptedProxy, drone: Drone) -> N
     assert drone.hover()
 
 
-def test_leaving_waits_for_the_stop_to_show() -> None:
-    """The last line of a program, and its packet is lost: the end of the connection must not end the stop."""
+def test_closing_waits_for_the_stop_to_show() -> None:
+    """The last line of a program, with its packet lost: the end of the connection must not end the stop."""
     proxy = LossyProxy(lost=5)
     proxy.state = FlightState.FLYING
     proxy.start()
@@ -142,7 +142,7 @@ def test_leaving_waits_for_the_stop_to_show() -> None:
         proxy.stop()
 
 
-def test_a_vehicle_that_can_not_stop_its_motors_is_no_reason_for_silence(proxy: ScriptedProxy) -> None:
+def test_a_vehicle_without_motor_stop_raises(proxy: ScriptedProxy) -> None:
     known = frozenset(ACTION_NAMES.values()) - {"emergency_stop"}
     proxy.capabilities = Capabilities("scripted", known)
     with flown(proxy) as drone:
@@ -158,7 +158,7 @@ def feedback(state: FlightState) -> Feedback:
     return Feedback(captured_ns=1, state=state)
 
 
-def test_nothing_may_be_asked_for_until_it_shows_and_then_everything() -> None:
+def test_nothing_may_be_commanded_until_it_shows_and_then_everything() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
     assert schedule.next(clock()) == EmergencyStop()
@@ -186,8 +186,8 @@ def test_a_reset_is_sent_once_the_stop_has_shown_if_that_is_soon(after_s: float,
 
 
 @pytest.mark.parametrize("there_is_room", [True, False])
-def test_it_is_repeated_at_once_however_seldom_other_commands_are(there_is_room: bool) -> None:
-    """At 1 Hz one lost packet, or one moment without room, left the motors running for 1.25 s more."""
+def test_a_stop_is_repeated_at_once_however_rare_other_commands_are(there_is_room: bool) -> None:
+    """At 1 Hz, one lost packet or a moment without room left the motors running for another 1.25 s."""
     clock, schedule = ManualClock(), CommandSchedule(rate_hz=1.0)
     schedule.ask(EmergencyStop(), clock())
     sent = []
@@ -201,7 +201,7 @@ def test_it_is_repeated_at_once_however_seldom_other_commands_are(there_is_room:
     assert schedule.due_ns - clock() <= 50_000_000
 
 
-def test_it_is_given_up_when_the_driver_gives_it_up() -> None:
+def test_a_stop_is_abandoned_before_the_driver_abandons_it() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
     begun_ns, sent = clock(), []
@@ -211,21 +211,21 @@ def test_it_is_given_up_when_the_driver_gives_it_up() -> None:
             sent.append(clock() - begun_ns)
         schedule.observe(feedback(FlightState.FLYING), clock())
         clock.advance(0.01)
-    assert 7.9 * NS_PER_S < sent[-1] <= 8.0 * NS_PER_S < GIVE_UP_NS - NS_PER_S, "its last repeat presses nothing anew"
+    assert 7.9 * NS_PER_S < sent[-1] <= 8.0 * NS_PER_S < GIVE_UP_NS - NS_PER_S, "its last repeat is not a new press"
     assert not schedule.stopping
     assert schedule.may_ask(Land())
 
 
-def test_one_that_could_not_be_sent_is_withdrawn_or_soon_over() -> None:
+def test_an_unsent_stop_is_withdrawn_or_soon_over() -> None:
     clock, schedule = ManualClock(), CommandSchedule()
     schedule.ask(EmergencyStop(), clock())
-    assert schedule.may_ask(Idle()), "it was told as not sent"
+    assert schedule.may_ask(Idle()), "it was reported as not sent"
     assert not schedule.may_ask(Hover())
     clock.advance(2.1)
     assert schedule.next(clock()) == Idle()
 
 
-def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unshown_stop_is_reported(proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(actions._AT_MOST_NS, EmergencyStop, 200_000_000)
     proxy.state = FlightState.FLYING
     told = threading.Event()
@@ -237,8 +237,8 @@ def test_what_is_not_shown_is_told(proxy: ScriptedProxy, drone: Drone, monkeypat
     assert drone.hover()
 
 
-def test_a_stop_that_finds_no_room_is_withdrawn_or_given_up_and_never_sent_later() -> None:
-    """It counted as sent: told as not sent after 2 s, it cut the motors when there was room, up to 8 s later."""
+def test_a_stop_without_room_is_withdrawn_or_abandoned_and_never_sent_later() -> None:
+    """It counted as sent. Reported as unsent after 2 s, it cut the motors once there was room, up to 8 s later."""
     schedule = CommandSchedule()
     schedule.ask(EmergencyStop(), 0)
     for now_ns in range(0, 1_000_000_000, 40_000_000):
@@ -256,4 +256,4 @@ def test_a_stop_that_finds_no_room_is_withdrawn_or_given_up_and_never_sent_later
     assert schedule.next(3_000_000_000) == EmergencyStop()
     assert schedule.next(3_100_000_000) == EmergencyStop()
     schedule.not_sent(EmergencyStop(), 3_100_000_000)
-    assert not schedule.may_ask(Idle()), "one that was sent is not taken back, whatever became of a repeat"
+    assert not schedule.may_ask(Idle()), "a stop that was sent is not withdrawn, whatever happened to a repeat"

@@ -1,4 +1,4 @@
-"""Who lets a vehicle go, and when: the own hover and landing of the library, and the end of a flight."""
+"""Letting go of a vehicle: the library's own hover and landing, and the end of a flight."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 
 def newest(proxy: ScriptedProxy) -> Command:
-    """The newest command that is no sign of life only, once a later packet has come."""
+    """Return the newest command other than a mere sign of life, once a later packet has arrived."""
     proxy.until(lambda: any(type(command.action) is not Idle for command in proxy.commands), "a command")
     return next(command for command in reversed(proxy.commands) if type(command.action) is not Idle)
 
@@ -60,7 +60,7 @@ def newest(proxy: ScriptedProxy) -> Command:
 # Letting go ------------------------------------------------------------------------------------------------------
 
 
-def test_a_hover_of_the_librarys_own_says_so_and_a_programs_does_not(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_the_librarys_own_hover_is_marked_and_a_programs_is_not(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.velocity(forward=0.5)
     assert not newest(proxy).automatic
     assert drone._piloting.let_go("a test says so")
@@ -70,7 +70,7 @@ def test_a_hover_of_the_librarys_own_says_so_and_a_programs_does_not(proxy: Scri
     proxy.until(lambda: proxy.commands[-1].action == Hover() and not proxy.commands[-1].automatic, "its own")
 
 
-def test_the_hover_that_a_set_point_decays_to_is_the_librarys_own() -> None:
+def test_the_hover_after_a_decayed_set_point_is_the_librarys_own() -> None:
     schedule = CommandSchedule(stall_s=1.0)
     schedule.ask(Velocity(0.5), 0)
     assert (schedule.next(0), schedule.automatic) == (Velocity(0.5), False)
@@ -96,10 +96,10 @@ def test_the_hover_that_a_set_point_decays_to_is_the_librarys_own() -> None:
         (Hover(), {}, None),
     ],
 )
-def test_what_letting_go_sends(
+def test_commands_of_letting_go(
     proxy: ScriptedProxy, drone: Drone, asked: AnyAction, more: dict[str, object], sent: AnyAction | None
 ) -> None:
-    """It breaks off no landing, takes no vehicle of others, ends no return, and leaves no take-off to be made later."""
+    """It aborts no landing, takes no vehicle from others, ends no return, and leaves no take-off for later."""
     more = dict(more)
     proxy.state = more.pop("state", FLYING)  # type: ignore[assignment]
     proxy.more = more
@@ -129,7 +129,7 @@ def test_without_the_authority_nothing_is_sent_now_or_later(proxy: ScriptedProxy
         (lambda drone: drone.return_to_start(), None),
     ],
 )
-def test_ctrl_c_in_a_flight_to_a_place_hovers(
+def test_ctrl_c_in_go_to_hovers(
     proxy: ScriptedProxy, drone: Drone, call: Callable[[Drone], None], action: AnyAction | None
 ) -> None:
     count = len(proxy.commands)
@@ -145,7 +145,7 @@ def test_ctrl_c_in_a_flight_to_a_place_hovers(
     assert drone._commands.newest == Hover()
 
 
-def test_ctrl_c_in_a_take_off_that_does_not_begin_ends_it(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_ctrl_c_in_a_take_off_that_does_not_start_ends_it(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.state = LANDED
     drone.wait("landed", WAIT_S)
     background(lambda: proxy.until_commanded(Takeoff()), lambda: signal.raise_signal(signal.SIGINT))
@@ -158,7 +158,7 @@ def test_ctrl_c_in_a_take_off_that_does_not_begin_ends_it(proxy: ScriptedProxy, 
     assert Takeoff() not in proxy.actions()[count:]
 
 
-def test_ctrl_c_in_a_landing_lets_it_go_on(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_ctrl_c_in_a_landing_lets_it_continue(proxy: ScriptedProxy, drone: Drone) -> None:
     background(lambda: proxy.until_commanded(Land()), lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         drone.land()
@@ -166,9 +166,7 @@ def test_ctrl_c_in_a_landing_lets_it_go_on(proxy: ScriptedProxy, drone: Drone) -
 
 
 @pytest.mark.parametrize("how", [KeyboardInterrupt, SystemExit])
-def test_a_controller_that_is_interrupted_hovers_at_once(
-    proxy: ScriptedProxy, drone: Drone, how: type[BaseException]
-) -> None:
+def test_an_interrupted_controller_hovers_at_once(proxy: ScriptedProxy, drone: Drone, how: type[BaseException]) -> None:
     class Flying(Controller):
         def on_feedback(self, feedback: Feedback) -> None:
             self.drone.velocity(forward=0.5)
@@ -185,7 +183,7 @@ def test_a_controller_that_is_interrupted_hovers_at_once(
     assert proxy.until_commanded(Hover()).automatic
 
 
-def test_a_controller_that_has_landed_and_fails_is_left_to_land(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_controller_that_fails_after_landing_lets_it_land(proxy: ScriptedProxy, drone: Drone) -> None:
     class Landing(Controller):
         def on_feedback(self, feedback: Feedback) -> None:
             self.drone.land(wait=False)
@@ -200,13 +198,13 @@ def test_a_controller_that_has_landed_and_fails_is_left_to_land(proxy: ScriptedP
 
 
 def landing(proxy: ScriptedProxy) -> threading.Thread:
-    """The vehicle lands when it is told to for the first time."""
+    """The vehicle lands at the first command to do so."""
     return background(
         lambda: proxy.until(lambda: Land() in proxy.actions(), "the landing"), lambda: setattr(proxy, "state", LANDED)
     )
 
 
-def test_a_thread_that_still_commands_does_not_keep_the_end_of_the_block_from_landing(
+def test_a_commanding_thread_does_not_prevent_the_landing_at_the_end_of_the_block(
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
     raised: list[Exception] = []
@@ -240,7 +238,7 @@ def test_a_thread_that_still_commands_does_not_keep_the_end_of_the_block_from_la
     assert not [event for event in drone.recent_events() if event.kind is EventKind.CALLBACK_ERROR]
 
 
-def test_an_emergency_stop_passes_when_the_end_has_begun(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_an_emergency_stop_passes_during_the_end(proxy: ScriptedProxy, drone: Drone) -> None:
     stopping = background(
         lambda: proxy.until(lambda: Land() in proxy.actions()),
         drone.emergency_stop,
@@ -251,7 +249,7 @@ def test_an_emergency_stop_passes_when_the_end_has_begun(proxy: ScriptedProxy, d
     assert EmergencyStop() in proxy.actions()
 
 
-def test_who_waits_for_another_command_hears_that_the_flight_ends(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_wait_for_another_command_ends_with_the_flight(proxy: ScriptedProxy, drone: Drone) -> None:
     raised: list[Exception] = []
 
     def fly() -> None:
@@ -286,7 +284,7 @@ def test_a_controller_on_another_thread_ends_with_the_block(proxy: ScriptedProxy
 
 @pytest.mark.parametrize("inline", [False, True])
 def test_sys_exit_in_a_callback_ends_the_flight(proxy: ScriptedProxy, drone: Drone, inline: bool) -> None:
-    """It would end the callback's thread, silently, and with ``inline`` all that is received."""
+    """It would end the callback's thread, silently, and with ``inline`` all reception."""
 
     def leave(_: Feedback) -> None:
         sys.exit("enough")
@@ -295,7 +293,7 @@ def test_sys_exit_in_a_callback_ends_the_flight(proxy: ScriptedProxy, drone: Dro
     drone.on_feedback(leave, inline=inline)
     proxy.until(lambda: drone.closed or drone._piloting.ending, "the end begins")
     down.join(WAIT_S)
-    assert drone._piloting.end_flight() is None, "waits for the end that is under way"
+    assert drone._piloting.end_flight() is None, "waits for the end in progress"
     assert drone.closed
     assert proxy.until_commanded(Land()).automatic
     told = [event.text for event in drone.recent_events() if event.kind is EventKind.CALLBACK_ERROR]
@@ -303,10 +301,10 @@ def test_sys_exit_in_a_callback_ends_the_flight(proxy: ScriptedProxy, drone: Dro
 
 
 @pytest.mark.parametrize("inline", [False, True])
-def test_sys_exit_in_a_callback_lands_also_where_there_is_no_thread_to_wait_for_it(
+def test_sys_exit_in_a_callback_lands_even_without_a_thread_to_wait_for_it(
     proxy: ScriptedProxy, drone: Drone, inline: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Commands were refused from then on, and nothing ended the flight."""
+    """From then on, commands were refused, and nothing ended the flight."""
     begin = threading.Thread.start
 
     def start(thread: threading.Thread) -> None:
@@ -323,9 +321,7 @@ def test_sys_exit_in_a_callback_lands_also_where_there_is_no_thread_to_wait_for_
     assert proxy.until_commanded(Land()).automatic
 
 
-def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
-    proxy: ScriptedProxy, drone: Drone
-) -> None:
+def test_a_return_for_the_battery_is_awaited_without_further_commands(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.more = {"failsafe": Failsafe.LAND, "return_phase": ReturnPhase.FLYING}
     drone.wait(lambda f: f.return_phase is ReturnPhase.FLYING, WAIT_S)
     steps: list[str] = []
@@ -351,7 +347,7 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
         ),
     ],
 )
-def test_what_others_fly_is_left_to_them_at_the_end(
+def test_a_vehicle_flown_by_others_is_left_to_them_at_the_end(
     proxy: ScriptedProxy,
     drone: Drone,
     take: Callable[[ScriptedProxy], None],
@@ -367,7 +363,7 @@ def test_what_others_fly_is_left_to_them_at_the_end(
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 
-def test_two_controllers_on_one_drone_end_with_it_and_one_that_fails_stops_it_for_a_moment_only(
+def test_two_controllers_on_one_drone_end_with_it_and_a_failing_one_stops_it_only_briefly(
     proxy: ScriptedProxy, drone: Drone
 ) -> None:
     class Flying(Controller):
@@ -399,7 +395,7 @@ def test_two_controllers_on_one_drone_end_with_it_and_one_that_fails_stops_it_fo
 
 @pytest.fixture
 def two(proxy: ScriptedProxy, drone: Drone) -> Iterator[tuple[ScriptedProxy, Swarm]]:
-    """The other one's proxy, and a swarm of both."""
+    """The other drone's proxy, and a swarm of both."""
     with scripted() as other:
         other.state = FLYING
         with flown(other) as second:
@@ -407,7 +403,7 @@ def two(proxy: ScriptedProxy, drone: Drone) -> Iterator[tuple[ScriptedProxy, Swa
             yield other, Swarm({"a": drone, "b": second}, on_error="land")
 
 
-def test_an_error_of_another_kind_keeps_no_drone_of_a_swarm_from_its_emergency_stop(
+def test_a_foreign_error_keeps_no_drone_of_a_swarm_from_its_emergency_stop(
     two: tuple[ScriptedProxy, Swarm], drone: Drone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other, swarm = two
@@ -421,7 +417,7 @@ def test_an_error_of_another_kind_keeps_no_drone_of_a_swarm_from_its_emergency_s
     other.until_commanded(EmergencyStop())
 
 
-def test_a_swarms_hover_takes_none_of_its_drones_from_others_and_breaks_off_its_own_landing(
+def test_a_swarms_hover_takes_no_drone_from_others_and_aborts_its_own_landing(
     proxy: ScriptedProxy, two: tuple[ScriptedProxy, Swarm]
 ) -> None:
     other, swarm = two
@@ -435,7 +431,7 @@ def test_a_swarms_hover_takes_none_of_its_drones_from_others_and_breaks_off_its_
     assert not other.until_commanded(Hover(), count).automatic
 
 
-def test_the_rest_of_a_swarm_is_landed_by_the_library_and_not_by_its_program(
+def test_the_rest_of_a_swarm_is_landed_by_the_library_not_by_its_program(
     proxy: ScriptedProxy, two: tuple[ScriptedProxy, Swarm]
 ) -> None:
     other, swarm = two
@@ -447,10 +443,10 @@ def test_the_rest_of_a_swarm_is_landed_by_the_library_and_not_by_its_program(
     assert Land() not in proxy.actions()
 
 
-def test_ctrl_c_at_the_end_of_a_swarm_waits_no_longer_and_keeps_no_drone_from_its_landing(
+def test_ctrl_c_at_the_end_of_a_swarm_stops_the_wait_but_no_landing(
     proxy: ScriptedProxy, two: tuple[ScriptedProxy, Swarm], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A second Ctrl-C while the first drone was being landed left the others as they were."""
+    """A second Ctrl-C during the landing of the first drone left the others as they were."""
     other, swarm = two
     begin = threading.Thread.start
 
@@ -490,8 +486,8 @@ def test_the_end_of_a_swarm_bars_all_its_drones_before_the_first_lands(
     assert Land() in other.actions()
 
 
-def test_who_took_it_a_moment_ago_keeps_it_too(proxy: ScriptedProxy, drone: Drone) -> None:
-    """The proxy knows it before feedback has said so, and refuses the landing."""
+def test_a_controller_that_took_the_vehicle_a_moment_ago_keeps_it(proxy: ScriptedProxy, drone: Drone) -> None:
+    """The proxy knows it before feedback shows it, and refuses the landing."""
 
     def take() -> None:
         intent = proxy.until_commanded(Land()).intent

@@ -1,4 +1,4 @@
-"""Frames and where their memory comes from."""
+"""Frames and their memory."""
 
 from __future__ import annotations
 
@@ -65,11 +65,11 @@ def test_a_frame_shows_itself_in_a_notebook() -> None:
         assert encoded is not None
         shown = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
         assert np.array_equal(shown, np.asarray(image))
-    assert frame[0, 0]._repr_png_() is None, "a pixel is no picture"
+    assert frame[0, 0]._repr_png_() is None, "a pixel is not a picture"
     assert frame[:0]._repr_png_() is None
 
 
-def test_what_is_derived_is_plain() -> None:
+def test_derived_arrays_are_plain() -> None:
     frame = arrival(header(), pixels()).frame()
     own = frame.copy()
     own[0, 0] = (1, 2, 3)
@@ -156,7 +156,7 @@ def test_sizes_are_checked() -> None:
     assert "99" in size_error(header(Encoding.JPEG, size=99), 98)
 
 
-def test_the_state_at_the_capture_gets_better_until_it_is_final() -> None:
+def test_the_state_at_capture_improves_until_it_is_final() -> None:
     history = FeedbackHistory()
     frame = Arrival(header(), pixels(), 3000, 0, history).frame()
     history.add(Feedback(captured_ns=500, altitude_m=1.0))
@@ -165,5 +165,5 @@ def test_the_state_at_the_capture_gets_better_until_it_is_final() -> None:
     history.add(Feedback(captured_ns=2000, altitude_m=4.0))
     assert frame.feedback.altitude_m == pytest.approx(2.0)
     assert frame.feedback_reach_s == pytest.approx(1000 / 1e9)
-    history.add(Feedback(captured_ns=100))  # the proxy was restarted: what this frame knows stays
+    history.add(Feedback(captured_ns=100))  # the proxy restarted: this frame's state stays
     assert frame.feedback.altitude_m == pytest.approx(2.0)

@@ -30,13 +30,13 @@ def monitor(clock: ManualClock) -> LinkMonitor:
     return LinkMonitor(Thresholds(), clock())
 
 
-def test_connecting_until_feedback_comes(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_connecting_until_feedback_arrives(monitor: LinkMonitor, clock: ManualClock) -> None:
     assert monitor.verdict(clock()).state is LinkState.CONNECTING
     flow(monitor, clock, [7])
     assert monitor.verdict(clock()).state is LinkState.UP
 
 
-def test_late_feedback_degrades_and_the_next_one_mends(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_late_feedback_degrades_and_the_next_one_recovers(monitor: LinkMonitor, clock: ManualClock) -> None:
     flow(monitor, clock, range(40))
     clock.advance(0.31)
     verdict = monitor.verdict(clock())
@@ -53,7 +53,7 @@ def test_silence_is_a_lost_link_to_be_restarted(monitor: LinkMonitor, clock: Man
     assert (verdict.state, verdict.restart) == (LinkState.LOST, True)
 
 
-def test_a_network_that_is_silent_now_and_then_is_given_more_time(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_a_network_with_pauses_is_given_more_time(monitor: LinkMonitor, clock: ManualClock) -> None:
     monitor.excuse(2.0)
     flow(monitor, clock, range(10))
     clock.advance(2.9)
@@ -116,7 +116,7 @@ def test_any_arrivals_give_a_verdict(arrivals: list[tuple[int, float]]) -> None:
         clock.advance(pause_s)
         monitor.feedback(seq, clock())
         verdict = monitor.verdict(clock())
-        assert not verdict.restart  # it was heard this very moment
+        assert not verdict.restart  # it was received at this very moment
         assert verdict.state in (LinkState.UP, LinkState.DEGRADED)
     assert monitor.received <= len(arrivals)
     assert len(monitor._past) <= len(arrivals) + 1
@@ -134,15 +134,15 @@ def test_stall_watch_asks_once_per_patience() -> None:
     clock.advance(0.9)
     assert not watch.stalled(True, clock())
     clock.advance(5.0)
-    assert not watch.stalled(False, clock())  # nothing else flows either: that is the link's matter
+    assert not watch.stalled(False, clock())  # nothing else flows either: that is up to the link
     clock.advance(0.9)
-    assert not watch.stalled(True, clock()), "the others came first after the silence"
+    assert not watch.stalled(True, clock()), "the others returned first after the silence"
     clock.advance(0.2)
     assert watch.stalled(True, clock())
 
 
 def slow_flow(monitor: LinkMonitor, clock: ManualClock, seqs: list[int], period_s: float = 1.0) -> None:
-    """Samples of which 31 are left out before each, judged twenty times a second."""
+    """Feed samples that each follow 31 left-out ones, judged twenty times a second."""
     for seq in seqs:
         for _ in range(round(period_s * 20)):
             clock.advance(0.05)
@@ -150,7 +150,7 @@ def slow_flow(monitor: LinkMonitor, clock: ManualClock, seqs: list[int], period_
         monitor.feedback(seq, clock(), 31)
 
 
-def test_feedback_that_was_asked_for_once_a_second_is_not_late(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_feedback_requested_once_a_second_is_not_late(monitor: LinkMonitor, clock: ManualClock) -> None:
     flow(monitor, clock, range(1, 33))
     monitor.expect(1.0, clock())
     for number in range(2, 30):
@@ -164,7 +164,7 @@ def test_feedback_that_was_asked_for_once_a_second_is_not_late(monitor: LinkMoni
     assert (verdict.state, verdict.restart) == (LinkState.LOST, True)
 
 
-def test_what_is_lost_of_slow_feedback_is_counted_in_its_own_samples(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_losses_of_slow_feedback_are_counted_in_its_own_samples(monitor: LinkMonitor, clock: ManualClock) -> None:
     flow(monitor, clock, [1])
     monitor.expect(0.1, clock())
     slow_flow(monitor, clock, [32 * number for number in range(1, 25)], 0.1)
@@ -183,10 +183,10 @@ def test_a_change_of_the_rate_leaves_no_gap(monitor: LinkMonitor, clock: ManualC
     assert monitor.missing == 0
     assert monitor.verdict(clock()).state is LinkState.UP
     flow(monitor, clock, [170])
-    assert monitor.missing == 10, "from then on gaps count again"
+    assert monitor.missing == 10, "from then on, gaps count again"
 
 
-def test_a_rate_once_in_a_quarter_of_an_hour_excuses_no_long_silence(monitor: LinkMonitor, clock: ManualClock) -> None:
+def test_a_rate_of_one_per_quarter_of_an_hour_excuses_no_long_silence(monitor: LinkMonitor, clock: ManualClock) -> None:
     flow(monitor, clock, [1])
     monitor.expect(1000.0, clock())
     for _ in range(100):

@@ -35,7 +35,7 @@ def sent(proxy: ScriptedProxy, count: int) -> list[LogEntry]:
     return [entry for entry in proxy.others if isinstance(entry, LogEntry)]
 
 
-def test_what_is_logged_is_sent(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_entries_are_sent(proxy: ScriptedProxy, drone: Drone) -> None:
     assert drone.log.text("found it")
     assert drone.log.text("look out", name="mode", severity="warning")
     assert drone.log.number("error", float(np.float32(0.25)))
@@ -79,7 +79,7 @@ def test_what_is_logged_is_sent(proxy: ScriptedProxy, drone: Drone) -> None:
         (lambda log: log.array("", [1]), "1 to 64"),
     ],
 )
-def test_what_can_not_be_logged(proxy: ScriptedProxy, drone: Drone, call: Any, match: str) -> None:
+def test_invalid_entries(proxy: ScriptedProxy, drone: Drone, call: Any, match: str) -> None:
     with pytest.raises(UsageError, match=match):
         call(drone.log)
     assert proxy.others == []
@@ -92,7 +92,7 @@ def test_the_largest_entries_fit_into_a_packet(proxy: ScriptedProxy, drone: Dron
         assert len(encode(entry)) < MAX_BODY
 
 
-def test_listeners_get_what_anybody_logs(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_listeners_get_every_applications_entries(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[LogEntry] = []
     entry = LogEntry("other", "error", 5, number=0.5)
     with drone.on_log(got.append):

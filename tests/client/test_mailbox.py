@@ -22,10 +22,10 @@ def test_ready_at_once_and_time_out() -> None:
     assert notifier.wait_for(lambda: True, 0.0)
     assert not notifier.wait_for(lambda: False, 0.0)
     assert not notifier.wait_for(lambda: False, 0.01)
-    assert notifier._waiting == []  # whoever gave up left nothing behind
+    assert notifier._waiting == []  # a timed-out waiter leaves nothing behind
 
 
-def test_all_who_wait_are_woken() -> None:
+def test_all_waiters_are_woken() -> None:
     notifier, rung = Notifier(), threading.Event()
     woken: list[bool] = []
     threads = [in_thread(lambda: woken.append(notifier.wait_for(rung.is_set, 10.0))) for _ in range(5)]
@@ -36,13 +36,13 @@ def test_all_who_wait_are_woken() -> None:
     assert woken == [True] * 5
 
 
-def test_a_ring_between_looking_and_sleeping_is_not_missed() -> None:
+def test_a_notification_between_check_and_sleep_is_not_missed() -> None:
     notifier = Notifier()
     looks: list[int] = []
 
     def ready() -> bool:
         looks.append(len(looks))
-        if len(looks) == 2:  # the waiter hung up its lock and looks once more: now it comes true
+        if len(looks) == 2:  # the waiter has added its lock and checks again: now it becomes true
             notifier.notify()
             return False
         return len(looks) > 2
@@ -51,7 +51,7 @@ def test_a_ring_between_looking_and_sleeping_is_not_missed() -> None:
     assert len(looks) == 3
 
 
-def test_many_hand_overs_lose_none() -> None:
+def test_many_hand_overs_lose_nothing() -> None:
     buffer: Mailbox[int] = Mailbox(10_000)
     got: list[int | None] = []
     thread = in_thread(lambda: got.extend(buffer.wait(10.0) for _ in range(2000)))
@@ -62,7 +62,7 @@ def test_many_hand_overs_lose_none() -> None:
 
 
 @given(st.lists(st.booleans(), max_size=60), st.integers(1, 4))
-def test_newest_win_and_everything_is_accounted_for(puts: list[bool], depth: int) -> None:
+def test_the_newest_win_and_everything_is_counted(puts: list[bool], depth: int) -> None:
     buffer: Mailbox[int] = Mailbox(depth)
     offered, model, dropped, taken = 0, [], 0, 0
     for put in puts:

@@ -73,7 +73,7 @@ def test_refusals(proxy: ScriptedProxy, drone: Drone) -> None:
     assert proxy.parameters["limits.tilt"] == 0.35
 
 
-def test_answers_out_of_place(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_answers_of_the_wrong_type(proxy: ScriptedProxy, drone: Drone) -> None:
     for kind in (GetParameter, SetParameter, ListParameters):
         proxy.answers[kind] = Done()
     with pytest.raises(LinkError, match="with Done"):
@@ -84,7 +84,7 @@ def test_answers_out_of_place(proxy: ScriptedProxy, drone: Drone) -> None:
         drone.config.items()
 
 
-def test_what_cannot_be_put_back_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_values_that_cannot_be_restored_are_reported(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.config["limits.tilt"] = 0.2
     proxy.answers[SetParameter] = Refused(Refusal.OUT_OF_RANGE, "too much today")
     proxy.stop()
@@ -105,14 +105,14 @@ def writes(proxy: ScriptedProxy) -> list[SetParameter]:
 
 def held_again(drone: Drone, lease: int) -> None:
     drone.wait(lambda _: drone.authority.state == "held" and drone.authority.lease != lease, WAIT_S)
-    _ = drone.config["limits.tilt"]  # what is written at the grant was sent before this
+    _ = drone.config["limits.tilt"]  # values written at the grant were sent before this
 
 
 @pytest.mark.parametrize("momentary", [True, False])
-def test_what_happens_once_is_not_asked_for_again_after_a_broken_link(
+def test_momentary_parameters_are_not_repeated_after_a_broken_link(
     proxy: ScriptedProxy, drone: Drone, momentary: bool
 ) -> None:
-    """The proxy may have done it before the link broke: two flips for one."""
+    """The proxy may have done it before the link broke: two flips instead of one."""
     proxy.momentary = {"limits.tilt"} if momentary else set()
     proxy.answers[SetParameter] = None
     ended: list[Exception | None] = []
@@ -140,7 +140,7 @@ def test_what_happens_once_is_not_asked_for_again_after_a_broken_link(
         assert again
 
 
-def test_a_lost_link_alone_writes_nothing_again(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_lost_link_alone_restores_nothing(proxy: ScriptedProxy, drone: Drone) -> None:
     """The proxy forgot nothing: another pilot's newer value would be overwritten."""
     drone.config["limits.tilt"] = 0.2
     lease = drone.authority.lease
@@ -149,8 +149,8 @@ def test_a_lost_link_alone_writes_nothing_again(proxy: ScriptedProxy, drone: Dro
     assert len(writes(proxy)) == 1
 
 
-def test_a_restarted_proxy_gets_the_values_and_no_momentary_parameter(proxy: ScriptedProxy, drone: Drone) -> None:
-    """A drone flipped a second time by itself."""
+def test_a_restarted_proxy_gets_the_values_but_no_momentary_parameter(proxy: ScriptedProxy, drone: Drone) -> None:
+    """A drone flipped a second time, unasked."""
     proxy.momentary = {"tello.flip"}
     proxy.parameters["tello.flip"] = 0.0
     drone.config["limits.tilt"] = 0.2
@@ -163,7 +163,7 @@ def test_a_restarted_proxy_gets_the_values_and_no_momentary_parameter(proxy: Scr
     assert [(write.name, write.value) for write in writes(proxy)] == [("limits.tilt", 0.2)]
 
 
-def test_what_another_pilot_wrote_is_not_overwritten(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_another_pilots_values_are_not_overwritten(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.config["limits.tilt"] = 0.2
     drone.config["limits.speed"] = 1.0
     proxy.event(EventKind.PARAMETER_CHANGED, "", "other", name="limits.tilt", value=0.1, app_id=99)
@@ -184,7 +184,7 @@ def test_what_another_pilot_wrote_is_not_overwritten(proxy: ScriptedProxy, drone
     assert [write.name for write in writes(proxy)] == ["limits.speed"]
 
 
-def test_nothing_is_written_again_where_another_flew_since_the_restart(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_nothing_is_restored_if_others_flew_since_the_restart(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.config["limits.tilt"] = 0.2
     proxy.stop()
     proxy.requests.clear()
@@ -220,12 +220,12 @@ def test_plain_values(given: object, expected: Value) -> None:
 @pytest.mark.parametrize(
     "given", [None, {}, object(), ["a"], 2**63, "x" * 5000, [0.0] * 300, np.zeros((2, 2)), np.array(1j)]
 )
-def test_values_that_cannot_travel(given: object) -> None:
+def test_values_that_cannot_be_sent(given: object) -> None:
     with pytest.raises(UsageError, match="x can't be"):
         plain_value("x", given)
 
 
-def test_not_finite_is_for_the_proxy_to_refuse() -> None:
+def test_non_finite_values_are_left_to_the_proxy() -> None:
     value = plain_value("x", math.inf)
     assert isinstance(value, float)
     assert math.isinf(value)

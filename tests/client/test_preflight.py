@@ -1,4 +1,4 @@
-"""The checklist before a flight: each line that is not good says what, why and what to do."""
+"""The checklist before a flight: each bad finding says what, why and what to do."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def with_parameters(**changes: Value) -> PreflightState:
     return replace(READY, parameters={**PARAMETERS, **{name.replace("__", "."): v for name, v in changes.items()}})
 
 
-def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
+def test_a_ready_vehicle_has_only_good_findings() -> None:
     found = lines(READY)
     assert {finding.level for finding in found.values()} == {Level.OK}
     assert list(found) == [
@@ -110,14 +110,14 @@ def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
         (with_parameters(vehicle__checkup="no list"), "driver", Level.WARN, "can't be read"),
     ],
 )
-def test_what_is_not_good_says_why(state: PreflightState, check: str, level: Level, words: str) -> None:
+def test_bad_findings_have_a_reason(state: PreflightState, check: str, level: Level, words: str) -> None:
     finding = lines(state)[check]
     assert (finding.level, words in finding.detail) == (level, True), finding
     assert finding.why
     assert finding.remedy
 
 
-def test_what_the_driver_finds_is_part_of_it() -> None:
+def test_the_drivers_findings_are_included() -> None:
     text = encode_checkup(
         [
             Diagnostic("autopilot", True, "ArduCopter 4.6"),
@@ -139,7 +139,7 @@ def test_a_remedy_is_a_command_for_this_drone() -> None:
 
 
 @pytest.mark.parametrize(("chosen", "shown"), [("front", True), ("bottom", False), ("both_in_one", True)])
-def test_a_camera_that_is_not_chosen_is_not_missed(chosen: str, shown: bool) -> None:
+def test_a_camera_that_is_not_selected_is_not_missed(chosen: str, shown: bool) -> None:
     both = (CameraInfo("front", 32, 24, 30.0), CameraInfo("bottom", 32, 24, 30.0))
     state = with_parameters(camera__active=chosen)
     state = replace(state, capabilities=replace_cameras(state.capabilities, both), video_age_s={"front": None})
@@ -153,7 +153,7 @@ def replace_cameras(capabilities: Capabilities, cameras: tuple[CameraInfo, ...])
 
 
 @pytest.mark.parametrize("profile", [ArduCopterProfile(), Px4Profile()], ids=["arducopter", "px4"])
-def test_each_safety_net_of_an_autopilot_that_is_off_is_explained(profile: AutopilotProfile) -> None:
+def test_each_disabled_safety_net_of_an_autopilot_is_explained(profile: AutopilotProfile) -> None:
     off = {net.name: next(bad for bad in (0.0, 99.0) if not net.good(bad)) for net in profile.SAFETY_NETS}
     diagnostics = profile.safety_diagnostics(off, own_system=255)
     state = replace(with_parameters(vehicle__checkup=encode_checkup(diagnostics)), name="alpha")
@@ -165,7 +165,7 @@ def test_each_safety_net_of_an_autopilot_that_is_off_is_explained(profile: Autop
         assert line.why
         key, value = line.remedy.removeprefix("skyloop param alpha mavlink.").split()
         assert key.upper() == net.name
-        assert net.good(float(value)), "what is advised is good"
+        assert net.good(float(value)), "the advised value is good"
 
 
 def test_an_autopilot_that_watches_another_computer_says_so() -> None:
@@ -189,14 +189,14 @@ def test_a_hot_tello_says_why_it_may_come_down() -> None:
         assert bool(found.why and found.remedy) is (level is Level.WARN)
 
 
-def test_a_check_up_that_is_too_long_keeps_what_is_wrong() -> None:
+def test_a_check_up_that_is_too_long_keeps_the_bad_findings() -> None:
     many = [Diagnostic(f"check {number}", number % 2 == 0, "x" * 200) for number in range(60)]
     text = encode_checkup(many)
     assert len(text) <= MAX_CHECKUP_TEXT
     assert [one.good for one in decode_checkup(text)].count(False) == 30
 
 
-def test_an_ardrone_says_what_keeps_it_down() -> None:
+def test_an_ardrone_reports_what_keeps_it_down() -> None:
     usual = {"control:altitude_max": "3000", "control:outdoor": "FALSE", "control:flight_without_shell": "FALSE"}
     assert all(one.good for one in diagnose(State.FLYING, usual))
     found = {one.what: one for one in diagnose(State.MOTORS_PROBLEM | State.MAGNETOMETER_UNCALIBRATED, {
@@ -219,7 +219,7 @@ def test_a_drone_checks_itself() -> None:
 
 
 class Absent:
-    """In place of a drone whose link is down, or that was closed."""
+    """A stand-in for a drone whose link is down, or that was closed."""
 
     name = "alpha"
     link = LinkStatus(LinkState.LOST, LinkState.LOST)
@@ -235,7 +235,7 @@ class Absent:
         raise self._error
 
 
-def test_a_link_that_is_down_is_a_line_and_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_is_down_is_a_finding_rather_than_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def unreadable(_: Path) -> None:
         raise OSError("not readable")
 

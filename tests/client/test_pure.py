@@ -20,7 +20,7 @@ angles = st.floats(-math.pi, math.pi)
     st.integers(-(10**15), 10**15),
     st.lists(st.tuples(st.integers(0, 10**8), st.integers(0, 10**8)), min_size=1, max_size=40),
 )
-def test_offset_is_true_to_its_uncertainty(offset_ns: int, trips: list[tuple[int, int]]) -> None:
+def test_the_offset_is_within_its_uncertainty(offset_ns: int, trips: list[tuple[int, int]]) -> None:
     estimator = OffsetEstimator()
     now_ns = 10**12
     for there_ns, back_ns in trips:
@@ -36,7 +36,7 @@ def test_offset_is_true_to_its_uncertainty(offset_ns: int, trips: list[tuple[int
     st.floats(-MAX_DRIFT, MAX_DRIFT),
     st.lists(st.tuples(st.integers(0, 10**8), st.integers(0, 10**8), st.integers(0, 10**10)), min_size=1, max_size=60),
 )
-def test_offset_follows_a_clock_that_drifts(offset_ns: int, drift: float, trips: list[tuple[int, int, int]]) -> None:
+def test_the_offset_follows_a_drifting_clock(offset_ns: int, drift: float, trips: list[tuple[int, int, int]]) -> None:
     def true_ns(at_ns: int) -> int:
         return offset_ns + round(drift * (at_ns - 10**12))
 
@@ -62,7 +62,7 @@ def test_the_best_answer_serves_until_drift_may_have_made_it_worse() -> None:
     assert estimator.at(60 * 10**9).uncertainty_ns > 10_000_000
 
 
-def test_a_clock_that_was_set_is_believed_at_once() -> None:
+def test_a_clock_that_was_set_is_followed_at_once() -> None:
     estimator = OffsetEstimator()
     for second in range(5):
         estimator.add(second * 10**9, second * 10**9, second * 10**9 + 1000)
@@ -115,13 +115,13 @@ def test_history_looks_on_both_sides() -> None:
     assert (state.captured_ns, reach_s, final) == (10**9, 0.0, True)
     state, reach_s, final = history.at(2_500_000_000)
     assert state is not None
-    assert (state.captured_ns, reach_s, final) == (2 * 10**9, 0.5, False), "not beyond what is known"
+    assert (state.captured_ns, reach_s, final) == (2 * 10**9, 0.5, False), "not beyond the known samples"
     state, reach_s, final = history.at(-(10**9))
     assert state is not None
     assert (state.captured_ns, reach_s, final) == (0, 1.0, False)
 
 
-def test_history_of_a_restarted_proxy_is_its_own() -> None:
+def test_the_history_of_a_restarted_proxy_is_separate() -> None:
     history = FeedbackHistory()
     history.add(Feedback(captured_ns=100))
     history.add(Feedback(captured_ns=50))

@@ -20,7 +20,7 @@ def descriptors() -> int:
 
 def test_fifty_drones_leave_no_thread_and_no_descriptor() -> None:
     with scripted() as proxy:
-        gc.collect()  # what earlier tests left must not go meanwhile
+        gc.collect()  # leftovers of earlier tests must not go during the test
         before_threads, before_descriptors = set(threading.enumerate()), descriptors()
         for number in range(50):
             drone = open_drone(proxy.server.dial, app=f"app {number}", policy=QUICK)

@@ -1,4 +1,4 @@
-"""Results of processors as an application reads them, from a proxy that is played by the test."""
+"""Results of processors, read from a scripted proxy."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_newest_one(proxy: ScriptedProxy, drone: Drone) -> None:
     assert "Result of detector for front 3" in repr(result)
 
 
-def test_iterating_gets_each_newest_and_ends_with_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_iterating_yields_each_newest_and_ends_with_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     ends: list[str] = []
 
@@ -86,7 +86,7 @@ def test_leaving_the_loop_ends_the_subscription(proxy: ScriptedProxy, drone: Dro
     until_subscribed(proxy, drone, "results/detector", 0)
 
 
-def test_who_gets_nothing_is_told_why(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_missing_results_raise_with_a_reason(proxy: ScriptedProxy, drone: Drone) -> None:
     with pytest.raises(
         NoAnswerError, match=r"no result of processor detector arrived within 0\.02 s: does skyloop proc"
     ):
@@ -108,13 +108,13 @@ def test_who_gets_nothing_is_told_why(proxy: ScriptedProxy, drone: Drone) -> Non
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "x" * 65, "ä", 7])
-def test_a_name_that_cannot_be(drone: Drone, name: Any) -> None:
+def test_an_invalid_name(drone: Drone, name: Any) -> None:
     with pytest.raises(UsageError, match="the name of a processor must have 1 to 64 letters"):
         drone.result(name)
 
 
 @pytest.mark.parametrize("age", [-1.0, float("nan"), "1"])
-def test_a_limit_that_cannot_be(drone: Drone, age: Any) -> None:
+def test_an_invalid_age_limit(drone: Drone, age: Any) -> None:
     with pytest.raises(UsageError, match="max_age_s is"):
         drone.on_result(print, "detector", max_age_s=age)
 
@@ -146,7 +146,7 @@ def test_listeners(proxy: ScriptedProxy, drone: Drone) -> None:
         drone.on_result(7)  # type: ignore[arg-type]
 
 
-def test_results_that_are_too_old_are_left_out_and_counted(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_results_that_are_too_old_are_skipped_and_counted(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     with drone.on_result(lambda result: got.append(result.seq), "detector", inline=True, max_age_s=5.0) as listener:
         until_subscribed(proxy, drone, "results/detector")
@@ -179,10 +179,10 @@ def test_a_busy_listener_gets_the_newest(proxy: ScriptedProxy, drone: Drone) -> 
     drone.wait(lambda _: got == [1, 4], WAIT_S)
 
 
-def test_numbers_tell_losses_and_repetitions(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_numbers_show_losses_and_repetitions(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     drone.on_result(lambda result: got.append(result.seq), inline=True)
-    drone.result("detector")  # subscribed by both topics: each result comes twice
+    drone.result("detector")  # subscribed on both topics: each result arrives twice
     until_subscribed(proxy, drone, RESULTS)
     until_subscribed(proxy, drone, "results/detector")
     a, b = Sender(proxy, worker=1), Sender(proxy, worker=2)
@@ -197,7 +197,7 @@ def test_numbers_tell_losses_and_repetitions(proxy: ScriptedProxy, drone: Drone)
     assert stats.delay_s is not None
 
 
-def test_after_a_restart_of_the_proxy_numbers_begin_anew(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_after_a_restart_of_the_proxy_numbers_start_over(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
     drone.on_result(lambda result: got.append(result.seq), "detector", inline=True)
     until_subscribed(proxy, drone, "results/detector")
@@ -230,7 +230,7 @@ def test_values_as_types(proxy: ScriptedProxy, drone: Drone) -> None:
         result.to(dict[str, float])
 
 
-def test_a_payload_that_is_none_is_told_to_who_reads_it(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_an_invalid_payload_raises_for_its_reader(proxy: ScriptedProxy, drone: Drone) -> None:
     drone.result("detector")
     until_subscribed(proxy, drone, "results/detector")
     Sender(proxy).send(1, payload=b"\xc1")

@@ -1,4 +1,4 @@
-"""Questions and answers matched by number."""
+"""Requests and answers, matched by number."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_answers_find_their_questions_in_any_order(bench: Bench) -> None:
+def test_answers_match_their_requests_in_any_order(bench: Bench) -> None:
     first, second = bench.ask(), bench.ask()
     assert first != second
     assert bench.requests.answered(Reply(second, Done()))
@@ -41,7 +41,7 @@ def test_answers_find_their_questions_in_any_order(bench: Bench) -> None:
     assert bench.answers == [Done(), Pong(5, 6)]
 
 
-def test_a_second_answer_and_one_that_nobody_asked_for_are_ignored(bench: Bench) -> None:
+def test_duplicate_and_unrequested_answers_are_ignored(bench: Bench) -> None:
     number = bench.ask()
     assert bench.requests.answered(Reply(number, Done()))
     assert not bench.requests.answered(Reply(number, Done()))
@@ -49,7 +49,7 @@ def test_a_second_answer_and_one_that_nobody_asked_for_are_ignored(bench: Bench)
     assert bench.answers == [Done()]
 
 
-def test_an_unanswered_question_is_repeated_and_then_given_up(bench: Bench) -> None:
+def test_an_unanswered_request_is_repeated_and_then_abandoned(bench: Bench) -> None:
     number = bench.ask(timeout_s=1.0)
     for _ in range(11):
         bench.clock.advance(0.1)
@@ -63,7 +63,7 @@ def test_an_unanswered_question_is_repeated_and_then_given_up(bench: Bench) -> N
     assert len(bench.sent) == 4
 
 
-def test_a_lost_connection_answers_everything_now_and_later(bench: Bench) -> None:
+def test_a_lost_connection_fails_all_requests_now_and_later(bench: Bench) -> None:
     bench.ask()
     bench.ask()
     bench.requests.fail(ClosedError("gone"))

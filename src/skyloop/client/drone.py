@@ -153,7 +153,7 @@ class Drone:
     """A connected vehicle, returned by :func:`skyloop.connect`.
 
     It is a context manager, and every method is thread-safe. At the end of its block, a drone that is in the air under
-    this application's authority lands, and the authority is released. From the start of that end on, commands from
+    this application's authority lands, and the authority is released. Once that end has begun, commands from
     other threads raise :class:`ClosedError`, except for an emergency stop. A drone flown by others is left to them, and
     one that returns because of its battery keeps returning. ``sys.exit()`` in a callback ends the flight in the same
     way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during :meth:`land` the
