@@ -592,7 +592,7 @@ def test_a_take_off_that_is_refused_for_good(
 
 
 def test_a_refusal_from_an_earlier_session_has_no_effect(proxy: ScriptedProxy, drone: Drone) -> None:
-    """After a reconnection it made land(), takeoff() and go_to() raise within a millisecond, even under another's name."""
+    """After a reconnection, land(), takeoff() and go_to() raised within a millisecond, even under another's name."""
     proxy.more["outcome"] = Outcome(drone.app_id + 1, 1, Fate.REFUSED, Refusal.WRONG_STATE, "me: never")
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
     with pytest.raises(NoAnswerError, match=r"within 0\.3 s: the vehicle is landed$"):
@@ -654,7 +654,7 @@ def interrupt(_: Feedback) -> bool:
 def test_an_interrupted_call_leaves_nothing_for_later(
     proxy: ScriptedProxy, drone: Drone, action: AnyAction, state: FlightState, instead: AnyAction
 ) -> None:
-    """Ctrl-C in go_to() or takeoff() stopped nothing: the vehicle flew on, or took off 6 s later. A landing continues."""
+    """Ctrl-C in go_to() or takeoff() stopped nothing: it flew on, or took off 6 s later. A landing continues."""
     proxy.state = state
     drone.wait(state.value, WAIT_S)
     with pytest.raises(KeyboardInterrupt):
@@ -728,7 +728,7 @@ def test_a_set_point_returns_false_while_set_points_are_refused(proxy: ScriptedP
 
 
 def test_a_landing_is_repeated_until_the_proxy_reports_it_as_complete(proxy: ScriptedProxy, drone: Drone) -> None:
-    """Earlier feedback said "landed": one packet was sent, then Idle, and if that one was lost, the vehicle kept hovering."""
+    """Earlier feedback said "landed": one packet was sent, then Idle. If that packet was lost, it kept hovering."""
     proxy.more["outcome"] = Outcome()
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
     landing = background(lambda: drone.land(timeout_s=WAIT_S))
