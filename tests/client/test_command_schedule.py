@@ -328,8 +328,8 @@ def test_commands_given_while_the_link_was_down(age_s: float, kept: bool) -> Non
 def test_what_waited_long_for_the_lease_says_whether_the_link_was_lost_when_it_was_asked_for(
     action: AnyAction, link_back_s: float, fate: Fate
 ) -> None:
-    """It is never sent, but a caller who still waits for a landing may ask for it anew, which it is if only the lease
-    was awaited."""
+    """It is never sent, but a caller who still waits for a landing may request it again; that one is sent if only the
+    lease was awaited."""
     clock = ManualClock()
     commander = CommandSchedule()
     connected_ns = clock() + nanoseconds(link_back_s)

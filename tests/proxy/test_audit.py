@@ -1,4 +1,4 @@
-"""The audit trail: events to lines, lines to a table, and a proxy that keeps one."""
+"""The audit trail: events become lines, lines a table, and a proxy that keeps one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def entry(kind: EventKind, app: str | None = None, text: str = "", **data: Value
     return entry_of(Event(kind, text, 0, app=app, data=data), NOON, "alpha", "r1")
 
 
-def test_the_lines_of_events() -> None:
+def test_lines_for_events() -> None:
     granted = entry(EventKind.AUTHORITY_GRANTED, "alice", app_id=1, priority=4, lease=2, identity="pid 9")
     assert granted == Entry(NOON, "alpha", "r1", "granted", "alice", "pid 9", 2, 4)
     lost = entry(EventKind.AUTHORITY_LOST, "alice", app_id=1, lease=2, reason="silent", by="")
@@ -49,13 +49,13 @@ def test_the_lines_of_events() -> None:
         ("taking_off", "hovering", None),
         ("landing", "landed", "landed"),
         ("flying", "emergency", "landed"),
-        ("unknown", "hovering", None),  # a vehicle that flew already when the proxy began
+        ("unknown", "hovering", None),  # a vehicle that was already flying when the proxy started
         ("landed", "emergency", None),
         ("landed", "levitating", None),
         ("landed", 3, None),
     ],
 )
-def test_what_counts_as_a_take_off(before: str, after: Value, what: str | None) -> None:
+def test_which_changes_count_as_a_take_off(before: str, after: Value, what: str | None) -> None:
     line = entry(EventKind.STATE_CHANGED, before=before, after=after)
     assert (line.what if line else None) == what
 
@@ -65,7 +65,7 @@ def test_the_table() -> None:
     lines = [
         Entry(at[0], "alpha", "r1", "begin", how="sim://"),
         Entry(at[1], "alpha", "r1", "granted", "alice", "pid 9", 1, 16),
-        Entry(at[1], "bravo", "x1", "takeoff"),  # before anybody held it
+        Entry(at[1], "bravo", "x1", "takeoff"),  # before anyone held it
         Entry(at[2], "alpha", "r1", "takeoff"),
         Entry(at[2], "bravo", "x1", "granted", "carol", "pid 7", 1, 0),
         Entry(at[3], "alpha", "r1", "landed"),
@@ -87,7 +87,7 @@ def test_the_table() -> None:
     ]
 
 
-def test_a_proxy_keeps_its_trail_and_appends_to_the_one_before(tmp_path: Path) -> None:
+def test_a_proxy_keeps_its_trail_and_appends_to_the_previous_one(tmp_path: Path) -> None:
     path = tmp_path / "state" / "bench.jsonl"
     for run in ("r1", "r2"):
         bench = Bench()
@@ -120,7 +120,7 @@ def test_a_proxy_keeps_its_trail_and_appends_to_the_one_before(tmp_path: Path) -
     assert [row.identity for row in tenures(entries)] == ["this process"] * 6
 
 
-def test_a_torn_line_is_left_out_and_counted(tmp_path: Path) -> None:
+def test_a_torn_line_is_skipped_and_counted(tmp_path: Path) -> None:
     path = tmp_path / "a.jsonl"
     trail = AuditTrail(path, "alpha", "r1", lambda: NOON)
     trail.begin("sim://")
@@ -134,7 +134,7 @@ def test_a_torn_line_is_left_out_and_counted(tmp_path: Path) -> None:
         read(tmp_path / "b.jsonl")
 
 
-def test_a_disk_that_is_full_is_told_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full here")
     trail = AuditTrail(Path("/dev/full"), "alpha", "r1")
@@ -144,7 +144,7 @@ def test_a_disk_that_is_full_is_told_once(caplog: pytest.LogCaptureFixture, monk
     assert caplog.text.count("can't be written: [Errno 28]") == 1
 
 
-def test_the_usual_place_may_be_missing_and_one_that_was_asked_for_may_not(
+def test_the_default_folder_may_be_missing_but_a_requested_one_may_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "state").write_text("not a directory")

@@ -1,4 +1,4 @@
-"""Authority: tables of what the rules say, and properties over random histories."""
+"""The authority: tables of the rules, and properties over random histories."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skyloop.proxy.core.authority import (
 S = NS_PER_S
 
 
-def test_the_first_to_ask_gets_lease_one() -> None:
+def test_the_first_request_gets_lease_one() -> None:
     authority = Authority()
     assert authority.request(7, 16, True, 0) == [Granted(7, 16, 1)]
     assert authority.holder is not None
@@ -59,7 +59,7 @@ def test_a_higher_priority_takes_over_at_once_and_the_loser_waits_on() -> None:
     assert authority.release(3, 6) == [Lost(3, 2, "released"), Granted(1, 16, 3), Queued(2, 16, 1)]
 
 
-def test_who_does_not_want_to_wait_is_refused() -> None:
+def test_a_request_that_does_not_wait_is_refused() -> None:
     authority = Authority()
     authority.request(1, 16, True, 0)
     assert authority.request(2, 16, False, 0) == []
@@ -67,7 +67,7 @@ def test_who_does_not_want_to_wait_is_refused() -> None:
     assert authority.request(2, 15, False, 0) == [Preempted(1, 1, 2, 15), Granted(2, 15, 2), Queued(1, 16, 1)]
 
 
-def test_who_waits_and_then_does_not_want_to_leaves_the_line() -> None:
+def test_a_waiting_application_that_no_longer_waits_leaves_the_queue() -> None:
     authority = Authority()
     authority.request(1, 16, True, 0)
     authority.request(2, 16, True, 0)
@@ -75,7 +75,7 @@ def test_who_waits_and_then_does_not_want_to_leaves_the_line() -> None:
     assert authority.waiting == ()
 
 
-def test_a_holder_that_asks_again_changes_its_priority() -> None:
+def test_another_request_of_the_holder_changes_its_priority() -> None:
     authority = Authority()
     authority.request(1, 16, True, 0)
     authority.request(2, 10, True, 0)  # takes over
@@ -86,14 +86,14 @@ def test_a_holder_that_asks_again_changes_its_priority() -> None:
     assert authority.position(2) == 1
 
 
-def test_who_waits_and_asks_again_with_a_higher_priority_takes_over() -> None:
+def test_a_waiting_application_takes_over_with_a_higher_priority() -> None:
     authority = Authority()
     authority.request(1, 16, True, 0)
     authority.request(2, 16, True, 0)
     assert authority.request(2, 3, True, 0) == [Preempted(1, 1, 2, 3), Granted(2, 3, 2), Queued(1, 16, 1)]
 
 
-def test_leaving_the_line_takes_nothing_from_the_holder() -> None:
+def test_leaving_the_queue_takes_nothing_from_the_holder() -> None:
     authority = Authority()
     authority.request(1, 16, True, 0)
     authority.request(2, 16, True, 0)
@@ -110,15 +110,15 @@ def test_a_silent_holder_loses_the_lease_exactly_at_the_time_out() -> None:
     authority.last_command_ns = 11 * S
     assert authority.update(13 * S - 1) == []
     assert authority.update(13 * S) == [Lost(1, 1, "silent"), Granted(2, 20, 2)]
-    assert authority.position(1) == 0  # silent ones do not wait on
-    assert authority.update(15 * S - 1) == []  # the grant counts as heard
+    assert authority.position(1) == 0  # silent ones do not stay in the queue
+    assert authority.update(15 * S - 1) == []  # the grant counts as a sign of life
 
 
-def test_nobody_is_silent_when_nobody_holds_it() -> None:
+def test_without_a_holder_no_one_is_silent() -> None:
     assert Authority().update(100 * S) == []
 
 
-def test_a_silent_holder_keeps_the_name_until_somebody_asks() -> None:
+def test_a_silent_holder_stays_listed_until_the_next_request() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
     assert authority.update(2 * S) == [Lost(1, 1, "silent")]
@@ -127,12 +127,12 @@ def test_a_silent_holder_keeps_the_name_until_somebody_asks() -> None:
     assert authority.owner is not None
     assert (authority.owner.app_id, authority.owner.priority) == (1, 4)
     assert authority.update(9 * S) == []
-    assert authority.request(2, 31, False, 9 * S) == [Granted(2, 31, 2)]  # of whatever priority
+    assert authority.request(2, 31, False, 9 * S) == [Granted(2, 31, 2)]  # of any priority
     assert authority.owner is authority.holder
     assert authority.position(1) == 0
 
 
-def test_a_silent_holder_that_is_back_asks_like_anybody() -> None:
+def test_a_silent_holder_that_is_back_must_request_again() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
     authority.update(2 * S)
@@ -140,7 +140,7 @@ def test_a_silent_holder_that_is_back_asks_like_anybody() -> None:
     assert authority.silent is None
 
 
-def test_a_silent_holder_that_gives_back_or_is_gone_leaves_no_name() -> None:
+def test_a_silent_holder_that_releases_or_is_gone_is_not_listed() -> None:
     for end in (Authority.release, Authority.gone):
         authority = Authority(timeout_s=2.0)
         authority.request(1, 4, True, 0)
@@ -149,7 +149,7 @@ def test_a_silent_holder_that_gives_back_or_is_gone_leaves_no_name() -> None:
         assert authority.owner is None
 
 
-def test_who_waits_when_the_holder_falls_silent_follows_at_once() -> None:
+def test_the_first_in_the_queue_follows_a_silent_holder_at_once() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
     authority.request(2, 9, True, 0)
@@ -160,7 +160,7 @@ def test_who_waits_when_the_holder_falls_silent_follows_at_once() -> None:
 # For a time ------------------------------------------------------------------------------------------------------
 
 
-def test_a_holder_whose_time_is_over_is_told_once_and_keeps_it_while_nobody_waits() -> None:
+def test_a_holder_whose_time_is_over_is_notified_once_and_keeps_it_while_no_one_waits() -> None:
     authority = Authority(timeout_s=1000.0)
     assert authority.request(1, 16, True, 0, term_ns=60 * S) == [Granted(1, 16, 1, 60 * S)]
     assert authority.update(60 * S - 1) == []
@@ -170,26 +170,26 @@ def test_a_holder_whose_time_is_over_is_told_once_and_keeps_it_while_nobody_wait
     assert authority.position(1) == 0
 
 
-def test_who_waits_gets_it_when_the_holders_time_is_over_whatever_the_priorities() -> None:
+def test_the_first_in_the_queue_follows_when_the_holders_time_is_over_whatever_the_priorities() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 0, True, 0, term_ns=60 * S)
     assert authority.request(2, 16, True, 10 * S) == [Queued(2, 16, 1, 50 * S)]
     assert authority.update(60 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
 
 
-def test_a_higher_priority_takes_over_within_the_time_and_leaves_what_is_left_of_it() -> None:
+def test_a_higher_priority_takes_over_within_the_time_and_the_rest_of_it_stays() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 16, True, 0, term_ns=60 * S)
     assert authority.request(2, 4, True, 20 * S) == [Preempted(1, 1, 2, 4), Granted(2, 4, 2), Queued(1, 16, 1)]
     assert authority.release(2, 30 * S) == [Lost(2, 2, "released"), Granted(1, 16, 3, 70 * S)]
 
 
-def test_a_holder_can_lengthen_its_time_only_while_nobody_waits() -> None:
+def test_a_holder_can_extend_its_time_only_while_no_one_waits() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 16, True, 0, term_ns=60 * S)
     authority.request(1, 16, True, 10 * S, term_ns=100 * S)
     assert authority.until_ns == 110 * S
-    authority.request(1, 12, True, 11 * S)  # says nothing of the time
+    authority.request(1, 12, True, 11 * S)  # without a time
     assert authority.until_ns == 110 * S
     authority.request(2, 16, True, 20 * S)
     authority.request(1, 16, True, 30 * S, term_ns=100 * S)
@@ -198,7 +198,7 @@ def test_a_holder_can_lengthen_its_time_only_while_nobody_waits() -> None:
     assert authority.update(40 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
 
 
-def test_a_time_that_was_over_and_is_lengthened_is_told_again() -> None:
+def test_an_extended_time_is_reported_again_when_it_is_over() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 16, True, 0, term_ns=10 * S)
     assert authority.update(10 * S) == [Expired(1, 1)]
@@ -206,23 +206,23 @@ def test_a_time_that_was_over_and_is_lengthened_is_told_again() -> None:
     assert authority.update(21 * S) == [Expired(1, 1)]
 
 
-def test_the_expected_wait_is_what_those_ahead_have_said() -> None:
+def test_the_expected_wait_follows_from_the_requested_times() -> None:
     authority = Authority(timeout_s=1000.0)
     assert authority.wait_ns(1, 0) is None
     authority.request(1, 16, True, 0, term_ns=60 * S)
     assert authority.request(2, 16, True, 20 * S, term_ns=30 * S) == [Queued(2, 16, 1, 40 * S)]
     assert authority.request(3, 16, True, 20 * S) == [Queued(3, 16, 2, 70 * S)]
-    assert authority.request(4, 16, True, 20 * S) == [Queued(4, 16, 3)]  # the one before it said nothing
+    assert authority.request(4, 16, True, 20 * S) == [Queued(4, 16, 3)]  # the one before it gave no time
     assert authority.wait_ns(9, 20 * S) is None
     assert authority.release(2, 25 * S) == [Queued(3, 16, 1, 35 * S), Queued(4, 16, 2)]
     authority.release(1, 25 * S)
-    assert authority.wait_ns(4, 25 * S) is None  # the holder said nothing
+    assert authority.wait_ns(4, 25 * S) is None  # the holder gave no time
 
 
 # Asking first ----------------------------------------------------------------------------------------------------
 
 
-def test_a_holder_that_is_asked_and_does_not_answer_keeps_it_until_the_time_is_over() -> None:
+def test_a_holder_that_does_not_answer_keeps_it_until_the_time_to_ask_is_over() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     asked = Asked(1, 1, 2, 4, 15 * S, 60 * S)
@@ -242,14 +242,14 @@ def test_asking_twice_is_asking_once() -> None:
     assert authority.update(15 * S)[0] == Preempted(1, 1, 2, 4)
 
 
-def test_who_asked_and_can_not_wait_any_longer_takes_over() -> None:
+def test_a_request_that_stops_asking_takes_over() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 4, True, 0, ask=True)
     assert authority.request(2, 4, True, 1 * S)[:2] == [Preempted(1, 1, 2, 4), Granted(2, 4, 2)]
 
 
-def test_a_holder_grants_and_waits_to_have_it_back() -> None:
+def test_a_holder_grants_and_waits_to_get_it_back() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 4, True, 0, ask=True)
@@ -258,7 +258,7 @@ def test_a_holder_grants_and_waits_to_have_it_back() -> None:
     assert authority.release(2, 5 * S) == [Lost(2, 2, "released"), Granted(1, 16, 3)]
 
 
-def test_who_grants_to_a_lower_priority_does_not_take_it_back_at_once() -> None:
+def test_a_holder_that_grants_to_a_lower_priority_does_not_take_it_back_at_once() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 4, True, 0)
     assert authority.request(2, 16, True, 0, ask=True) == [Queued(2, 16, 1), Asked(1, 1, 2, 16, 10 * S)]
@@ -267,16 +267,16 @@ def test_who_grants_to_a_lower_priority_does_not_take_it_back_at_once() -> None:
     assert authority.update(4 * S) == []
 
 
-def test_one_that_is_not_higher_may_ask_and_waits_on_when_nobody_answers() -> None:
+def test_an_equal_or_lower_priority_may_ask_and_waits_without_an_answer() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 16, True, 0, ask=True)
     assert authority.update(10 * S) == []
     assert authority.position(2) == 1
-    assert authority.request(2, 16, True, 11 * S, ask=True)[-1] == Asked(1, 1, 2, 16, 21 * S)  # asked anew
+    assert authority.request(2, 16, True, 11 * S, ask=True)[-1] == Asked(1, 1, 2, 16, 21 * S)  # asked again
 
 
-def test_a_holder_declines_and_the_higher_priority_wins_all_the_same() -> None:
+def test_a_holder_declines_and_the_higher_priority_still_wins() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 4, True, 0, ask=True)
@@ -285,7 +285,7 @@ def test_a_holder_declines_and_the_higher_priority_wins_all_the_same() -> None:
     assert authority.update(10 * S)[0] == Preempted(1, 1, 2, 4)
 
 
-def test_answers_that_mean_nothing_any_more() -> None:
+def test_outdated_answers_change_nothing() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     assert authority.answer(1, 0, 2, True, "", 0) == []
     authority.request(1, 16, True, 0)
@@ -293,12 +293,12 @@ def test_answers_that_mean_nothing_any_more() -> None:
     authority.request(3, 31, True, 0)
     assert authority.answer(3, 1, 2, True, "", 0) == []  # not the holder
     assert authority.answer(1, 9, 2, True, "", 0) == []  # under another lease
-    assert authority.answer(1, 1, 3, True, "", 0) == []  # does not ask
-    assert authority.answer(1, 1, 7, True, "", 0) == []  # is not there
+    assert authority.answer(1, 1, 3, True, "", 0) == []  # has not asked
+    assert authority.answer(1, 1, 7, True, "", 0) == []  # unknown
     assert authority.lease == 1
 
 
-def test_the_holder_is_told_when_who_asked_does_so_no_more() -> None:
+def test_the_holder_is_notified_when_a_request_ends() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     for leave in (authority.release, authority.gone):
@@ -308,10 +308,10 @@ def test_the_holder_is_told_when_who_asked_does_so_no_more() -> None:
     assert authority.request(2, 16, True, 1 * S) == [Queued(2, 16, 1), Withdrawn(1, 1, 2)]  # waits without asking
     assert authority.release(2, 2 * S) == []
     authority.request(2, 16, True, 2 * S, ask=True)
-    assert authority.release(2, 12 * S) == []  # it was asked for long enough
+    assert authority.release(2, 12 * S) == []  # its time to answer the request has passed
 
 
-def test_somebody_who_does_not_ask_lets_the_first_in_line_have_it() -> None:
+def test_granting_to_a_non_asking_application_hands_over_to_the_first_in_the_queue() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 2, True, 0, ask=True)
@@ -320,7 +320,7 @@ def test_somebody_who_does_not_ask_lets_the_first_in_line_have_it() -> None:
     assert [claim.app_id for claim in authority.waiting] == [3, 1]
 
 
-def test_who_takes_over_and_does_not_want_to_wait_is_not_left_in_line() -> None:
+def test_a_takeover_without_queueing_leaves_nothing_in_the_queue() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 2, True, 0, ask=True)
@@ -329,7 +329,7 @@ def test_who_takes_over_and_does_not_want_to_wait_is_not_left_in_line() -> None:
     assert authority.position(3) == 0
 
 
-def test_who_asks_again_when_its_time_is_over_waits_like_everybody() -> None:
+def test_a_holder_whose_time_is_over_waits_like_all_others() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 16, True, 0, term_ns=S)
     authority.request(2, 16, True, 0)
@@ -381,7 +381,7 @@ def test_any_history_keeps_the_rules(history: list[tuple[str, int, int, int, int
         for effect in effects:
             if isinstance(effect, Granted):
                 assert in_force == 0, "two holders at once"
-                assert effect.lease == last_lease + 1, "a lease was left out or used twice"
+                assert effect.lease == last_lease + 1, "a lease was skipped or used twice"
                 last_lease = in_force = effect.lease
                 places.pop(effect.app_id, None)
             if isinstance(effect, Lost | Preempted):
@@ -397,17 +397,19 @@ def test_any_history_keeps_the_rules(history: list[tuple[str, int, int, int, int
         assert len({claim.app_id for claim in waiting}) == len(waiting)
         assert authority.lease == in_force
         told = {app_id: place for app_id, place in places.items() if authority.position(app_id)}
-        assert told == {claim.app_id: place for place, claim in enumerate(waiting, 1)}, "a place was not told"
+        assert told == {claim.app_id: place for place, claim in enumerate(waiting, 1)}, "a position was not reported"
         holder = authority.holder
         if holder is None:
-            assert not waiting, "somebody waits while nobody holds it"
+            assert not waiting, "someone waits although there is no holder"
         else:
             assert authority.silent is None
             assert holder.app_id not in {claim.app_id for claim in waiting}
             higher = [claim for claim in waiting if claim.priority < holder.priority]
             if what in ("request", "polite", "try", "release", "gone", "tick"):
                 assert all(claim.asks(now) for claim in higher), "a higher priority waits without asking"
-                assert authority.until_ns is None or authority.until_ns > now or not waiting, "over, and others wait"
+                assert authority.until_ns is None or authority.until_ns > now or not waiting, (
+                    "its time is over, and others wait"
+                )
         if what in ("request", "polite"):
             holds = holder is not None and holder.app_id == app
             assert holds or authority.position(app) > 0
@@ -416,7 +418,7 @@ def test_any_history_keeps_the_rules(history: list[tuple[str, int, int, int, int
 
 
 @given(steps, st.integers(0, 31))
-def test_whoever_waits_gets_it_when_all_others_are_gone(
+def test_each_waiting_application_gets_it_when_all_others_are_gone(
     history: list[tuple[str, int, int, int, int | None]], priority: int
 ) -> None:
     authority = Authority(timeout_s=2.0, ask_s=1.5)

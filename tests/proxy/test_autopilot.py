@@ -1,4 +1,4 @@
-"""The software autopilot against a point mass, and its signs, states and lacks by table."""
+"""The software autopilot with a point mass; its signs, states and gaps as tables."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STEP_NS = round(PERIOD_S * NS_PER_S)
 
 @dataclass
 class PointMass:
-    """A vehicle that takes attitude with climb rate: first-order tilt and climb, drag, wind. Body axes; yaw turns."""
+    """A vehicle with attitude and climb rate: first-order tilt and climb, drag, wind. Body axes; yaw turns."""
 
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # east, north, up [m]
     velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # east, north, up [m/s]
@@ -87,7 +87,7 @@ def taken_off(mass: PointMass) -> Autopilot:
         (set(), set()),
     ],
 )
-def test_it_adds_what_set_points_can_make(native: set[str], added: set[str]) -> None:
+def test_it_adds_actions_that_set_points_can_emulate(native: set[str], added: set[str]) -> None:
     assert software_actions(frozenset(native)) == added
 
 
@@ -95,7 +95,7 @@ def test_it_adds_what_set_points_can_make(native: set[str], added: set[str]) -> 
     ("wanted", "roll_sign", "pitch_sign"),
     [(Velocity(1.0), 0, 1), (Velocity(-1.0), 0, -1), (Velocity(left=1.0), -1, 0), (Velocity(left=-1.0), 1, 0)],
 )
-def test_signs_are_those_of_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int) -> None:
+def test_signs_follow_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int) -> None:
     autopilot = Autopilot(ATTITUDE)
     still = Feedback(captured_ns=0, velocity_m_s=(0.0, 0.0, 0.0))
     autopilot.start(wanted, 0, still)
@@ -135,7 +135,7 @@ def test_a_velocity_is_reached_and_held(wanted: Velocity) -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -1.2])
-def test_hover_brakes_and_holds_the_place_in_wind(yaw: float) -> None:
+def test_hover_brakes_and_holds_the_position_in_wind(yaw: float) -> None:
     mass = PointMass(yaw=yaw)
     autopilot = taken_off(mass)
     autopilot.start(Velocity(1.0), mass.now_ns, mass.feedback())
@@ -149,7 +149,7 @@ def test_hover_brakes_and_holds_the_place_in_wind(yaw: float) -> None:
     assert math.hypot(*mass.velocity) < 0.05
 
 
-def test_hover_without_a_position_stands_still() -> None:
+def test_hover_without_a_position_stays_level() -> None:
     mass = PointMass(wind=(1.0, 0.0))
     autopilot = taken_off(mass)
     autopilot.start(Hover(), mass.now_ns, mass.feedback(position=False))
@@ -157,7 +157,7 @@ def test_hover_without_a_position_stands_still() -> None:
     assert math.hypot(*mass.velocity) < 0.05
 
 
-def test_a_vehicle_that_takes_velocities_gets_velocities() -> None:
+def test_a_vehicle_with_velocities_gets_velocities() -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
     feedback = Feedback(captured_ns=0, altitude_m=0.0)
     autopilot.start(Takeoff(), 0, feedback)
@@ -167,7 +167,7 @@ def test_a_vehicle_that_takes_velocities_gets_velocities() -> None:
     assert autopilot.step(2 * STEP_NS, high) == Velocity(up=pytest.approx(0.05))  # type: ignore[arg-type]
 
 
-def test_without_knowledge_it_stays_level_and_goes_by_time() -> None:
+def test_without_data_it_stays_level_and_uses_time() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert autopilot.step(0, None) == Attitude(climb=0.5)
@@ -179,10 +179,10 @@ def test_without_knowledge_it_stays_level_and_goes_by_time() -> None:
     assert autopilot.step(17 * NS_PER_S, None) == Attitude(climb=-0.4)
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING
     assert autopilot.step(60 * NS_PER_S, None) == Attitude(climb=-0.4)
-    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING, "time shows nothing"
+    assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING, "time alone shows nothing"
 
 
-def test_what_becomes_of_a_landing_that_no_altimeter_shows_is_not_known() -> None:
+def test_the_result_of_a_landing_without_an_altimeter_is_unknown() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
     heard = 0
@@ -195,8 +195,8 @@ def test_what_becomes_of_a_landing_that_no_altimeter_shows_is_not_known() -> Non
 
 
 @pytest.mark.parametrize("shown", [FlightState.UNKNOWN, FlightState.FLYING])
-def test_a_gap_in_what_is_heard_ends_no_landing(shown: FlightState) -> None:
-    """Late in a long landing nothing is heard for 0.6 s, or for a minute."""
+def test_a_gap_in_the_feedback_ends_no_landing(shown: FlightState) -> None:
+    """Late in a long landing, nothing is received for 0.6 s, or for a minute."""
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
     now = 0
@@ -210,10 +210,10 @@ def test_a_gap_in_what_is_heard_ends_no_landing(shown: FlightState) -> None:
             assert autopilot.step(now, last, shown) == Attitude(climb=-0.4)
             assert autopilot.flight.state(shown) is FlightState.LANDING
     assert autopilot.step(now + STEP_NS, Feedback(captured_ns=now + STEP_NS, altitude_m=0.4), shown) is not None
-    assert autopilot.flight.state(shown) is FlightState.LANDING, "no headway for a second counts while it is heard"
+    assert autopilot.flight.state(shown) is FlightState.LANDING, "a second without headway counts while it is received"
 
 
-def test_a_landing_over_lower_ground_ends_where_the_vehicle_says_that_it_stands() -> None:
+def test_a_landing_over_lower_ground_ends_when_the_vehicle_reports_it() -> None:
     """Its altimeter counts from where it took off, 2 m higher."""
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
@@ -222,15 +222,17 @@ def test_a_landing_over_lower_ground_ends_where_the_vehicle_says_that_it_stands(
         now += STEP_NS
         seen(autopilot, FlightState.FLYING, now, 0.0 - 0.02 * below)
         assert autopilot.flight.state(FlightState.FLYING) is FlightState.LANDING
-    for _ in range(100):  # it makes no headway either, and still says that it flies
+    for _ in range(100):  # it makes no headway either, and still reports to fly
         now += STEP_NS
         assert seen(autopilot, FlightState.FLYING, now, -2.0) == Attitude(climb=-0.4)
-    assert seen(autopilot, FlightState.LANDED, now + STEP_NS, -2.0) == Attitude(climb=-0.4), "it stays in force"
+    assert seen(autopilot, FlightState.LANDED, now + STEP_NS, -2.0) == Attitude(climb=-0.4), (
+        "the set-point stays in force"
+    )
     assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
     assert seen(autopilot, FlightState.LANDED, now + 2 * STEP_NS, -2.0) is None
 
 
-def test_a_landing_right_after_a_take_off_began_is_not_over_by_what_was_reported_before() -> None:
+def test_reports_from_before_do_not_end_a_landing_right_after_a_take_off() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
@@ -243,7 +245,7 @@ def test_a_landing_right_after_a_take_off_began_is_not_over_by_what_was_reported
 
 @pytest.mark.parametrize("position", [True, False])
 def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
-    """It is stuck at zero: the position says how high it is, or else the time."""
+    """It is stuck at zero: the position shows the height, otherwise the time."""
     autopilot = Autopilot(frozenset({"velocity"}))
     autopilot.start(Takeoff(), 0, None)
     height, now = 0.0, 0
@@ -259,8 +261,8 @@ def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
     assert told == Velocity(), "it does not climb to where the altimeter should be"
 
 
-def test_a_take_off_that_has_not_risen_when_its_time_is_over_lands() -> None:
-    """Seen on a real Betaflight that got too little of its computer: it was told as hovering, at 0.04 m."""
+def test_a_take_off_that_has_not_risen_in_time_lands() -> None:
+    """Seen with a real Betaflight short of computing time: it was reported as hovering, at 0.04 m."""
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     now = 0
@@ -274,7 +276,7 @@ def test_a_take_off_that_has_not_risen_when_its_time_is_over_lands() -> None:
     assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 
-def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimeter_says() -> None:
+def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimeter() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     for step in range(1, 400):
@@ -284,8 +286,8 @@ def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimete
     assert autopilot.flight.state(FlightState.FLYING) is FlightState.HOVERING
 
 
-def test_what_is_found_on_the_ground_after_a_gap_stays_there() -> None:
-    """A flight controller stood still for a while, and its vehicle fell."""
+def test_a_vehicle_found_on_the_ground_after_a_gap_stays_there() -> None:
+    """A flight controller stalled for a while, and its vehicle fell."""
     autopilot = Autopilot(ATTITUDE)
     now = 0
     autopilot.start(Hover(), now, Feedback(captured_ns=0, altitude_m=1.0))
@@ -300,7 +302,7 @@ def test_what_is_found_on_the_ground_after_a_gap_stays_there() -> None:
         assert told == Attitude()
 
 
-def test_stale_feedback_is_not_steered_by() -> None:
+def test_stale_feedback_is_not_used() -> None:
     autopilot = Autopilot(ATTITUDE)
     old = Feedback(captured_ns=0, velocity_m_s=(3.0, 3.0, 0.0))
     autopilot.start(Hover(), 0, old)
@@ -331,7 +333,7 @@ def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
         ({"attitude"}, Takeoff(), FlightState.EMERGENCY, FlightState.EMERGENCY),
     ],
 )
-def test_the_vehicles_own_word_counts_where_it_has_the_notion(
+def test_the_vehicles_own_report_counts_if_it_has_one(
     native: set[str], mode: Takeoff | Hover | Land | Velocity, told: FlightState, expected: FlightState
 ) -> None:
     autopilot = Autopilot(frozenset(native))
@@ -348,7 +350,7 @@ def test_the_vehicles_own_word_counts_where_it_has_the_notion(
         ("reset_emergency", FlightState.LANDED),
     ],
 )
-def test_what_the_vehicle_does_itself_stops_the_autopilot(action: str, expected: FlightState) -> None:
+def test_the_vehicles_own_actions_stop_the_autopilot(action: str, expected: FlightState) -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Hover(), 0, None)
     autopilot.stop(action)
@@ -356,7 +358,7 @@ def test_what_the_vehicle_does_itself_stops_the_autopilot(action: str, expected:
     assert autopilot.flight.state(FlightState.UNKNOWN) is expected
 
 
-def test_an_attitude_on_the_ground_is_no_flight() -> None:
+def test_an_attitude_on_the_ground_is_not_a_flight() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.stop("attitude")
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
@@ -388,7 +390,7 @@ def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
         max_size=50,
     )
 )
-def test_whatever_it_hears_it_never_tilts_beyond_the_limit(
+def test_it_never_tilts_beyond_the_limit_whatever_the_feedback(
     heard: list[
         tuple[
             Takeoff | Hover | Land | Velocity,
@@ -418,7 +420,7 @@ def test_whatever_it_hears_it_never_tilts_beyond_the_limit(
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
 @pytest.mark.parametrize("wind", [(0.0, 0.0), (0.8, -0.5)])
-def test_a_place_is_reached_and_held(yaw: float, wind: tuple[float, float]) -> None:
+def test_a_target_is_reached_and_held(yaw: float, wind: tuple[float, float]) -> None:
     mass = PointMass(yaw=yaw, wind=wind)
     autopilot = taken_off(mass)
     autopilot.start(Position(3.0, -2.0, 2.0, yaw=-1.0), mass.now_ns, mass.feedback())
@@ -429,7 +431,7 @@ def test_a_place_is_reached_and_held(yaw: float, wind: tuple[float, float]) -> N
     assert wrap_angle(mass.yaw + 1.0) == pytest.approx(0.0, abs=0.05)
 
 
-def test_the_heading_is_kept_where_none_is_asked_for() -> None:
+def test_the_heading_is_kept_if_none_is_requested() -> None:
     mass = PointMass(yaw=0.5)
     autopilot = taken_off(mass)
     autopilot.start(Position(1.0, 1.0, 1.0), mass.now_ns, mass.feedback())
@@ -441,7 +443,7 @@ def test_the_heading_is_kept_where_none_is_asked_for() -> None:
     fly(autopilot, mass, 8.0)
     autopilot.start(Position(0.0, 1.0, 1.0), mass.now_ns, mass.feedback())
     fly(autopilot, mass, 8.0)
-    assert mass.yaw == pytest.approx(2.0, abs=0.05), "what it was turned to is kept, not what was before"
+    assert mass.yaw == pytest.approx(2.0, abs=0.05), "it keeps the heading that it was turned to, not the earlier one"
 
 
 PLACES = st.floats(-50.0, 50.0)
@@ -455,7 +457,7 @@ PLACES = st.floats(-50.0, 50.0)
     st.floats(0.05, 10.0),
     st.floats(0.05, 3.0),
 )
-def test_the_way_is_straight_and_within_its_speeds(
+def test_the_path_is_straight_and_within_its_speeds(
     place: tuple[float, float, float],
     target: tuple[float, float, float],
     heading: float,
@@ -472,7 +474,7 @@ def test_the_way_is_straight_and_within_its_speeds(
     world = (cos * told.forward - sin * told.left, sin * told.forward + cos * told.left, told.up)
     pace, away = math.hypot(*world), math.dist(place, target)
     assert pace <= min(speed, away) + 1e-9
-    assert pace**2 / 2 <= 0.6 * away + 1e-6, "it can still be stopped there"
+    assert pace**2 / 2 <= 0.6 * away + 1e-6, "it can still stop there"
     assert math.dist([one * away for one in world], [(b - a) * pace for a, b in zip(place, target, strict=True)]) < 1e-6
     assert abs(told.yaw_rate) <= yaw_rate
     turn = 0.0 if yaw is None else wrap_angle(yaw - heading)
@@ -484,7 +486,7 @@ def test_the_way_is_straight_and_within_its_speeds(
     [{"position_m": None}, {"yaw_rad": None}, {"captured_ns": -NS_PER_S}],
     ids=["no position", "no yaw", "old"],
 )
-def test_it_stops_while_it_does_not_know_where_it_is(lacking: dict[str, object]) -> None:
+def test_it_stops_while_its_position_is_unknown(lacking: dict[str, object]) -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
     known: dict[str, object] = {"captured_ns": 0, "yaw_rad": 0.0, "position_m": (0.0, 0.0, 1.0)}
     autopilot.start(Position(5.0, 0.0, 1.0), 0, Feedback(**known))  # type: ignore[arg-type]
@@ -493,7 +495,7 @@ def test_it_stops_while_it_does_not_know_where_it_is(lacking: dict[str, object])
     assert autopilot.step(0, None) == Velocity()
 
 
-def test_what_is_not_allowed_on_the_way_is_not_flown() -> None:
+def test_forbidden_velocities_are_not_flown() -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
     autopilot.guard = lambda wanted, _feedback, _now_ns: Velocity(up=wanted.up)
     feedback = Feedback(captured_ns=0, yaw_rad=0.0, position_m=(0.0, 0.0, 1.0))
@@ -511,7 +513,7 @@ def seen(autopilot: Autopilot, state: FlightState, now_ns: int, altitude_m: floa
     return autopilot.step(now_ns, Feedback(captured_ns=now_ns, altitude_m=altitude_m), state)
 
 
-def test_a_vehicle_that_was_disarmed_in_the_air_is_flown_no_more() -> None:
+def test_a_vehicle_disarmed_in_the_air_is_no_longer_flown() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, STEP_NS, 0.0) is not None, "it is about to rise"
@@ -532,18 +534,18 @@ def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
 
 
 @pytest.mark.parametrize("action", [Hover(), Velocity(0.5)])
-def test_what_is_steered_on_the_ground_without_a_take_off_ends(action: Hover | Velocity) -> None:
-    """It was disarmed at the moment at which the software began to steer it: an upward velocity would arm it again."""
+def test_steering_on_the_ground_without_a_take_off_ends(action: Hover | Velocity) -> None:
+    """It was disarmed when the software started to steer it: an upward velocity would arm it again."""
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(action, 0, None)
     seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
-    assert autopilot.flight.state(FlightState.LANDED).airborne, "its driver may not have heard of it yet"
+    assert autopilot.flight.state(FlightState.LANDED).airborne, "its driver may not know yet"
     for step in range(2, 60):
         seen(autopilot, FlightState.LANDED, step * STEP_NS, 0.0)
     assert autopilot.flight.state(FlightState.LANDED) is FlightState.LANDED
 
 
-def test_a_refusal_ends_a_take_off_and_no_flight() -> None:
+def test_a_refusal_ends_a_take_off_but_no_flight() -> None:
     autopilot = Autopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     autopilot.refused(FlightState.UNKNOWN)

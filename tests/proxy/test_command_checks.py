@@ -1,4 +1,4 @@
-"""The command checks: each by table, and properties of the sequence and age filters."""
+"""The command checks: each as a table, and properties of the sequence and age filters."""
 
 from __future__ import annotations
 
@@ -86,11 +86,11 @@ def test_the_age_has_both_bounds(age_ms: int, expected: Refusal | None) -> None:
         (LEASE + 1, True, Refusal.FOREIGN_LEASE),
     ],
 )
-def test_the_lease_in_force_of_its_holder_and_no_other(lease: int, holds: bool, expected: Refusal | None) -> None:
+def test_only_the_holders_lease_in_force_counts(lease: int, holds: bool, expected: Refusal | None) -> None:
     assert receive(Intents(), lease=lease, holds=holds) is expected
 
 
-def test_nobody_flies_without_a_lease_in_force() -> None:
+def test_nothing_flies_without_a_lease_in_force() -> None:
     command = Command(1, 0, 1, NOW, Hover())
     assert Intents().check(command, NOW, MAX_AGE, 0, False) is Refusal.NO_AUTHORITY
 
@@ -118,12 +118,12 @@ _POLICY_TABLE: list[tuple[type[Action], str]] = [
 
 
 @pytest.mark.parametrize(("kind", "row"), _POLICY_TABLE)
-def test_what_each_flight_state_makes_of_an_action(kind: type[Action], row: str) -> None:
+def test_each_action_in_each_flight_state(kind: type[Action], row: str) -> None:
     states = [S.UNKNOWN, S.LANDED, S.TAKING_OFF, S.HOVERING, S.FLYING, S.LANDING, S.EMERGENCY]
     assert [STATE_POLICIES[kind][state].name for state in states] == row.split()
 
 
-def test_every_action_but_the_emergency_stop_has_a_plan_for_every_state() -> None:
+def test_every_action_but_the_emergency_stop_has_a_policy_for_every_state() -> None:
     assert set(STATE_POLICIES) == set(ACTION_NAMES) - {EmergencyStop}
     for row in STATE_POLICIES.values():
         assert set(row) == set(FlightState)
@@ -140,13 +140,13 @@ def test_every_action_but_the_emergency_stop_has_a_plan_for_every_state() -> Non
         (Refusal.NON_FINITE, Command(9, LEASE, 1, NOW, Velocity(math.nan)), ["velocity", "NaN"]),
     ],
 )
-def test_refusals_say_what_would_be_right(reason: Refusal, command: Command, words: list[str]) -> None:
+def test_refusals_name_the_remedy(reason: Refusal, command: Command, words: list[str]) -> None:
     text = explain(reason, command, 7, now_ns=NOW, max_age_ns=MAX_AGE, lease=LEASE)
     for word in words:
         assert word in text
 
 
-def test_a_foreign_lease_when_none_is_in_force_says_so() -> None:
+def test_a_foreign_lease_without_one_in_force_is_explained() -> None:
     command = Command(9, 2, 1, NOW, Hover())
     assert "no lease" in explain(Refusal.FOREIGN_LEASE, command, -1, now_ns=NOW, max_age_ns=MAX_AGE, lease=0)
 

@@ -1,4 +1,4 @@
-"""The proxy's decisions import nothing that has a thread, a lock, a socket or a clock of its own."""
+"""The proxy's decisions import nothing with its own thread, lock, socket or clock."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FILES = [*sorted(Path(skyloop.proxy.core.__file__).parent.glob("*.py")), Path(sk
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_decision_has_only_its_arguments(path: Path) -> None:
+def test_a_decision_depends_only_on_its_arguments(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             assert {name.name for name in node.names} <= ALLOWED

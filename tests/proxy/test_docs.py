@@ -1,4 +1,4 @@
-"""``docs/proxy.md`` is true of the code."""
+"""``docs/proxy.md`` matches the code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _POLICIES = {"done": "APPLY", "hover": "HOVER", "refused": "REFUSE", "nothing to
 
 
 def rows(first_cell: str) -> list[list[str]]:
-    """The cells of the table whose header begins with this cell."""
+    """Return the cells of the table whose header starts with this cell."""
     lines = PAGE.splitlines()
     start = next(number for number, line in enumerate(lines) if line.startswith(f"| {first_cell} |"))
     table = []
@@ -26,7 +26,7 @@ def rows(first_cell: str) -> list[list[str]]:
     return table
 
 
-def test_the_table_of_flight_states_is_the_one_in_force() -> None:
+def test_the_table_of_flight_states_matches_the_code() -> None:
     kinds = ["Takeoff", "Hover", "Land", "Velocity", "ResetEmergency"]
     plans = {kind.__name__: plan for kind, plan in command_checks.STATE_POLICIES.items()}
     assert plans["Attitude"] == plans["Velocity"]
@@ -57,7 +57,7 @@ def test_every_reason_for_refusing_a_command_is_named() -> None:
         assert f"`{reason.value}`" in PAGE
 
 
-def test_the_numbers_that_are_no_parameters_are_those_of_the_code() -> None:
+def test_numbers_other_than_parameters_match_the_code() -> None:
     for sentence in (
         f"at most {command_checks.MAX_AHEAD_NS / 1e9:g} s in the future",
         f"than {requests.MAX_MALFORMED} malformed packets within a second",

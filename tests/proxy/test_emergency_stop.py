@@ -1,4 +1,4 @@
-"""An emergency stop that the vehicle does not show: what the proxy makes of it until it is given up, and after."""
+"""The proxy's handling of an emergency stop that the vehicle does not show, until it is abandoned and after."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tests.support.proxy_bench import ALL, Bench
 ATTITUDE_ONLY = ("idle", "attitude", "emergency_stop", "reset_emergency")
 
 
-def test_the_repeats_of_a_stop_are_signs_of_life_of_who_flies() -> None:
-    """The vehicle takes seconds to show it: meanwhile nothing else is sent, and no failsafe is needed."""
+def test_repeats_of_a_stop_are_signs_of_life() -> None:
+    """The vehicle takes seconds to show it: until then nothing else is sent, and no failsafe is needed."""
     with Bench() as bench:
         pilot = bench.airborne()
         bench.driver.answers = False
@@ -19,12 +19,12 @@ def test_the_repeats_of_a_stop_are_signs_of_life_of_who_flies() -> None:
         bench.run(2.0, lambda: pilot.command(EmergencyStop(), repeat=True))
         assert pilot.told(EventKind.FAILSAFE) == []
         bench.run(0.7)
-        assert len(pilot.told(EventKind.FAILSAFE)) == 1, "silence is none"
+        assert len(pilot.told(EventKind.FAILSAFE)) == 1, "silence is not"
 
 
 @pytest.mark.parametrize("off_s", [-0.3, 0.06, 3600.0])
-def test_a_stop_with_the_stamp_of_another_time_is_carried_out_and_is_no_sign_of_life(off_s: float) -> None:
-    """One from the future counted as one: packets with such a stamp could keep a dead pilot alive for ever."""
+def test_a_stop_with_a_wrong_timestamp_is_executed_but_no_sign_of_life(off_s: float) -> None:
+    """A stop from the future counted as one: packets with such a timestamp could keep a dead pilot alive for ever."""
     with Bench() as bench:
         pilot = bench.airborne()
         bench.driver.answers = False
@@ -37,7 +37,7 @@ def test_a_stop_with_the_stamp_of_another_time_is_carried_out_and_is_no_sign_of_
         assert len(pilot.told(EventKind.FAILSAFE)) == 1
 
 
-def test_a_stop_of_another_application_keeps_no_silent_pilot_alive() -> None:
+def test_a_stop_from_another_application_keeps_no_silent_pilot_alive() -> None:
     with Bench() as bench:
         pilot, other = bench.airborne(), bench.join("other")
         bench.driver.answers = False
@@ -46,8 +46,8 @@ def test_a_stop_of_another_application_keeps_no_silent_pilot_alive() -> None:
 
 
 @pytest.mark.parametrize("actions", [ALL, ATTITUDE_ONLY])
-def test_a_vehicle_whose_stop_was_given_up_is_told_as_flying_and_landed(actions: tuple[str, ...]) -> None:
-    """Also one that the software autopilot flies, and that was lost meanwhile; its pilot is gone."""
+def test_a_vehicle_whose_stop_was_abandoned_is_reported_as_flying_and_landed(actions: tuple[str, ...]) -> None:
+    """Also a vehicle that the software autopilot flies, and that was lost since; its pilot is gone."""
     with Bench(actions) as bench:
         pilot, watcher = bench.pilot(), bench.join("watcher")
         pilot.command(Takeoff())

@@ -1,4 +1,4 @@
-"""Repeated things: the first is told at once, the others in sums, and nothing is kept for ever."""
+"""Repeated events: the first is published at once, the others as sums, and nothing is kept for ever."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def note(repeats: RepeatedEvents, key: str, now_ns: int) -> bool:
     return first
 
 
-def test_the_first_is_told_and_the_rest_summed() -> None:
+def test_the_first_is_published_and_the_rest_summed() -> None:
     repeats = RepeatedEvents()
     assert note(repeats, "a", 0)
     assert not note(repeats, "a", 1)
@@ -34,7 +34,7 @@ def test_the_first_is_told_and_the_rest_summed() -> None:
     assert note(repeats, "a", 3 * S + 1)
 
 
-def test_a_sum_is_told_in_the_words_of_the_newest() -> None:
+def test_a_sum_has_the_text_of_the_newest() -> None:
     repeats = RepeatedEvents()
     for number, why in enumerate(["not initialised", "gyros inconsistent", "no GPS fix"]):
         draft = EventDraft(EventKind.COMMAND_REFUSED, why)
@@ -43,7 +43,7 @@ def test_a_sum_is_told_in_the_words_of_the_newest() -> None:
     assert [draft.text for draft, _ in repeats.due(S)] == ["no GPS fix"]
 
 
-def test_what_ended_is_forgotten() -> None:
+def test_ended_repetitions_are_forgotten() -> None:
     repeats = RepeatedEvents()
     for number in range(1000):
         note(repeats, str(number), 0)

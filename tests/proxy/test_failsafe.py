@@ -1,4 +1,4 @@
-"""The ladder: exact times, what ends a step, and the pace of retries."""
+"""The failsafe ladder: exact times, the ends of steps, and the pace of retries."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_silence_makes_it_hover_and_then_land_to_the_nanosecond() -> None:
 
 
 @pytest.mark.parametrize("pilot", ["released", "silent", "none"])
-def test_without_a_pilot_the_reason_is_why(pilot: str) -> None:
+def test_the_reason_tells_why_there_is_no_pilot(pilot: str) -> None:
     ladder = FailsafeLadder()
     view = replace(FLYING, pilot=pilot)
     assert taken(ladder, T0 + 499 * MS, view) == []
@@ -67,7 +67,7 @@ def test_a_fresh_command_ends_a_step() -> None:
     assert taken(ladder, T0 + S, replace(FLYING, last_command_ns=T0 + S)) == []
 
 
-def test_being_heard_without_a_fresh_command_keeps_the_step_but_does_not_land() -> None:
+def test_signs_of_life_without_a_fresh_command_keep_the_step_but_do_not_land() -> None:
     ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
     heard = replace(FLYING, state=FlightState.HOVERING, last_command_ns=T0 + 60 * S)
@@ -81,7 +81,7 @@ def test_landing_ends_the_step() -> None:
     assert taken(ladder, T0 + 9 * S, LANDED) == [StepChange(Failsafe.NONE, "landed")]
 
 
-def test_what_the_driver_did_not_take_is_tried_again_at_the_set_pace() -> None:
+def test_a_rejected_action_is_retried_at_the_set_pace() -> None:
     ladder = FailsafeLadder(FailsafeSettings(retry_s=0.25))
     view = replace(FLYING, state=FlightState.HOVERING)
     tries = [
@@ -92,7 +92,7 @@ def test_what_the_driver_did_not_take_is_tried_again_at_the_set_pace() -> None:
     assert len(tries) == 6
 
 
-def test_what_was_taken_is_repeated_only_while_the_state_contradicts_it() -> None:
+def test_an_accepted_action_is_repeated_only_while_the_state_contradicts_it() -> None:
     ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
     assert taken(ladder, T0 + S + 100 * MS, FLYING) == []
@@ -101,7 +101,7 @@ def test_what_was_taken_is_repeated_only_while_the_state_contradicts_it() -> Non
 
 
 @pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.LANDING])
-def test_hover_never_breaks_off_a_manoeuvre(state: FlightState) -> None:
+def test_hover_never_aborts_a_manoeuvre(state: FlightState) -> None:
     ladder = FailsafeLadder()
     view = replace(FLYING, state=state, pilot="gone")
     assert FailsafeAction(Hover()) not in taken(ladder, T0 + S, view)
@@ -111,12 +111,12 @@ def test_hover_never_breaks_off_a_manoeuvre(state: FlightState) -> None:
     assert FailsafeAction(Hover()) in taken(ladder, T0 + 2 * S, up)
 
 
-def test_land_does_break_off_a_take_off() -> None:
+def test_land_aborts_a_take_off() -> None:
     ladder = FailsafeLadder()
     assert FailsafeAction(Land()) in taken(ladder, T0 + 5 * S, replace(FLYING, state=FlightState.TAKING_OFF))
 
 
-def test_a_low_battery_is_told_once_and_again_only_after_it_rose() -> None:
+def test_a_low_battery_is_reported_once_and_again_only_after_a_rise() -> None:
     ladder = FailsafeLadder()
     levels = [0.21, 0.19, 0.18, 0.21, 0.19, 0.26, 0.19]
     told = [ladder.update(T0, replace(LANDED, battery=level)) for level in levels]
@@ -130,7 +130,7 @@ def test_an_empty_battery_lands_and_bars_set_points_until_down() -> None:
     assert ladder.barred == "battery"
     assert ladder.fresh_command() == []
     assert taken(ladder, T0, replace(empty, battery=0.12, state=FlightState.LANDING)) == []
-    assert ladder.barred == "battery"  # it rises when the load falls: that is no new charge
+    assert ladder.barred == "battery"  # it rises when the load falls: that is not a charge
     assert taken(ladder, T0, replace(LANDED, battery=0.12)) == [StepChange(Failsafe.NONE, "landed")]
     assert ladder.barred == ""
 
@@ -148,7 +148,7 @@ def test_zero_disables_the_battery_steps() -> None:
     assert taken(ladder, T0, replace(FLYING, battery=0.0)) == []
 
 
-def test_an_unknown_battery_is_no_low_battery() -> None:
+def test_an_unknown_battery_is_not_low() -> None:
     assert taken(FailsafeLadder(), T0, replace(FLYING, battery=None)) == []
 
 
@@ -160,7 +160,7 @@ def test_a_lost_vehicle_link_makes_it_hover() -> None:
     ]
 
 
-def test_handing_over_hovers_without_a_step() -> None:
+def test_a_change_of_hands_hovers_without_a_step() -> None:
     ladder = FailsafeLadder()
     ladder.hand_over(T0)
     assert not ladder.idle
@@ -170,7 +170,7 @@ def test_handing_over_hovers_without_a_step() -> None:
     assert ladder.idle
 
 
-def test_handing_over_does_not_break_off_the_ladders_landing() -> None:
+def test_a_change_of_hands_does_not_abort_the_ladders_landing() -> None:
     ladder = FailsafeLadder()
     taken(ladder, T0 + 5 * S, FLYING)
     ladder.hand_over(T0 + 5 * S)
@@ -198,7 +198,7 @@ views = st.builds(
 
 
 @given(st.lists(st.tuples(views, st.integers(0, S), st.booleans(), st.booleans()), max_size=40))
-def test_any_history_keeps_the_pace_and_climbs_only_upwards(
+def test_any_history_keeps_the_pace_and_only_escalates(
     history: list[tuple[FailsafeInputs, int, bool, bool]],
 ) -> None:
     ladder = FailsafeLadder()
@@ -214,7 +214,7 @@ def test_any_history_keeps_the_pace_and_climbs_only_upwards(
             assert not any(isinstance(effect, FailsafeAction) for effect in effects)
         elif before is Failsafe.LAND:
             assert ladder.step is Failsafe.LAND
-        new = new or any(isinstance(effect, StepChange) for effect in effects)  # since the last try
+        new = new or any(isinstance(effect, StepChange) for effect in effects)  # since the last attempt
         for effect in effects:
             if isinstance(effect, FailsafeAction):
                 assert new or now - last_try >= S // 4

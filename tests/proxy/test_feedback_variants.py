@@ -1,4 +1,4 @@
-"""Feedback in the forms that subscribers ask for: no more than asked, encoded once, bounded in number."""
+"""Feedback in the forms that subscribers request: no more than requested, encoded once, bounded in number."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fly(bench: Bench, seconds: float, hz: float = 32.0) -> None:
         bench.proxy.publisher.keep_alive(bench.clock())
 
 
-def test_no_more_samples_than_asked_for(bench: Bench) -> None:
+def test_no_more_samples_than_requested(bench: Bench) -> None:
     app, whole = watcher(bench, SLOW), bench.join("whole")
     bench.driver.report()
     before = whole.last_feedback().seq
@@ -65,14 +65,14 @@ def test_authority_and_failsafe_come_with_every_form(bench: Bench) -> None:
     assert newest.state is pilot.last_feedback().state
 
 
-def test_a_silent_vehicle_is_reported_all_the_same(bench: Bench) -> None:
+def test_a_silent_vehicle_is_still_reported(bench: Bench) -> None:
     app = watcher(bench, "feedback?max_hz=2")
     bench.run(3.0)
     app.sync()
     assert 5 <= len(app.feedback) <= 7
 
 
-def test_a_form_is_encoded_once_however_many_have_it(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_form_is_encoded_once_for_all_its_subscribers(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     apps = [watcher(bench, SLOW, name) for name in ("a", "b", "c")]
     encoded: list[Feedback] = []
 
@@ -89,7 +89,7 @@ def test_a_form_is_encoded_once_however_many_have_it(bench: Bench, monkeypatch: 
         app.end.subscribe(SLOW, False)
     encoded.clear()
     fly(bench, 1.0)
-    assert not encoded, "without subscribers nothing is encoded"
+    assert not encoded, "without subscribers, nothing is encoded"
 
 
 def test_native_telemetry_that_cannot_be_sent_is_left_out(bench: Bench) -> None:
@@ -99,7 +99,7 @@ def test_native_telemetry_that_cannot_be_sent_is_left_out(bench: Bench) -> None:
     assert app.last_feedback().native is None
 
 
-def test_forms_are_bounded_and_given_up_when_unused(bench: Bench) -> None:
+def test_forms_are_bounded_and_released_when_unused(bench: Bench) -> None:
     app = bench.join("greedy", Role.OBSERVER)
     for number in range(1, MAX_VARIANTS + 1):
         app.end.subscribe(f"feedback?max_hz={number}")
@@ -109,7 +109,7 @@ def test_forms_are_bounded_and_given_up_when_unused(bench: Bench) -> None:
     late.sync()
     (told,) = late.told(EventKind.PACKET_MALFORMED)
     assert f"at most {MAX_VARIANTS} forms" in told.text
-    late.end.subscribe("feedback?max_hz=3")  # what is sent already can be had by all
+    late.end.subscribe("feedback?max_hz=3")  # a form already in use is available to all
     late.sync()
     assert len(late.told(EventKind.PACKET_MALFORMED)) == 1
     app.end.close()
@@ -127,7 +127,7 @@ def test_forms_are_bounded_and_given_up_when_unused(bench: Bench) -> None:
     assert len(numbers) > len(set(numbers)), "once on the plain topic, and once in the form"
 
 
-def test_a_request_that_makes_no_sense_counts_as_malformed(bench: Bench) -> None:
+def test_a_nonsensical_request_counts_as_malformed(bench: Bench) -> None:
     app = watcher(bench, "feedback?max_hz=nan")
     (told,) = app.told(EventKind.PACKET_MALFORMED)
     assert "max_hz is nan and must be from" in told.text

@@ -1,4 +1,4 @@
-"""Whose flight it is: who began it, who takes it, and what the proxy leaves alone."""
+"""Flight ownership: starting a flight, taking one over, and leaving others' flights alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def seen(flight: Flight, state: FlightState, now_ns: int = T0, left_to: str = ""
 
 
 def flying_here() -> Flight:
-    """After an application's take-off."""
+    """Return a flight after an application's take-off."""
     flight = Flight()
     seen(flight, LANDED)
     flight.claim(T0)
@@ -30,7 +30,7 @@ def flying_here() -> Flight:
 
 
 @pytest.mark.parametrize("state", [each for each in FlightState if each.airborne])
-def test_what_is_found_in_the_air_is_somebody_elses(state: FlightState) -> None:
+def test_a_vehicle_found_in_the_air_is_others(state: FlightState) -> None:
     flight = Flight()
     assert seen(flight, UNKNOWN) is Whose.NOBODYS
     changed = flight.observe(state, "", T0)
@@ -41,14 +41,14 @@ def test_what_is_found_in_the_air_is_somebody_elses(state: FlightState) -> None:
     assert flight.observe(state, "", T0) is None
 
 
-def test_what_takes_off_without_us_is_somebody_elses() -> None:
+def test_a_take_off_without_us_is_others() -> None:
     flight = Flight()
     assert seen(flight, LANDED) is Whose.NOBODYS
     assert seen(flight, FlightState.TAKING_OFF, T0 + S) is Whose.OTHERS
     assert seen(flight, LANDED, T0 + 2 * S) is Whose.NOBODYS
 
 
-def test_what_takes_off_because_an_application_asked_is_ours_until_it_stands() -> None:
+def test_a_take_off_for_an_application_is_ours_until_it_stands() -> None:
     flight = flying_here()
     assert flight.ours
     assert seen(flight, UNKNOWN, T0 + 90 * S) is Whose.OURS, "a lost link does not give it away"
@@ -76,11 +76,11 @@ def test_a_take_off_that_showed_claims_no_other_flight() -> None:
     assert seen(flight, FLYING, T0 + 5 * S) is Whose.OTHERS
 
 
-def test_who_changes_its_mode_has_it_until_an_application_takes_it() -> None:
+def test_a_mode_change_takes_it_until_an_application_takes_it_back() -> None:
     flight = flying_here()
     changed = flight.observe(FLYING, "RTL", T0 + 3 * S)
     assert changed is not None
-    assert changed.why == "", "the driver has told it"
+    assert changed.why == "", "the driver has already reported it"
     assert "in RTL" in flight.others
     assert seen(flight, UNKNOWN, T0 + 4 * S) is Whose.OTHERS
     assert seen(flight, FLYING, T0 + 5 * S) is Whose.OTHERS
@@ -89,7 +89,7 @@ def test_who_changes_its_mode_has_it_until_an_application_takes_it() -> None:
     assert flight.others == ""
 
 
-def test_a_flight_of_an_earlier_run_is_ours_if_it_is_found_in_the_air_and_no_later_one_is() -> None:
+def test_an_earlier_runs_flight_is_ours_if_found_in_the_air_but_no_later_one() -> None:
     flight = Flight()
     flight.began_before(T0 + BELIEF_NS)
     assert seen(flight, UNKNOWN) is Whose.NOBODYS
@@ -105,8 +105,8 @@ def test_a_flight_of_an_earlier_run_is_ours_if_it_is_found_in_the_air_and_no_lat
     assert seen(landed_meanwhile, FLYING, T0 + 9 * S) is Whose.OTHERS
 
 
-def test_time_that_a_computer_slept_counts_for_what_is_believed_however_often_it_did() -> None:
-    """Belief in an earlier run's flight ended after 60 s by the clock that stands still meanwhile, or by one sleep."""
+def test_sleep_of_the_computer_counts_for_beliefs_however_often_it_happens() -> None:
+    """Belief in an earlier run's flight ended after 60 s of a clock that stops during sleep, or after one sleep."""
     flight = Flight()
     flight.began_before(T0 + BELIEF_NS)
     for _ in range(2):
@@ -125,7 +125,9 @@ steps = st.tuples(
 
 
 @given(st.lists(st.tuples(steps, st.integers(0, 3 * S)), max_size=30))
-def test_nothing_is_ours_that_no_application_asked_for(history: list[tuple[tuple[FlightState, str, str], int]]) -> None:
+def test_nothing_is_ours_without_an_applications_request(
+    history: list[tuple[tuple[FlightState, str, str], int]],
+) -> None:
     flight, now, asked = Flight(), T0, False
     for (state, left_to, done), later in history:
         now += later
@@ -139,8 +141,8 @@ def test_nothing_is_ours_that_no_application_asked_for(history: list[tuple[tuple
         assert bool(flight.others) is (flight.whose is Whose.OTHERS)
 
 
-def test_what_nobody_else_can_fly_is_never_somebody_elses() -> None:
-    """A recording that is played, for one: its flight is anybody's who commands it."""
+def test_an_unshared_vehicle_is_never_others() -> None:
+    """For example, a played recording belongs to anyone who commands it."""
     flight = Flight(shared=False)
     changed = flight.observe(FLYING, "", T0)
     assert changed is not None

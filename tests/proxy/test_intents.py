@@ -1,4 +1,4 @@
-"""An intent has one beginning and one end, and no repeat acts after it."""
+"""An intent starts once and ends once, and no repeat acts after its end."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def received(intents: Intents, number: int, action: AnyAction, state: FlightStat
 
 @pytest.mark.parametrize("action", ORDERS, ids=lambda action: action.name)
 @pytest.mark.parametrize("fate", ENDINGS)
-def test_each_end_of_the_list_ends_every_kind_of_intent(fate: Fate, action: AnyAction) -> None:
+def test_each_end_ends_every_kind_of_intent(fate: Fate, action: AnyAction) -> None:
     intents = Intents()
     received(intents, 3, action)
     intents.end(fate)
@@ -68,11 +68,11 @@ def test_each_end_of_the_list_ends_every_kind_of_intent(fate: Fate, action: AnyA
     assert (later.over, new) == (False, True)
 
 
-def test_the_list_of_ends_has_each_fate_that_is_one() -> None:
+def test_the_list_of_ends_is_complete() -> None:
     assert set(ENDINGS) == set(Fate) - {Fate.UNDER_WAY}
 
 
-def test_a_newer_intent_takes_the_place_of_the_one_before_for_good() -> None:
+def test_a_newer_intent_replaces_the_previous_one_for_good() -> None:
     intents = Intents()
     first, _ = received(intents, 1, Velocity(0.3))
     received(intents, 2, Hover())
@@ -80,14 +80,14 @@ def test_a_newer_intent_takes_the_place_of_the_one_before_for_good() -> None:
     assert received(intents, 1, Velocity(0.3))[0].over
 
 
-def test_to_want_nothing_withdraws_what_was_asked_for() -> None:
+def test_idle_withdraws_the_request() -> None:
     intents = Intents()
     takeoff, _ = received(intents, 1, Takeoff(), S.LANDED)
     received(intents, 2, Idle(), S.LANDED)
     assert takeoff.fate is Fate.WITHDRAWN
 
 
-def test_what_was_received_but_refused_as_late_is_ended_too() -> None:
+def test_late_refused_commands_are_ended_too() -> None:
     intents = Intents()
     intents.check(Command(1, 1, 9, 0, Hover()), NOW, NS_PER_S, 1, True)
     intents.end(Fate.FAILSAFE)
@@ -95,7 +95,7 @@ def test_what_was_received_but_refused_as_late_is_ended_too() -> None:
     assert (repeat.over, new, repeat.reason) == (True, False, Refusal.NOT_FRESH)
 
 
-def test_before_anything_was_received_intent_zero_is_new() -> None:
+def test_intent_zero_is_new_before_anything_was_received() -> None:
     assert received(Intents(), 0, Hover())[1]
 
 
@@ -104,14 +104,14 @@ def test_before_anything_was_received_intent_zero_is_new() -> None:
     [
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.HOVERING], Fate.COMPLETED),
         (Takeoff(), [S.LANDED, S.TAKING_OFF], Fate.UNDER_WAY),
-        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDED], Fate.LANDED),  # tipped over, or killed by a switch
-        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDING], Fate.LANDED),  # somebody else lands it
-        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.UNKNOWN, S.LANDED], Fate.LANDED),  # and nothing was known meanwhile
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDED], Fate.LANDED),  # tipped over, or disarmed by a switch
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.LANDING], Fate.LANDED),  # others land it
+        (Takeoff(), [S.LANDED, S.TAKING_OFF, S.UNKNOWN, S.LANDED], Fate.LANDED),  # with an unknown state in between
         (Takeoff(), [S.LANDED, S.TAKING_OFF, S.EMERGENCY], Fate.EMERGENCY),
         (Land(), [S.HOVERING, S.LANDING], Fate.UNDER_WAY),
         (Land(), [S.HOVERING, S.LANDING, S.LANDED], Fate.COMPLETED),
         (Land(), [S.LANDED], Fate.COMPLETED),
-        (Hover(), [S.LANDING, S.HOVERING], Fate.UNDER_WAY),  # it broke a landing off
+        (Hover(), [S.LANDING, S.HOVERING], Fate.UNDER_WAY),  # it aborted a landing
         (Hover(), [S.HOVERING, S.LANDING], Fate.LANDED),
         (Velocity(0.3), [S.FLYING, S.LANDED], Fate.LANDED),
         (Velocity(0.3), [S.FLYING, S.UNKNOWN], Fate.UNDER_WAY),
@@ -122,14 +122,14 @@ def test_before_anything_was_received_intent_zero_is_new() -> None:
         (ResetEmergency(), [S.EMERGENCY, S.LANDED], Fate.COMPLETED),
     ],
 )
-def test_what_the_vehicle_does_ends_it(action: AnyAction, states: list[FlightState], fate: Fate) -> None:
+def test_the_vehicles_actions_end_an_intent(action: AnyAction, states: list[FlightState], fate: Fate) -> None:
     intent = Intent(1, action, NOW, states[0], begun=True)
     for state in states:
         intent.observe(state, NOW)
     assert intent.fate is fate
 
 
-def test_a_take_off_has_a_time_on_the_ground_and_none_in_the_air() -> None:
+def test_a_take_off_has_a_time_limit_on_the_ground_but_none_in_the_air() -> None:
     stands, climbs = (Intent(1, Takeoff(), NOW, S.LANDED, begun=True) for _ in range(2))
     stands.observe(S.LANDED, NOW + TAKEOFF_NS - 1)
     assert not stands.over
@@ -138,8 +138,8 @@ def test_a_take_off_has_a_time_on_the_ground_and_none_in_the_air() -> None:
     assert (stands.fate, climbs.fate) == (Fate.TIMED_OUT, Fate.UNDER_WAY)
 
 
-def test_a_take_off_of_a_vehicle_that_does_not_report_its_state_has_a_time_too(bench: Bench) -> None:
-    """A robot whose service does not answer: the repeats called it again for ever, until it did."""
+def test_a_take_off_of_a_vehicle_without_a_state_has_a_time_limit_too(bench: Bench) -> None:
+    """A robot's service did not answer: the repeats called it for ever, until it did."""
     pilot = bench.pilot()
     bench.driver.answers = False
     bench.driver.report(state=S.UNKNOWN)
@@ -153,7 +153,7 @@ def test_a_take_off_of_a_vehicle_that_does_not_report_its_state_has_a_time_too(b
     assert outcome.fate is Fate.TIMED_OUT
 
 
-def test_a_landing_that_withdrew_a_take_off_waits_for_an_arming_that_is_on_its_way() -> None:
+def test_a_landing_that_withdrew_a_take_off_waits_for_an_arming_on_its_way() -> None:
     landing = Intent(1, Land(), NOW, S.LANDED, withdrew=True)
     landing.observe(S.LANDED, NOW + SETTLED_NS - 1)
     assert not landing.over
@@ -170,11 +170,11 @@ _STEPS = st.one_of(
 
 
 @given(st.lists(_STEPS, max_size=40))
-def test_whatever_happens_no_repeat_is_under_way_after_an_end(steps: list[tuple[str, object]]) -> None:
+def test_no_repeat_is_in_progress_after_an_end_whatever_happens(steps: list[tuple[str, object]]) -> None:
     intents, over, number = Intents(), set[int](), 0
     for step, what in steps:
         if step == "ask":
-            over.add(number)  # the newer one takes its place
+            over.add(number)  # the newer one replaces it
             number += 1
             intent, new = received(intents, number, what)  # type: ignore[arg-type]
             assert new
@@ -197,7 +197,7 @@ def test_whatever_happens_no_repeat_is_under_way_after_an_end(steps: list[tuple[
 
 
 def pending(bench: Bench, name: str = "pilot") -> App:
-    """A pilot whose take-off the vehicle was told of, and does not show yet."""
+    """Return a pilot whose vehicle got a take-off that it does not show yet."""
     bench.driver.answers = False
     pilot = bench.pilot(name)
     pilot.command(Takeoff())
@@ -206,11 +206,11 @@ def pending(bench: Bench, name: str = "pilot") -> App:
 
 
 def repeats(bench: Bench, pilot: App, action: AnyAction, seconds: float = 1.0) -> None:
-    """The library repeats it, as many times a second as it does."""
+    """Repeat an action as often as the library does."""
     bench.run(seconds, lambda: pilot.command(action, repeat=True))
 
 
-def test_a_take_off_that_others_land_does_not_begin_again_when_it_stands(bench: Bench) -> None:
+def test_a_take_off_that_others_land_does_not_restart(bench: Bench) -> None:
     """Another station, or a pilot's switch, lands it at 1 m: 0.1 s after touch-down it took off again."""
     pilot = bench.pilot()
     pilot.command(Takeoff())
@@ -227,7 +227,7 @@ def test_a_take_off_that_others_land_does_not_begin_again_when_it_stands(bench: 
 
 @pytest.mark.parametrize("noticed", [True, False], ids=["seen landing", "seen standing"])
 def test_a_take_off_that_ends_on_the_ground_is_over(bench: Bench, noticed: bool) -> None:
-    """It tips over, or is disarmed by a switch: 0.1 s later it armed itself and took off."""
+    """It tips over, or a switch disarms it: 0.1 s later it armed itself and took off."""
     pilot = bench.pilot()
     pilot.command(Takeoff())
     bench.tick()
@@ -265,10 +265,10 @@ def no_link(bench: Bench) -> Callable[[], object]:
 
 
 @pytest.mark.parametrize("prevent", [battery, emergency, not_ready, no_link], ids=lambda one: one.__name__)
-def test_a_refused_take_off_is_not_carried_out_later(
+def test_a_refused_take_off_is_not_executed_later(
     bench: Bench, prevent: Callable[[Bench], Callable[[], object]]
 ) -> None:
-    """Refused and not waited for: it was done when the battery read higher, or an emergency was reset."""
+    """Refused and without a waiting call: it was executed once the battery read higher, or an emergency was reset."""
     pilot = bench.pilot()
     bench.tick()
     release = prevent(bench)
@@ -279,10 +279,10 @@ def test_a_refused_take_off_is_not_carried_out_later(
     repeats(bench, pilot, Takeoff())
     assert Takeoff() not in bench.driver.told
     pilot.command(Takeoff())
-    assert bench.driver.told[-1] == Takeoff(), "newly asked for, it is done"
+    assert bench.driver.told[-1] == Takeoff(), "a new request is executed"
 
 
-def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench: Bench) -> None:
+def test_a_driver_that_gives_up_midway_must_forget_the_take_off(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.fail = {"apply"}
     pilot.command(Takeoff(), repeat=True)
@@ -292,8 +292,8 @@ def test_a_driver_that_gives_up_on_its_way_is_told_to_forget_the_take_off(bench:
     assert bench.driver.told == [Takeoff(), Land()]
 
 
-def test_a_set_point_that_a_driver_fails_at_leaves_the_one_before_it_not_in_force(bench: Bench) -> None:
-    """The driver raised once at a repeat: the library sent Idle from then on, and it flew on with the old velocity."""
+def test_a_failed_set_point_does_not_leave_the_previous_one_in_force(bench: Bench) -> None:
+    """The driver raised once at a repeat: the library sent Idle from then on, and it flew on at the old velocity."""
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.driver.told.clear()
@@ -308,8 +308,8 @@ def test_a_set_point_that_a_driver_fails_at_leaves_the_one_before_it_not_in_forc
     assert set(map(type, bench.driver.told[1:])) == {Velocity}, "a new one is flown"
 
 
-def test_a_place_that_the_vehicle_can_not_fly_to_leaves_no_velocity_in_force() -> None:
-    """It was refused and replaced the velocity, which nobody repeated, and nothing ended."""
+def test_an_unreachable_target_leaves_no_velocity_in_force() -> None:
+    """It was refused but replaced the velocity, which was not repeated, and nothing ended."""
     with Bench(ALL - {"position"}) as bench:
         pilot = bench.airborne()
         pilot.command(Velocity(0.5))
@@ -377,10 +377,10 @@ def timed_out_behind_a_set_point(bench: Bench, pilot: App) -> None:
 def test_a_take_off_that_ends_before_it_shows_is_withdrawn_from_the_vehicle(
     bench: Bench, end: Callable[[Bench, App], None]
 ) -> None:
-    """A call gave up after 4 s, and the vehicle took off at 14.6 s: its driver went on trying."""
+    """A call gave up after 4 s, and the vehicle took off at 14.6 s, because its driver kept trying."""
     pilot = pending(bench)
     end(bench, pilot)
-    assert bench.driver.told[-1] == Land(), "which makes a driver forget it"
+    assert bench.driver.told[-1] == Land(), "this makes a driver forget it"
     assert bench.driver.told.count(Land()) == 1
 
 
@@ -393,10 +393,8 @@ def test_a_take_off_that_ends_before_it_shows_is_withdrawn_from_the_vehicle(
     ],
     ids=["hover", "land", "release"],
 )
-def test_a_take_off_that_a_driver_fails_to_withdraw_is_withdrawn_once_it_can(
-    bench: Bench, end: Callable[[App], object]
-) -> None:
-    """The driver raised once when it was told to land: its take-off went on, although the person had ended it."""
+def test_a_failed_withdrawal_of_a_take_off_is_retried(bench: Bench, end: Callable[[App], object]) -> None:
+    """The driver raised once at the landing: its take-off continued, although the person had ended it."""
     pilot = bench.pilot()
     bench.driver.answers = False
     pilot.command(Takeoff())
@@ -410,13 +408,13 @@ def test_a_take_off_that_a_driver_fails_to_withdraw_is_withdrawn_once_it_can(
 
 
 @pytest.mark.parametrize("action", [Velocity(0.1), Takeoff()], ids=lambda action: action.name)
-def test_a_controller_that_runs_already_leaves_a_take_off_alone(bench: Bench, action: AnyAction) -> None:
+def test_a_running_controller_leaves_a_take_off_alone(bench: Bench, action: AnyAction) -> None:
     pilot = pending(bench)
     bench.run(0.5, lambda: pilot.command(action))
     assert Land() not in bench.driver.told
 
 
-def test_a_take_off_that_shows_is_not_broken_off_by_a_lost_lease(bench: Bench) -> None:
+def test_a_visible_take_off_is_not_aborted_by_a_lost_lease(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.report(state=S.TAKING_OFF)
     bench.tick()
@@ -425,14 +423,14 @@ def test_a_take_off_that_shows_is_not_broken_off_by_a_lost_lease(bench: Bench) -
     assert bench.driver.told == [Takeoff()]
 
 
-def test_an_order_that_shows_whose_the_flight_is_takes_it_at_once(bench: Bench) -> None:
+def test_a_command_that_shows_whose_flight_it_is_takes_it_at_once(bench: Bench) -> None:
     pilot = bench.pilot()
-    bench.driver.report(state=S.FLYING)  # by others, and nothing has looked since
+    bench.driver.report(state=S.FLYING)  # by others, and nothing has checked since
     pilot.command(Hover())
     assert bench.driver.told == [Hover()]
 
 
-def test_a_hover_that_withdraws_a_take_off_is_told_to_be_done(bench: Bench) -> None:
+def test_a_hover_that_withdraws_a_take_off_is_reported_as_completed(bench: Bench) -> None:
     pilot = pending(bench)
     pilot.command(Hover())
     bench.driver.report()
@@ -441,15 +439,15 @@ def test_a_hover_that_withdraws_a_take_off_is_told_to_be_done(bench: Bench) -> N
     assert (outcome.intent, outcome.fate) == (pilot.intent, Fate.COMPLETED)
 
 
-def test_after_a_stop_of_the_motors_nothing_else_is_sent(bench: Bench) -> None:
+def test_nothing_else_is_sent_after_a_motor_stop(bench: Bench) -> None:
     pilot = pending(bench)
     pilot.command(EmergencyStop())
     repeats(bench, pilot, Takeoff())
     assert bench.driver.told == [Takeoff(), EmergencyStop()]
 
 
-def test_what_flies_long_after_a_take_off_was_withdrawn_is_somebody_elses(bench: Bench) -> None:
-    """For 15 s whatever rose was taken for the take-off that a person had ended: another's flight was landed."""
+def test_a_flight_long_after_a_withdrawn_take_off_is_others(bench: Bench) -> None:
+    """For 15 s, anything that rose counted as the take-off that a person had ended: another's flight was landed."""
     pilot = bench.pilot()
     bench.driver.answers = False
     pilot.command(Takeoff())
@@ -463,7 +461,7 @@ def test_what_flies_long_after_a_take_off_was_withdrawn_is_somebody_elses(bench:
     assert bench.driver.told == []
 
 
-def test_nothing_is_withdrawn_from_a_vehicle_that_others_took(bench: Bench) -> None:
+def test_nothing_is_withdrawn_from_a_vehicle_taken_by_others(bench: Bench) -> None:
     pilot = pending(bench)
     bench.driver.left = "STABILIZE"
     bench.driver.answers = True
@@ -484,8 +482,8 @@ BELOW, HIGH = Position(0.0, 0.0, -4.0), Position(0.0, 0.0, 50.0)
 
 
 @pytest.mark.parametrize("place", [BELOW, HIGH], ids=["below the ground", "above the limit"])
-def test_a_refused_place_is_not_flown_to_by_its_own_repeat(bench: Bench, place: Position) -> None:
-    """Judged only while it was new, it stood on the floor 3 s later, with its motors running."""
+def test_a_refused_target_is_not_flown_to_by_its_own_repeat(bench: Bench, place: Position) -> None:
+    """Judged only while it was new, it stood on the floor 3 s later with its motors running."""
     pilot = at_home(bench)
     pilot.command(place)
     assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
@@ -494,16 +492,16 @@ def test_a_refused_place_is_not_flown_to_by_its_own_repeat(bench: Bench, place: 
 
 
 @pytest.mark.parametrize("place", [BELOW, HIGH], ids=["below the ground", "above the limit"])
-def test_a_place_that_is_asked_for_in_a_take_off_is_judged_at_once(bench: Bench, place: Position) -> None:
+def test_a_target_requested_during_a_take_off_is_judged_at_once(bench: Bench, place: Position) -> None:
     pilot = at_home(bench, S.TAKING_OFF)
     pilot.command(place)
     assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
     bench.driver.report(state=S.HOVERING)
     repeats(bench, pilot, place)
-    assert bench.driver.told == [], "the take-off went on, and it hovers"
+    assert bench.driver.told == [], "the take-off continued, and it hovers"
 
 
-def test_a_good_place_that_is_asked_for_in_a_take_off_is_flown_to_after_it(bench: Bench) -> None:
+def test_a_good_target_requested_during_a_take_off_is_flown_to_after_it(bench: Bench) -> None:
     pilot = at_home(bench, S.TAKING_OFF)
     place = Position(1.0, 0.0, 1.0)
     pilot.command(place)
@@ -513,7 +511,7 @@ def test_a_good_place_that_is_asked_for_in_a_take_off_is_flown_to_after_it(bench
     assert [type(action) for action in bench.driver.told] == [Position]
 
 
-def test_a_place_that_came_to_lie_behind_a_zone_in_a_take_off_is_judged_again_when_it_begins(bench: Bench) -> None:
+def test_a_target_behind_a_zone_added_during_a_take_off_is_judged_again(bench: Bench) -> None:
     from tests.support.proxy_bench import write
 
     pilot = at_home(bench, S.TAKING_OFF)
@@ -526,7 +524,7 @@ def test_a_place_that_came_to_lie_behind_a_zone_in_a_take_off_is_judged_again_wh
     assert Position not in map(type, bench.driver.told)
 
 
-def test_a_landing_that_a_driver_fails_at_once_is_tried_again(bench: Bench) -> None:
+def test_a_landing_that_fails_once_is_retried(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.fail = {"apply"}
     pilot.command(Land())
@@ -535,7 +533,7 @@ def test_a_landing_that_a_driver_fails_at_once_is_tried_again(bench: Bench) -> N
     assert bench.driver.told == [Land()]
 
 
-def test_a_reset_that_comes_before_the_emergency_is_known_is_done_when_it_is(bench: Bench) -> None:
+def test_a_reset_before_the_emergency_is_known_is_executed_once_it_is(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(ResetEmergency())
     assert pilot.refusals() == [Refusal.WRONG_STATE]
@@ -544,7 +542,7 @@ def test_a_reset_that_comes_before_the_emergency_is_known_is_done_when_it_is(ben
     assert bench.driver.told == [ResetEmergency()]
 
 
-def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repeat(bench: Bench) -> None:
+def test_a_landing_requested_while_others_land_does_not_take_the_vehicle_by_a_repeat(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.left = "LAND"
     bench.driver.report(state=S.LANDING)
@@ -557,7 +555,7 @@ def test_a_landing_wanted_while_others_land_does_not_take_the_vehicle_by_a_repea
     assert pilot.refusals() == [Refusal.WRONG_STATE]
 
 
-def test_a_take_off_asked_for_again_takes_no_vehicle_from_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_repeated_take_off_takes_no_vehicle_from_others(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """takeoff() waited for GPS, and a safety pilot took off by hand: the next attempt stopped it in the air."""
     begun: list[bool] = []
     apply = bench.driver.apply
@@ -569,7 +567,7 @@ def test_a_take_off_asked_for_again_takes_no_vehicle_from_others(bench: Bench, m
     monkeypatch.setattr(bench.driver, "apply", noted)
     pilot = bench.pilot()
     pilot.command(Takeoff(), automatic=True)
-    assert (begun, bench.driver.told) == ([True], [Takeoff()]), "on the ground it begins"
+    assert (begun, bench.driver.told) == ([True], [Takeoff()]), "on the ground it starts"
     pilot.command(Idle())
     bench.driver.report(state=S.LANDED)
     bench.tick()
@@ -581,10 +579,10 @@ def test_a_take_off_asked_for_again_takes_no_vehicle_from_others(bench: Bench, m
     assert bench.driver.told == []
     assert pilot.refusals()[-1] == Refusal.WRONG_STATE
     pilot.command(Takeoff())
-    assert bench.driver.told == [Hover()], "which a person's own still does"
+    assert bench.driver.told == [Hover()], "a person's own still does"
 
 
-def test_what_became_of_an_intent_is_in_each_sample_until_a_newer_one_comes(bench: Bench) -> None:
+def test_an_outcome_stays_in_feedback_until_a_newer_intent(bench: Bench) -> None:
     pilot = bench.pilot()
     pilot.command(Velocity(0.5))
     for _ in range(3):
@@ -606,8 +604,8 @@ def test_what_became_of_an_intent_is_in_each_sample_until_a_newer_one_comes(benc
     assert (outcome.intent, outcome.fate) == (2, Fate.COMPLETED)
 
 
-def test_a_take_off_is_not_told_to_be_under_way_in_the_air_before_it_is_known_whose_it_is(bench: Bench) -> None:
-    """A pilot's sticks took it on its way up: for 20 ms it flew, by all that was told, as it was asked to."""
+def test_a_take_off_in_the_air_is_not_reported_before_it_is_known_whose_it_is(bench: Bench) -> None:
+    """A pilot's sticks took it on its way up: for 20 ms all reports said that it flew as requested."""
     pilot = pending(bench)
     bench.driver.report(state=S.TAKING_OFF)
     bench.tick()
@@ -616,14 +614,14 @@ def test_a_take_off_is_not_told_to_be_under_way_in_the_air_before_it_is_known_wh
     risen = pilot.last_feedback()
     assert risen.state is S.FLYING
     assert risen.outcome is not None
-    assert risen.outcome.app_id == 0, "nobody's, until the proxy has looked"
+    assert risen.outcome.app_id == 0, "no one's until the proxy has checked"
     bench.tick()
     outcome = pilot.last_feedback().outcome
     assert outcome is not None
     assert (outcome.app_id, outcome.intent, outcome.fate) == (pilot.app_id, pilot.intent, Fate.OTHERS)
 
 
-def test_a_stop_of_the_motors_ends_what_anybody_asked_for(bench: Bench) -> None:
+def test_a_motor_stop_ends_all_requests(bench: Bench) -> None:
     pilot, other = bench.airborne(), bench.join("other")
     pilot.command(Velocity(0.5))
     other.command(EmergencyStop())
@@ -635,7 +633,7 @@ def test_a_stop_of_the_motors_ends_what_anybody_asked_for(bench: Bench) -> None:
     assert outcome.fate is Fate.EMERGENCY
 
 
-def test_a_repeat_of_what_was_done_ends_no_failsafe(bench: Bench) -> None:
+def test_a_repeat_of_a_completed_intent_ends_no_failsafe(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.tick()
     bench.run(0.6)
@@ -645,7 +643,9 @@ def test_a_repeat_of_what_was_done_ends_no_failsafe(bench: Bench) -> None:
     assert bench.driver.told == []
 
 
-def test_a_driver_that_refuses_at_once_says_why_to_a_repeat(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_immediate_refusal_by_the_driver_is_explained_to_a_repeat(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(_: AnyAction, *, new: bool = True) -> AnyAction:
         raise DriverError("no")
 
@@ -657,8 +657,8 @@ def test_a_driver_that_refuses_at_once_says_why_to_a_repeat(bench: Bench, monkey
     assert bench.driver.told == []
 
 
-def test_a_software_take_off_that_the_vehicle_refuses_is_over() -> None:
-    """One that was disarmed before it rose: the software autopilot armed it again, 50 times a second."""
+def test_a_refused_software_take_off_is_over() -> None:
+    """It was disarmed before it rose: the software autopilot armed it again, 50 times a second."""
     with Bench(actions={"attitude"}) as bench:
         bench.driver.answers = False
         bench.driver.report(altitude_m=0.0)

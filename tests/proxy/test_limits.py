@@ -1,4 +1,4 @@
-"""Limits: what is within stays as it is, what is beyond is shortened and told once."""
+"""Limits: values within them stay unchanged, others are shortened and reported once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ numbers = st.floats(-1e6, 1e6)
 altitudes = st.none() | st.floats(-10, 1000)
 
 
-def test_what_is_within_is_the_same_object() -> None:
+def test_a_set_point_within_the_limits_is_the_same_object() -> None:
     for action in (Velocity(1.0, -1.0, 1.0, -1.5), Attitude(0.2, 0.2, -1.0, 1.5)):
         allowed, clamps = LIMITS.clamp(action, 1.0)
         assert allowed is action
@@ -52,7 +52,7 @@ def test_what_is_within_is_the_same_object() -> None:
         ),
     ],
 )
-def test_what_is_beyond_is_shortened(
+def test_set_points_beyond_the_limits_are_shortened(
     action: Velocity | Attitude, altitude: float | None, expected: Velocity | Attitude, limits: list[str]
 ) -> None:
     allowed, clamps = LIMITS.clamp(action, altitude)
@@ -63,12 +63,12 @@ def test_what_is_beyond_is_shortened(
     assert [clamp.limit for clamp in clamps] == limits
 
 
-def test_the_clamp_says_what_was_asked() -> None:
+def test_the_clamp_names_the_requested_value() -> None:
     assert LIMITS.clamp(Velocity(3.0, 4.0), 1.0)[1] == (Clamp("limits.speed", 5.0, 2.0),)
 
 
 @given(numbers, numbers, numbers, numbers, altitudes)
-def test_nothing_leaves_the_limits_and_directions_stay(
+def test_nothing_exceeds_the_limits_and_directions_stay(
     forward: float, left: float, up: float, yaw_rate: float, altitude: float | None
 ) -> None:
     asked = Velocity(forward, left, up, yaw_rate)
@@ -80,7 +80,7 @@ def test_nothing_leaves_the_limits_and_directions_stay(
     if altitude is None or altitude <= LIMITS.altitude + SLACK_M:
         assert allowed.up * up >= 0
     else:
-        assert allowed.up <= max(LIMITS.altitude - altitude, -LIMITS.climb) * (1 - 1e-9), "it comes down"
+        assert allowed.up <= max(LIMITS.altitude - altitude, -LIMITS.climb) * (1 - 1e-9), "it descends"
     assert allowed.forward * left == pytest.approx(allowed.left * forward, rel=1e-6, abs=1e-6)
     if altitude is not None and altitude >= LIMITS.altitude:
         assert allowed.up <= 0
@@ -88,7 +88,7 @@ def test_nothing_leaves_the_limits_and_directions_stay(
         assert allowed == asked
 
 
-def test_an_episode_is_told_once_until_the_limit_was_left_alone_for_a_second() -> None:
+def test_an_episode_is_reported_once_until_the_limit_was_untouched_for_a_second() -> None:
     episodes, clamp = Episodes(), (Clamp("limits.tilt", 1.0, 0.3),)
     second = NS_PER_S
     assert episodes.begun(clamp, 0) == [*clamp]

@@ -1,4 +1,4 @@
-"""The overview: a row of each vehicle of a process, once a second, made once for all proxies that publish it."""
+"""The overview: one row for each vehicle of a process, once a second, built once for all its proxies."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_lone_proxy_has_one_row_a_second_and_one_at_once(bench: Bench) -> None
     assert len(overviews(app)) == 7, "a new subscriber does not wait"
 
 
-def test_nothing_is_made_without_a_subscriber(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_built_without_a_subscriber(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
     real = OverviewRegistry.packets
     monkeypatch.setattr(OverviewRegistry, "packets", lambda self, now_ns: (made.append(now_ns), real(self, now_ns))[1])  # type: ignore[func-returns-value]
@@ -92,7 +92,7 @@ def test_a_row_has_the_pilot_the_failsafe_and_the_last_event(bench: Bench) -> No
     assert row.applications == 3
 
 
-def test_a_vehicle_that_has_said_nothing_yet() -> None:
+def test_a_vehicle_without_any_report_yet() -> None:
     bench = Bench()
     row = bench.proxy.overview._row()
     assert (row.captured_ns, row.state, row.event) == (0, FlightState.UNKNOWN, None)
@@ -112,13 +112,13 @@ def test_proxies_that_share_a_registry_have_one_overview() -> None:
             other.tick()
             shown = [overviews(app)[0] for app in apps]
             assert [row.name for row in shown[0].vehicles] == ["bench", "other"]
-            assert shown[0] == shown[1], "made once"
+            assert shown[0] == shown[1], "built once"
         one.clock.advance(2.0)
         one.tick()
-        assert [row.name for row in overviews(apps[0])[-1].vehicles] == ["bench"], "one that was stopped is gone"
+        assert [row.name for row in overviews(apps[0])[-1].vehicles] == ["bench"], "a stopped one is gone"
 
 
-def test_where_keys_name_drones_a_proxy_shows_only_its_own() -> None:
+def test_with_keys_for_single_drones_a_proxy_shows_only_its_own() -> None:
     class Keyed(MemoryServer):
         @property
         def restricted(self) -> bool:
@@ -137,7 +137,7 @@ def test_where_keys_name_drones_a_proxy_shows_only_its_own() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 200, 1000])
-def test_rows_that_do_not_fit_one_packet_come_in_several(count: int) -> None:
+def test_rows_beyond_one_packet_are_split(count: int) -> None:
     registry = OverviewRegistry()
     rows = [
         VehicleOverview(name=f"drone-{number:04}", uri="u" * 200, link_reason="why " * 60, owner="p" * 64)
@@ -159,7 +159,7 @@ def test_rows_that_do_not_fit_one_packet_come_in_several(count: int) -> None:
 
 
 @given(st.lists(st.integers(0, 11), max_size=60))
-def test_pages_that_are_lost_repeated_or_disordered_make_no_wrong_overview(order: list[int]) -> None:
+def test_lost_repeated_or_reordered_pages_make_no_wrong_overview(order: list[int]) -> None:
     names = [f"d{number}" for number in range(4)]
     sent = [
         Overview(at_ns=0, seq=seq, first=first, total=4, vehicles=(VehicleOverview(name=names[first]),))
@@ -176,7 +176,7 @@ def test_pages_that_are_lost_repeated_or_disordered_make_no_wrong_overview(order
     assert last.seq == 2
 
 
-def test_an_overview_is_not_for_applications_to_send(bench: Bench) -> None:
+def test_applications_may_not_send_an_overview(bench: Bench) -> None:
     app = bench.stranger()
     app.ask(Hello("app", Role.OBSERVER))
     app.end.send(OverviewRegistry().packets(0)[0])

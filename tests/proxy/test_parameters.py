@@ -1,4 +1,4 @@
-"""Parameters: every kind of bad value is refused with what would be right."""
+"""Parameters: every kind of bad value is refused with the allowed ones."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FIXED = P("x.fixed", T.INT, 1, read_only=True)
         (PLACE, (1, 2.0, -5.0), (1.0, 2.0, -5.0)),
     ],
 )
-def test_good_values_come_back_in_the_parameters_type(parameter: Parameter, value: Value, expected: Value) -> None:
+def test_good_values_get_the_parameters_type(parameter: Parameter, value: Value, expected: Value) -> None:
     checked = check(parameter, value)
     assert checked == expected
     assert type(checked) is type(expected)
@@ -64,7 +64,7 @@ def test_good_values_come_back_in_the_parameters_type(parameter: Parameter, valu
         (FIXED, 1, Refusal.READ_ONLY, ["only be read"]),
     ],
 )
-def test_bad_values_are_refused_with_what_would_be_right(
+def test_bad_values_are_refused_with_the_allowed_ones(
     parameter: Parameter, value: Value, code: Refusal, words: list[str]
 ) -> None:
     with pytest.raises(ParameterError) as caught:
@@ -94,7 +94,7 @@ def test_anything_is_checked_or_refused(parameter: Parameter, value: Value) -> N
         assert refused.code in set(Refusal)
 
 
-def test_the_defaults_of_the_proxys_own_are_allowed_and_named_well() -> None:
+def test_the_defaults_of_the_proxys_own_are_allowed_and_well_named() -> None:
     for parameter in OWN:
         if not parameter.read_only:
             assert check(parameter, parameter.value) == parameter.value
@@ -104,7 +104,7 @@ def test_the_defaults_of_the_proxys_own_are_allowed_and_named_well() -> None:
     assert len({parameter.name for parameter in OWN}) == len(OWN)
 
 
-def test_a_number_that_was_set_is_in_force() -> None:
+def test_a_written_number_is_in_force() -> None:
     store = Parameters()
     assert store.number("limits.tilt") == 0.35
     written = store.set("limits.tilt", 0.2)
@@ -140,7 +140,7 @@ def test_the_driver_wins_on_shared_names() -> None:
         store.set("limits.tilt", 0.53)
 
 
-def test_a_driver_with_another_notion_of_a_shared_name_leaves_the_proxys_in_force() -> None:
+def test_a_driver_that_uses_a_shared_name_differently_leaves_the_proxys_in_force() -> None:
     store = Parameters(lambda: [P("limits.tilt", T.TEXT, "steep"), P("limits.climb", T.FLOAT, math.nan)])
     store.refresh()
     assert store.number("limits.tilt") == 0.35
@@ -166,7 +166,7 @@ def test_pages_hold_everything_once_in_order_and_fit_a_packet() -> None:
     assert store.page(10**9).parameters == ()
 
 
-def test_a_parameter_too_large_to_send_is_left_out() -> None:
+def test_a_parameter_too_large_to_send_is_skipped() -> None:
     store = Parameters(lambda: [P("a.huge", T.TEXT, "x" * MAX_PARAMETER), P("a.small", T.INT, 1)])
     store.refresh()
     assert store.left_out == ("a.huge",)
@@ -184,7 +184,7 @@ NUMBERS = [parameter for parameter in OWN if parameter.type is T.FLOAT]
         max_size=12,
     )
 )
-def test_settings_changed_one_by_one_are_those_of_a_store_that_had_all_values_at_once(
+def test_settings_changed_one_by_one_equal_those_set_at_once(
     steps: list[tuple[Parameter, float, str]],
 ) -> None:
     native: dict[str, Parameter] = {}
@@ -214,7 +214,7 @@ def test_settings_changed_one_by_one_are_those_of_a_store_that_had_all_values_at
     assert store.flight_settings() == fresh.flight_settings()
 
 
-def test_settings_that_a_parameter_does_not_concern_are_not_made_anew() -> None:
+def test_unaffected_settings_stay_the_same_object() -> None:
     store = Parameters()
     before = store.flight_settings()
     store.set("alarms.video_age_s", 2.0)

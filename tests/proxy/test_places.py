@@ -1,4 +1,4 @@
-"""Which places can be flown to, how fast, and what the proxy makes of a command to do so."""
+"""Targets: which can be flown to, how fast, and how the proxy handles commands to them."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
     assert flown(decided).speed == pytest.approx(speed)
     (clamp,) = decided.clamps
     assert (clamp.limit, clamp.asked, clamp.applied) == (limit, 9.0, flown(decided).speed)
-    assert airspace.judge(asked, START, NOW).clamps == (), "repeats are not told again"
+    assert airspace.judge(asked, START, NOW).clamps == (), "repeats are not reported again"
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,9 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
         (Position(3.5, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "blocks the straight line, cylinder 2 0 0.5 0 3"),
     ],
 )
-def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, reason: Refusal, words: str) -> None:
+def test_refused_targets_and_their_reasons(
+    asked: Position, feedback: Feedback | None, reason: Refusal, words: str
+) -> None:
     decided = asked_newly(asked, LIMITS, BOXED, feedback)
     assert (decided.action, decided.refusal) == (None, reason)
     assert words in decided.why
@@ -116,7 +118,7 @@ def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, rea
         (Position(0.0, 0.0, 8.0), START, "at most 5.00 m is allowed"),
     ],
 )
-def test_a_known_room_is_not_left(asked: Position, feedback: Feedback, words: str) -> None:
+def test_a_known_room_is_never_left(asked: Position, feedback: Feedback, words: str) -> None:
     airspace = within(LIMITS, ROOM)
     for new in (True, False):
         decided = airspace.judge(asked, feedback, NOW, new=new)
@@ -124,24 +126,24 @@ def test_a_known_room_is_not_left(asked: Position, feedback: Feedback, words: st
         assert words in decided.why
 
 
-def test_no_place_below_the_ground_is_flown_to() -> None:
+def test_no_target_below_the_ground_is_flown_to() -> None:
     into = asked_newly(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, START)
     assert (into.action, into.refusal) == (None, Refusal.OUT_OF_RANGE)
     assert "z is -3 m, which is 3.00 m below the ground under the vehicle" in into.why
-    hill = at(0.0, 0.0, -4.0, altitude_m=2.0)  # it took off farther up
+    hill = at(0.0, 0.0, -4.0, altitude_m=2.0)  # it took off from higher ground
     assert asked_newly(Position(2.0, 0.0, -5.0), LIMITS, ANYWHERE, hill).action is not None
     assert asked_newly(Position(2.0, 0.0, -7.0), LIMITS, ANYWHERE, hill).action is None
     unknown = at(0.0, 0.0, 1.0, altitude_m=None)
     assert asked_newly(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, unknown).action is not None
 
 
-def test_an_old_position_is_waited_for_a_moment() -> None:
+def test_a_fresh_position_is_awaited_for_a_moment() -> None:
     old = at(0, 0, 1, captured_ns=NOW - NS_PER_S)
     for new in (True, False):
         assert within(LIMITS, BOXED).judge(Position(1.0, 0.0, 1.0), old, NOW, new=new) == Verdict()
 
 
-def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -> None:
+def test_repeats_follow_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -> None:
     airspace, high = within(LIMITS, ANYWHERE), Position(0.0, 0.0, 4.0)
     assert flown(airspace.judge(high, START, NOW, new=True)).z == 4.0
     airspace.settings = AirspaceSettings(Limits(altitude=3.0))
@@ -163,8 +165,8 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("asked", "words"), REFUSED, ids=["behind a zone", "too high", "below the ground"])
-def test_a_refused_place_stays_refused_when_it_is_asked_for_again(asked: Position, words: str) -> None:
-    """A place that was refused was flown to by its repeats."""
+def test_a_refused_target_stays_refused_when_repeated(asked: Position, words: str) -> None:
+    """A refused target was flown to by its repeats."""
     airspace = within(LIMITS, Space(zones=BOXED.zones))
     for new in (True, False, False):
         decided = airspace.judge(asked, START, NOW, new=new)
@@ -172,7 +174,7 @@ def test_a_refused_place_stays_refused_when_it_is_asked_for_again(asked: Positio
         assert words in decided.why
 
 
-def test_a_zone_that_is_drawn_across_the_way_ends_it() -> None:
+def test_a_zone_drawn_across_the_path_ends_the_flight() -> None:
     airspace, far = within(LIMITS, ANYWHERE), Position(3.5, 0.1, 1.0)
     assert airspace.judge(far, START, NOW, new=True).action is not None
     airspace.settings = AirspaceSettings(LIMITS, BOXED)
@@ -180,14 +182,14 @@ def test_a_zone_that_is_drawn_across_the_way_ends_it() -> None:
     assert airspace.judge(far, START, NOW).refusal is Refusal.OUT_OF_RANGE
 
 
-def test_what_was_asked_for_between_ends_the_way() -> None:
+def test_a_command_in_between_ends_the_flight() -> None:
     airspace, past = within(LIMITS, BOXED), Position(3.5, 0.1, 1.0)
     assert airspace.judge(past, at(0.0, 3.0, 1.0), NOW, new=True).action is not None
     assert airspace.judge(Velocity(left=-1.0), START, NOW).action is not None
     assert airspace.judge(past, START, NOW).refusal is Refusal.OUT_OF_RANGE
 
 
-def test_a_zone_that_the_vehicle_is_in_can_be_left() -> None:
+def test_a_zone_around_the_vehicle_can_be_left() -> None:
     decided = asked_newly(Position(0.0, 0.0, 1.0), LIMITS, BOXED, at(2.1, 0.0, 1.0))
     assert decided.action is not None
 
@@ -197,20 +199,20 @@ PLACE = st.tuples(COORDINATE, COORDINATE, COORDINATE)
 
 
 @given(PLACE, PLACE, st.sampled_from([Box((-1.0, -2.0, 0.5), (2.0, 1.0, 2.0)), Cylinder(0.5, -0.5, 1.5, 0.0, 2.0)]))
-def test_a_zone_is_in_the_way_if_a_place_of_the_way_is_in_it(
+def test_a_zone_blocks_a_line_if_it_contains_a_point_of_it(
     start: tuple[float, float, float], end: tuple[float, float, float], zone: Box | Cylinder
 ) -> None:
     shares = [step / 200 for step in range(201)]
     places = [tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)) for share in shares]
     if any(zone.holds((x, y, z)) for x, y, z in places):
         assert zone.is_in_the_way(start, end)
-    elif zone.is_in_the_way(start, end):  # it is only touched, between two of the places that were looked at
+    elif zone.is_in_the_way(start, end):  # it is only touched, between two of the sampled positions
         step = math.dist(start, end) / 200
         assert min(abs(zone.wall_outside((x, y, z)).distance) for x, y, z in places) <= step + 1e-9
 
 
 @given(PLACE, PLACE, st.floats(0.1, 20.0))
-def test_what_is_flown_keeps_to_each_limit(
+def test_flown_speeds_stay_within_each_limit(
     start: tuple[float, float, float], end: tuple[float, float, float], speed: float
 ) -> None:
     assume(math.dist(start, end) > 0.1 and end[2] >= 0.0)
@@ -227,14 +229,14 @@ def test_what_is_flown_keeps_to_each_limit(
 
 
 def placed(bench: Bench, **more: Any) -> App:
-    """A pilot whose vehicle hovers 1 m above the origin."""
+    """Return a pilot whose vehicle hovers 1 m above the origin."""
     pilot = bench.airborne()
     bench.driver.report(position_m=(0.0, 0.0, 1.0), yaw_rad=0.0, altitude_m=1.0, **more)
     bench.driver.told.clear()
     return pilot
 
 
-def test_a_vehicle_that_flies_to_places_is_told_the_place_with_its_limits() -> None:
+def test_a_vehicle_with_native_positions_gets_the_target_with_its_limits() -> None:
     with Bench() as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0, 0.5))
@@ -243,10 +245,10 @@ def test_a_vehicle_that_flies_to_places_is_told_the_place_with_its_limits() -> N
         assert pilot.applied[-1].applied == told
         assert pilot.applied[-1].asked == Position(3.0, 0.0, 1.0, 0.5)
         bench.run(0.1)
-        assert bench.driver.told == [told], "it flies there by itself"
+        assert bench.driver.told == [told], "it flies there itself"
 
 
-def test_any_other_is_flown_there_by_velocity() -> None:
+def test_other_vehicles_are_flown_there_by_velocity() -> None:
     with Bench(SOFTWARE) as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0))
@@ -270,7 +272,7 @@ def test_a_vehicle_without_a_position_is_refused_with_the_reason() -> None:
         assert bench.driver.told == [Hover()]
 
 
-def test_a_refused_place_ends_the_set_point_before_it() -> None:
+def test_a_refused_target_ends_the_previous_set_point() -> None:
     with Bench() as bench:
         pilot = placed(bench)
         write(bench, pilot, "safety.box.x_high", 2.0)
@@ -284,8 +286,8 @@ def test_a_refused_place_ends_the_set_point_before_it() -> None:
 
 @pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
 @pytest.mark.parametrize(("asked", "words"), REFUSED, ids=["behind a zone", "too high", "below the ground"])
-def test_a_refused_place_is_not_flown_to_by_its_repeats(actions: frozenset[str], asked: Position, words: str) -> None:
-    """``go_to(wait=False)`` to a place that is refused: its repeats brought the vehicle there, or to the floor."""
+def test_a_refused_target_is_not_flown_to_by_its_repeats(actions: frozenset[str], asked: Position, words: str) -> None:
+    """``go_to(wait=False)`` to a refused target: its repeats brought the vehicle there, or to the floor."""
     with Bench(actions) as bench:
         pilot = placed(bench)
         if "zone" in words or "way" in words:
@@ -300,19 +302,19 @@ def test_a_refused_place_is_not_flown_to_by_its_repeats(actions: frozenset[str],
 
 
 @pytest.mark.parametrize(("asked", "words"), REFUSED[1:], ids=["too high", "below the ground"])
-def test_a_place_is_judged_while_the_vehicle_takes_off(asked: Position, words: str) -> None:
-    """A ``go_to`` during a take-off was held, then flown to by its repeats without having been judged at all."""
+def test_a_target_is_judged_while_the_vehicle_takes_off(asked: Position, words: str) -> None:
+    """A ``go_to`` during a take-off was held, then flown to by its repeats without any judgement."""
     with Bench() as bench:
         pilot = placed(bench, state=FlightState.TAKING_OFF)
         pilot.command(asked)
         assert words in pilot.told(EventKind.COMMAND_REFUSED)[0].text
-        assert bench.driver.told == [], "the take-off goes on"
+        assert bench.driver.told == [], "the take-off continues"
         bench.driver.report(state=FlightState.FLYING)
         pilot.command(asked, repeat=True)
         assert Position not in map(type, bench.driver.told)
 
 
-def test_a_place_that_is_all_right_waits_for_the_end_of_the_take_off() -> None:
+def test_a_valid_target_waits_for_the_end_of_the_take_off() -> None:
     with Bench() as bench:
         pilot = placed(bench, state=FlightState.TAKING_OFF)
         pilot.command(Position(2.0, 0.0, 1.0))
@@ -322,7 +324,7 @@ def test_a_place_that_is_all_right_waits_for_the_end_of_the_take_off() -> None:
         assert isinstance(bench.driver.told[-1], Position)
 
 
-def test_a_position_that_gets_lost_on_the_way_stops_a_vehicle_that_flies_there_itself() -> None:
+def test_a_lost_position_stops_a_vehicle_that_flies_there_itself() -> None:
     with Bench() as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0))
@@ -333,7 +335,7 @@ def test_a_position_that_gets_lost_on_the_way_stops_a_vehicle_that_flies_there_i
 
 
 @pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
-def test_a_vehicle_that_is_not_heard_for_a_moment_stops_and_then_goes_on(actions: frozenset[str]) -> None:
+def test_a_vehicle_that_is_silent_for_a_moment_stops_and_then_continues(actions: frozenset[str]) -> None:
     with Bench(actions) as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0))
@@ -347,7 +349,7 @@ def test_a_vehicle_that_is_not_heard_for_a_moment_stops_and_then_goes_on(actions
         assert pilot.refusals() == []
 
 
-def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
+def test_with_walls_the_proxy_checks_each_step_of_the_path() -> None:
     with Bench() as bench:
         pilot = placed(bench)
         write(bench, pilot, "safety.box.x_high", 3.0)
@@ -356,16 +358,16 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         bench.move((2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
         told = bench.driver.told[-1]
         assert isinstance(told, Velocity)
-        assert told.forward < 0.2, "as slow as any velocity so near to the wall: the way alone allows 0.36 m/s"
+        assert told.forward < 0.2, "as slow as any velocity this near to the wall: the path alone allows 0.36 m/s"
         write(bench, pilot, "safety.box.x_high", 2.7)
         pilot.command(Position(2.9, 0.0, 1.0), repeat=True)
-        assert bench.driver.told[-1] == Hover(), "the place is outside by now"
+        assert bench.driver.told[-1] == Hover(), "the target is outside by now"
         assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
 
 
 @pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
-def test_a_position_that_jumps_is_told_and_the_vehicle_hovers(actions: frozenset[str]) -> None:
-    """An autopilot's estimate that is reset, or motion capture that takes one drone for another: nobody noticed."""
+def test_a_position_jump_is_reported_and_the_vehicle_hovers(actions: frozenset[str]) -> None:
+    """A reset of an autopilot's estimate, or motion capture that confuses two drones, went unnoticed."""
     with Bench(actions) as bench:
         pilot = placed(bench)
         bench.move((0.5, 0.0, 1.0))
@@ -380,14 +382,14 @@ def test_a_position_that_jumps_is_told_and_the_vehicle_hovers(actions: frozenset
         assert event.data["jumped_m"] == pytest.approx(3.0)
         assert bench.driver.told == [Hover()]
         bench.run(0.2, lambda: pilot.command(Position(5.0, 0.0, 1.0), repeat=True))
-        assert bench.driver.told == [Hover()], "it does not go on by itself"
+        assert bench.driver.told == [Hover()], "it does not continue unasked"
         assert set(pilot.refusals()) == {Refusal.NOT_FRESH}
         pilot.command(Position(5.0, 0.0, 1.0))
         assert pilot.applied[-1].applied != Idle(), "a new one is flown"
 
 
-def test_a_position_that_jumps_to_and_fro_is_told_once_a_second() -> None:
-    """Two drones that motion capture takes for one another made 99 events in 2 s."""
+def test_a_position_that_jumps_back_and_forth_is_reported_once_a_second() -> None:
+    """Two drones that motion capture confused made 99 events in 2 s."""
     with Bench() as bench:
         bench.airborne()
         places = itertools.cycle([(0.0, 0.0, 1.0), (5.0, 0.0, 1.0)])
@@ -397,8 +399,8 @@ def test_a_position_that_jumps_to_and_fro_is_told_once_a_second() -> None:
         assert told[0].data["count"] == 1
 
 
-def test_a_landing_that_does_not_show_yet_is_not_broken_off_by_a_position_that_jumps() -> None:
-    """Who lands it because its position jumps would have to do so again after each jump."""
+def test_a_landing_that_does_not_show_yet_is_not_aborted_by_a_position_jump() -> None:
+    """The landing had to be repeated after each jump."""
     with Bench() as bench:
         pilot = bench.airborne()
         bench.driver.report(position_m=(0.0, 0.0, 1.0))
@@ -414,7 +416,7 @@ def test_a_landing_that_does_not_show_yet_is_not_broken_off_by_a_position_that_j
         assert bench.driver.told == [Land(), Land()]
 
 
-def test_a_vehicle_that_is_carried_or_was_not_seen_for_long_does_not_jump() -> None:
+def test_a_carried_or_long_unseen_vehicle_does_not_jump() -> None:
     with Bench() as bench:
         pilot = bench.pilot()
         bench.driver.report(position_m=(0.0, 0.0, 0.0), yaw_rad=0.0)
@@ -429,7 +431,7 @@ def test_a_vehicle_that_is_carried_or_was_not_seen_for_long_does_not_jump() -> N
         assert pilot.told(EventKind.VEHICLE_MESSAGE) == []
 
 
-def test_walls_that_are_set_on_the_way_take_over_from_the_vehicle() -> None:
+def test_walls_added_during_the_flight_take_over_from_the_vehicle() -> None:
     with Bench() as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0))
@@ -440,7 +442,7 @@ def test_walls_that_are_set_on_the_way_take_over_from_the_vehicle() -> None:
 
 
 @pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
-def test_a_pilot_who_falls_silent_on_the_way_gets_the_failsafe(actions: frozenset[str]) -> None:
+def test_a_silent_pilot_on_the_way_gets_the_failsafe(actions: frozenset[str]) -> None:
     with Bench(actions) as bench:
         pilot = placed(bench)
         pilot.command(Position(100.0, 0.0, 1.0))
@@ -451,7 +453,7 @@ def test_a_pilot_who_falls_silent_on_the_way_gets_the_failsafe(actions: frozense
 
 
 @pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.EMERGENCY])
-def test_on_the_ground_it_is_refused(state: FlightState) -> None:
+def test_a_target_is_refused_on_the_ground(state: FlightState) -> None:
     with Bench(SOFTWARE) as bench:
         pilot = placed(bench, state=state)
         pilot.command(Position(0.0, 0.0, 2.0))
@@ -461,7 +463,7 @@ def test_on_the_ground_it_is_refused(state: FlightState) -> None:
 
 
 @pytest.mark.parametrize("wrong", [Position(math.nan, 0.0, 1.0), Position(0.0, 0.0, 1.0, math.inf)])
-def test_numbers_that_are_none_are_refused(wrong: Position) -> None:
+def test_invalid_numbers_are_refused(wrong: Position) -> None:
     with Bench() as bench:
         pilot = placed(bench)
         pilot.command(wrong)
@@ -469,7 +471,7 @@ def test_numbers_that_are_none_are_refused(wrong: Position) -> None:
         assert bench.driver.told == []
 
 
-def test_applications_are_told_what_the_proxy_adds() -> None:
+def test_applications_learn_the_proxys_software_actions() -> None:
     with Bench(SOFTWARE) as bench:
         welcome = bench.stranger().hello("somebody")
         assert welcome.capabilities.software == {"position"}

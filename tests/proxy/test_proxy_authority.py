@@ -1,4 +1,4 @@
-"""Who flies: several applications at one proxy."""
+"""The authority among several applications at one proxy."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ def test_two_pilots_and_three_observers(bench: Bench) -> None:
     assert bench.driver.told[2:] == [Velocity(left=0.5)]
 
     assert bob.ask(ReleaseAuthority()) == Done()
-    granted = alice.told(EventKind.AUTHORITY_GRANTED)[-1]  # the pre-empted one was waiting in line
+    granted = alice.told(EventKind.AUTHORITY_GRANTED)[-1]  # the pre-empted one was waiting in the queue
     assert granted.data["app_id"] == alice.app_id
     assert bench.driver.told[3:] == [Hover()]
     alice.command(Velocity(7.0), repeat=True)  # under the old lease, not even now
     alice.lease = int(granted.data["lease"])  # type: ignore[arg-type]
-    alice.command(Velocity(7.0), repeat=True)  # nor what was asked for under the old lease
+    alice.command(Velocity(7.0), repeat=True)  # nor a request from the old lease
     assert bench.driver.told[3:] == [Hover()]
     alice.command(Velocity(0.25))
     assert bench.driver.told[4:] == [Velocity(0.25)]
@@ -109,7 +109,7 @@ def test_refused_repeats_after_a_failsafe_keep_the_lease(bench: Bench) -> None:
     assert bench.driver.told == [Velocity(0.5), Hover()]
 
 
-def test_a_dead_holder_is_followed_by_the_next_in_line(bench: Bench) -> None:
+def test_the_next_in_the_queue_follows_a_dead_holder(bench: Bench) -> None:
     alice, bob = bench.airborne("alice"), bench.join("bob")
     bob.ask(RequestAuthority(20))
     alice.command(Velocity(0.5))
@@ -123,7 +123,7 @@ def test_a_dead_holder_is_followed_by_the_next_in_line(bench: Bench) -> None:
     assert (left.app, left.data["state"]) == ("alice", "lost")
 
 
-def test_a_landing_is_not_broken_off_by_a_take_over(bench: Bench) -> None:
+def test_a_landing_is_not_aborted_by_a_takeover(bench: Bench) -> None:
     alice, bob = bench.airborne("alice"), bench.join("bob")
     alice.command(Land())
     bob.take_authority(0)
@@ -133,7 +133,7 @@ def test_a_landing_is_not_broken_off_by_a_take_over(bench: Bench) -> None:
     assert bench.driver.told == [Land(), Hover()]
 
 
-def test_a_hover_that_the_driver_did_not_take_at_a_take_over_is_tried_again(bench: Bench) -> None:
+def test_a_rejected_hover_at_a_takeover_is_retried(bench: Bench) -> None:
     alice, bob = bench.airborne("alice"), bench.join("bob")
     alice.command(Velocity(0.5))
     bench.driver.fail = {"apply"}
@@ -145,7 +145,7 @@ def test_a_hover_that_the_driver_did_not_take_at_a_take_over_is_tried_again(benc
     assert bench.driver.told == [Velocity(0.5), Hover()]
 
 
-def test_a_hand_over_on_the_ground_tells_the_vehicle_nothing(bench: Bench) -> None:
+def test_a_takeover_on_the_ground_sends_the_vehicle_nothing(bench: Bench) -> None:
     bench.pilot("alice")
     bench.pilot("bob", 0)
     bench.run(1.0)
@@ -153,7 +153,7 @@ def test_a_hand_over_on_the_ground_tells_the_vehicle_nothing(bench: Bench) -> No
     assert bench.proxy.handler._executor.state is FlightState.LANDED
 
 
-def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: Bench) -> None:
+def test_a_silent_holder_stays_listed_while_its_vehicle_fails_safe(bench: Bench) -> None:
     alice, bob = bench.airborne("alice", 4), bench.join("bob")
     alice.command(Velocity(0.5))
     bench.run(2.1)
@@ -176,7 +176,7 @@ def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: B
     assert bob.told(EventKind.AUTHORITY_PREEMPTED) == []
 
 
-def test_the_name_of_a_silent_holder_goes_with_its_connection(bench: Bench) -> None:
+def test_the_listing_of_a_silent_holder_ends_with_its_connection(bench: Bench) -> None:
     alice, bob = bench.pilot("alice"), bench.join("bob")
     bench.run(2.1)
     assert bob.last_feedback().owner == "alice"
@@ -186,7 +186,7 @@ def test_the_name_of_a_silent_holder_goes_with_its_connection(bench: Bench) -> N
     assert bob.last_feedback().owner is None
 
 
-def test_a_line_of_people_who_said_for_how_long(bench: Bench) -> None:
+def test_a_queue_of_requests_with_times(bench: Bench) -> None:
     alice, bob, carol = bench.airborne("alice"), bench.join("bob"), bench.join("carol")
     now_ns = bench.clock()
     assert alice.ask(RequestAuthority(for_s=60.0)) == AuthorityGranted(alice.lease, now_ns + 60 * 10**9)
@@ -208,7 +208,7 @@ def test_a_line_of_people_who_said_for_how_long(bench: Bench) -> None:
     assert (moved.app, moved.data["position"], moved.data["wait_s"]) == ("carol", 1, 30.0)
 
 
-def test_a_holder_whose_time_is_over_is_told_and_goes_on(bench: Bench) -> None:
+def test_a_holder_whose_time_is_over_is_notified_and_continues(bench: Bench) -> None:
     alice = bench.pilot("alice")
     alice.ask(RequestAuthority(for_s=1.0))
     bench.run(1.5, lambda: alice.command(Idle(), repeat=True))
@@ -257,7 +257,7 @@ def test_a_holder_that_does_not_answer_is_pre_empted_after_the_time_to_ask(bench
     assert preempted.data["granted"] is False
 
 
-def test_a_holder_is_told_when_who_asked_leaves_the_line(bench: Bench) -> None:
+def test_a_holder_is_notified_when_a_request_leaves_the_queue(bench: Bench) -> None:
     alice, bob = bench.pilot("alice"), bench.join("bob")
     bob.ask(RequestAuthority(4, takeover=Takeover.ASK))
     bob.ask(ReleaseAuthority())
@@ -266,7 +266,7 @@ def test_a_holder_is_told_when_who_asked_leaves_the_line(bench: Bench) -> None:
     assert withdrawn.text == "bob no longer asks alice to hand over the authority"
 
 
-def test_who_does_not_wait_can_not_ask_first(bench: Bench) -> None:
+def test_a_request_that_does_not_wait_can_not_ask_first(bench: Bench) -> None:
     bench.pilot("alice")
     bob = bench.join("bob")
     refused = bob.ask(RequestAuthority(4, queue=False, takeover=Takeover.ASK))

@@ -1,4 +1,4 @@
-"""The command path: what is executed, what is refused and told, and how often."""
+"""The command path: what is executed, refused and reported, and how often."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_command_reaches_the_vehicle_and_is_echoed(bench: Bench) -> None:
         ({}, ResetEmergency(), Refusal.WRONG_STATE),
     ],
 )
-def test_bad_commands_are_refused_and_told(
+def test_bad_commands_are_refused_and_reported(
     bench: Bench, changes: dict[str, Any], action: AnyAction, reason: Refusal
 ) -> None:
     pilot = bench.airborne()
@@ -82,7 +82,7 @@ def test_set_points_on_the_ground_are_refused_and_hover_is_harmless(bench: Bench
     assert bench.driver.told == []
 
 
-def test_repeats_of_a_take_off_and_set_points_meanwhile_leave_it_alone(bench: Bench) -> None:
+def test_repeats_of_a_take_off_and_set_points_during_it_leave_it_alone(bench: Bench) -> None:
     pilot = bench.pilot()
     pilot.command(Takeoff())
     pilot.command(Takeoff(), repeat=True)
@@ -98,12 +98,12 @@ def test_land_and_hover_are_obeyed_during_a_take_off(bench: Bench) -> None:
     pilot = bench.pilot()
     pilot.command(Takeoff())
     pilot.command(Land())
-    pilot.command(Velocity(1.0))  # a controller that runs on
+    pilot.command(Velocity(1.0))  # a controller that keeps running
     pilot.command(Takeoff())
     assert bench.driver.told == [Takeoff(), Land(), Hover()]
 
 
-def test_an_action_that_nothing_can_do_is_refused() -> None:
+def test_an_unsupported_action_is_refused() -> None:
     with Bench(actions=()) as bench:
         pilot = bench.pilot()
         pilot.command(Takeoff())
@@ -117,7 +117,7 @@ def test_an_action_that_nothing_can_do_is_refused() -> None:
         assert bench.driver.told == []
 
 
-def test_set_points_beyond_the_limits_are_clamped_and_told_once(bench: Bench) -> None:
+def test_set_points_beyond_the_limits_are_clamped_and_reported_once(bench: Bench) -> None:
     pilot = bench.airborne()
     for _ in range(64):
         bench.clock.advance(1 / 32)
@@ -130,7 +130,7 @@ def test_set_points_beyond_the_limits_are_clamped_and_told_once(bench: Bench) ->
     assert pilot.applied[-1].applied == Velocity(2.0)
 
 
-def test_repeated_refusals_are_told_at_once_and_then_once_a_second(bench: Bench) -> None:
+def test_repeated_refusals_are_reported_at_once_and_then_once_a_second(bench: Bench) -> None:
     pilot, observer = bench.airborne(), bench.join("observer", Role.OBSERVER)
 
     def refused() -> None:
@@ -149,7 +149,7 @@ def test_repeated_refusals_are_told_at_once_and_then_once_a_second(bench: Bench)
     bench.run(2.0)
     assert len(pilot.refusals()) == 4  # the last sum
     pilot.command(Velocity(math.nan))
-    assert len(pilot.refusals()) == 5  # a new one is told at once again
+    assert len(pilot.refusals()) == 5  # a new one is reported at once again
 
 
 @pytest.mark.parametrize("odd", [{}, {"seq": 0}, {"sent_ns": 0}, {"lease": 55}, {"sent_ns": 2**62}, {"sent_ns": 2**63}])
@@ -180,7 +180,7 @@ def test_an_observer_and_a_stranger_stop_nothing(bench: Bench) -> None:
     assert bench.driver.told == []
 
 
-def test_a_driver_that_raises_is_told_and_the_flight_goes_on(bench: Bench) -> None:
+def test_a_raising_driver_is_reported_and_the_flight_continues(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.fail = {"apply"}
     pilot.command(Velocity(0.5))
@@ -193,7 +193,7 @@ def test_a_driver_that_raises_is_told_and_the_flight_goes_on(bench: Bench) -> No
     assert bench.driver.told == [Velocity(0.5), EmergencyStop()]
 
 
-def test_a_landing_that_failed_once_is_not_told_to_be_refused_while_the_vehicle_lands(bench: Bench) -> None:
+def test_a_landing_that_failed_once_is_not_reported_as_refused_while_the_vehicle_lands(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.fail = {"apply"}
     pilot.command(Land())
@@ -211,10 +211,10 @@ def test_a_landing_that_failed_once_is_not_told_to_be_refused_while_the_vehicle_
 
 @pytest.mark.parametrize("state", [FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN])
 @pytest.mark.parametrize("action", [Hover(), Land()])
-def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
+def test_a_pilots_hover_and_landing_are_sent_to_a_silent_vehicle(
     bench: Bench, action: AnyAction, state: FlightState
 ) -> None:
-    """It may hear us all the same. Only the emergency stop went out, which is no way to bring a drone down."""
+    """It may still receive. Only the emergency stop was sent, which is no way to bring a drone down."""
     pilot = bench.airborne()
     bench.tick()
     bench.driver.answers = False
@@ -225,27 +225,25 @@ def test_a_pilots_hover_and_landing_go_to_a_vehicle_that_is_not_heard(
     pilot.command(action)
     assert bench.driver.told == [action]
     bench.run(1.0, lambda: pilot.command(action, repeat=True))
-    assert set(bench.driver.told) == {action}, "its failsafe's hover does not take a landing back"
+    assert set(bench.driver.told) == {action}, "its failsafe's hover does not cancel a landing"
     assert pilot.refusals() == []
     steps = [event.data["step"] for event in pilot.told(EventKind.FAILSAFE)]
     assert steps == (["hover"] if action == Hover() else ["hover", "none"])
     for other in (Velocity(0.5), Takeoff(), ResetEmergency()):
         pilot.command(other)
     pilot.command(action, automatic=True)
-    assert set(bench.driver.told) <= {action, Hover()}, "nothing else, and nothing that nobody decided"
+    assert set(bench.driver.told) <= {action, Hover()}, "nothing else, and nothing that no one decided"
     bench.run(1.1)
     assert set(pilot.refusals()) == {Refusal.VEHICLE_LINK_LOST}
     bench.driver.link(LinkState.UP)
     bench.driver.told.clear()
     pilot.command(action, repeat=True)
-    assert bench.driver.told == [Hover()], "what was asked for in between is not done later"
+    assert bench.driver.told == [Hover()], "requests from in between are not executed later"
 
 
 @pytest.mark.parametrize("state", [FlightState.LANDING, FlightState.LANDED])
-def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before(
-    bench: Bench, state: FlightState
-) -> None:
-    """It was held back: "it lands already", although a hover that it may have heard had broken that off."""
+def test_a_landing_is_sent_to_a_silent_vehicle_whatever_it_showed_before(bench: Bench, state: FlightState) -> None:
+    """It was held back as "already landing", although a hover that it may have received had aborted that."""
     pilot = bench.airborne()
     bench.driver.answers = False
     bench.driver.report(state=state)
@@ -259,8 +257,8 @@ def test_a_landing_goes_to_a_vehicle_that_is_not_heard_whatever_it_showed_before
     assert bench.driver.told == [Land()]
 
 
-def test_a_landing_is_told_to_be_done_only_by_what_was_heard_since(bench: Bench) -> None:
-    """A vehicle that stood when it was heard last was told to have landed as soon as the landing was sent."""
+def test_a_landing_completes_only_by_newer_feedback(bench: Bench) -> None:
+    """A vehicle last seen standing was reported as landed as soon as the landing was sent."""
     pilot = bench.pilot()
     bench.driver.answers = False
     bench.driver.link(LinkState.LOST, "a dead downlink")
@@ -279,8 +277,8 @@ def test_a_landing_is_told_to_be_done_only_by_what_was_heard_since(bench: Bench)
     assert outcome.fate is Fate.COMPLETED
 
 
-def test_a_landing_that_nobody_carries_out_does_not_keep_the_failsafes_hover_back(bench: Bench) -> None:
-    """``land()`` waits and asks by itself: that is refused, and the hover that had failed was not tried again."""
+def test_a_landing_that_is_not_executed_does_not_suppress_the_failsafes_hover(bench: Bench) -> None:
+    """``land()`` waits and repeats automatically: that is refused, and the failed hover was not retried."""
     pilot = bench.airborne()
     bench.driver.answers = False
     bench.driver.report(state=FlightState.FLYING)
@@ -293,13 +291,13 @@ def test_a_landing_that_nobody_carries_out_does_not_keep_the_failsafes_hover_bac
     assert set(bench.driver.told) == {Hover()}
 
 
-def test_a_hover_in_software_is_refused_while_the_vehicle_is_not_heard() -> None:
+def test_a_software_hover_is_refused_while_the_vehicle_is_silent() -> None:
     with Bench({"velocity"}) as bench:
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
         pilot = bench.pilot()
         bench.driver.link(LinkState.LOST)
         pilot.command(Land())
-        assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST], "nothing shows how it moves"
+        assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST], "its motion is unknown"
 
 
 def test_a_lost_vehicle_link_refuses_commands_until_fresh_ones_come(bench: Bench) -> None:
@@ -311,7 +309,7 @@ def test_a_lost_vehicle_link_refuses_commands_until_fresh_ones_come(bench: Bench
     pilot.command(Velocity(0.6))
     assert pilot.refusals() == [Refusal.VEHICLE_LINK_LOST]
     bench.tick()
-    assert bench.driver.told == [Velocity(0.5), Hover()]  # the driver does not go on with it when the link is back
+    assert bench.driver.told == [Velocity(0.5), Hover()]  # the driver does not continue it when the link is back
     feedback = pilot.last_feedback()
     assert (feedback.vehicle_link, feedback.failsafe) == ("lost", "hover")
     bench.driver.link(LinkState.UP)
@@ -323,7 +321,7 @@ def test_a_lost_vehicle_link_refuses_commands_until_fresh_ones_come(bench: Bench
     assert pilot.last_feedback().failsafe == "none"
 
 
-def test_a_link_that_was_lost_and_is_back_between_two_looks_ends_intents_too(bench: Bench) -> None:
+def test_a_link_lost_and_back_between_two_ticks_also_ends_intents(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.driver.link(LinkState.LOST)
@@ -333,7 +331,7 @@ def test_a_link_that_was_lost_and_is_back_between_two_looks_ends_intents_too(ben
     assert bench.driver.told == [Velocity(0.5), Hover()]
 
 
-def test_a_degraded_link_is_still_flown_by(bench: Bench) -> None:
+def test_a_degraded_link_can_be_flown_with(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.link(LinkState.DEGRADED, "few samples")
     pilot.command(Velocity(0.5))
@@ -406,7 +404,7 @@ def test_malformed_packets_at_a_slower_pace_do_not(bench: Bench) -> None:
     [Feedback(captured_ns=1), Event(EventKind.EMERGENCY, "ha", 1), Annotation("me", "front", 1, 4, 3)],
     ids=["feedback", "event", "annotation before Hello"],
 )
-def test_samples_that_are_not_the_applications_to_send_are_malformed(
+def test_samples_that_applications_may_not_send_are_malformed(
     bench: Bench, sample: Feedback | Event | Annotation
 ) -> None:
     witness, stranger = bench.join("witness"), bench.stranger()
@@ -439,9 +437,7 @@ def test_echoes_are_made_only_for_subscribers(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("action", [Hover(), Velocity(), Velocity(up=1.0), Attitude()])
-def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
-    bench: Bench, action: AnyAction
-) -> None:
+def test_above_limits_altitude_the_vehicle_descends_while_it_is_steered(bench: Bench, action: AnyAction) -> None:
     pilot = bench.airborne()
     bench.driver.report(altitude_m=7.4)
     for at in range(5):
@@ -456,11 +452,11 @@ def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
     assert bench.driver.told[-1] == Hover()
 
 
-def test_a_vehicle_refuses_what_the_software_autopilot_would_begin() -> None:
+def test_a_vehicle_refuses_a_software_action() -> None:
     with Bench(actions={"attitude"}) as bench:
         pilot = bench.pilot()
         bench.driver.report(altitude_m=0.0)
-        bench.driver.answers = False  # it goes on to stand
+        bench.driver.answers = False  # it keeps standing
         bench.driver.refuses = "it can't be armed: THROTTLE"
         pilot.command(Takeoff())
         assert pilot.refusals() == [Refusal.WRONG_STATE]  # waiting would not help
@@ -469,7 +465,7 @@ def test_a_vehicle_refuses_what_the_software_autopilot_would_begin() -> None:
         pilot.command(Takeoff())
         bench.run(0.1)
         assert isinstance(bench.driver.told[-1], Attitude)
-        bench.driver.refuses = "it refused to arm"  # from now on, while it still stands
+        bench.driver.refuses = "it refused to arm"  # from now on, while it is still standing
         bench.run(0.1)
         bench.driver.refuses = ""
         bench.driver.told.clear()

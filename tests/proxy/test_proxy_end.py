@@ -1,4 +1,4 @@
-"""The end of a proxy: everything is barred first, then what flies lands, hovers, and is no longer served."""
+"""The end of a proxy: everything is barred first, then a flying vehicle lands or hovers, and is no longer served."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LONG_S = 30.0
 
 @contextmanager
 def ending(end: Callable[[], object]) -> Iterator[threading.Thread]:
-    """On a thread of its own; it must have ended afterwards."""
+    """Run it in a separate thread, which must have ended afterwards."""
     thread = threading.Thread(target=end)
     thread.start()
     yield thread
@@ -47,8 +47,8 @@ def land_told(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("action", [Takeoff(), Velocity(0.5), Hover()])
-def test_while_it_lands_nobody_flies_it(bench: Bench, action: AnyAction) -> None:
-    """Neither its pilot nor a new one, by whatever priority; landing and the emergency stop stay possible."""
+def test_no_one_flies_it_while_it_lands(bench: Bench, action: AnyAction) -> None:
+    """Neither its pilot nor a new one, whatever the priority; landing and emergency stop stay possible."""
     pilot = bench.airborne()
     with ending(lambda: bench.proxy.end(LONG_S)):
         land_told(bench)
@@ -66,8 +66,8 @@ def test_while_it_lands_nobody_flies_it(bench: Bench, action: AnyAction) -> None
     assert bench.driver.closed
 
 
-def test_what_stands_is_not_taken_off_while_another_one_lands() -> None:
-    """Both end by one signal, as those of a simulated world do."""
+def test_a_standing_vehicle_does_not_take_off_while_another_lands() -> None:
+    """Both end on one signal, like those of a simulated world."""
     with Bench() as flying, Bench() as standing:
         flying.airborne()
         pilot = standing.pilot()
@@ -86,8 +86,8 @@ def test_what_stands_is_not_taken_off_while_another_one_lands() -> None:
         assert standing.driver.closed
 
 
-def test_all_are_told_to_land_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight drones of one simulated world were told so 0.2 s apart, one after the other."""
+def test_all_get_their_landing_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Eight drones of one simulated world got their landings 0.2 s apart."""
     with ExitStack() as stack:
         benches = [stack.enter_context(Bench()) for _ in range(4)]
         together = threading.Barrier(len(benches), timeout=LONG_S)
@@ -97,7 +97,7 @@ def test_all_are_told_to_land_at_the_same_time(monkeypatch: pytest.MonkeyPatch) 
 
             def meet(action: AnyAction, apply: Callable[[AnyAction], AnyAction] = apply) -> AnyAction:
                 if isinstance(action, Land):
-                    together.wait()  # broken, and none lands, unless all of them are told
+                    together.wait()  # broken, so that none lands, unless all get the command
                 return apply(action)
 
             monkeypatch.setattr(bench.driver, "_apply", meet)
@@ -108,7 +108,7 @@ def test_all_are_told_to_land_at_the_same_time(monkeypatch: pytest.MonkeyPatch) 
                 bench.driver.report(state=FlightState.LANDED)
 
 
-def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_close_keeps_no_other_proxy_from_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     with Bench() as broken, Bench() as good:
 
         def fail() -> None:
@@ -123,8 +123,8 @@ def test_one_that_fails_to_close_keeps_no_other_one_from_its_end(monkeypatch: py
 
 
 @pytest.mark.parametrize("at", ["the first begins", "all have begun"])
-def test_ctrl_c_keeps_none_of_several_from_its_end(monkeypatch: pytest.MonkeyPatch, at: str) -> None:
-    """Raised while they were told one after the other, it left the rest in the air. It only shortens the wait."""
+def test_ctrl_c_keeps_no_proxy_from_its_end(monkeypatch: pytest.MonkeyPatch, at: str) -> None:
+    """Raised while the landings were sent one by one, it left the rest in the air. It only shortens the wait."""
     with ExitStack() as stack:
         benches = [stack.enter_context(Bench()) for _ in range(3)]
         for bench in benches:
@@ -150,7 +150,7 @@ def test_ctrl_c_keeps_none_of_several_from_its_end(monkeypatch: pytest.MonkeyPat
             assert bench.driver.closed
 
 
-def test_those_that_end_in_turn_are_told_to_land_before_the_first_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_proxies_that_end_in_turn_all_land_before_the_first_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a thread for each, the second flew on while the first landed."""
     with Bench() as first, Bench() as second:
         for bench in (first, second):
@@ -170,7 +170,7 @@ def test_those_that_end_in_turn_are_told_to_land_before_the_first_ends(monkeypat
                 bench.driver.report(state=FlightState.LANDED)
 
 
-def test_where_there_is_no_thread_for_all_the_rest_ends_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_threads_for_all_the_rest_end_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     with Bench() as first, Bench() as second:
         first.airborne()
         second.airborne()
@@ -196,10 +196,8 @@ def broken(*_: object) -> None:
     "step",
     ["handler.leave_hovering", "overview.end", "_requests.stop", "publisher.streams.end", "server.stop"],
 )
-def test_a_step_of_the_end_that_fails_keeps_no_other_one_from_being_taken(
-    monkeypatch: pytest.MonkeyPatch, step: str
-) -> None:
-    """The driver stayed open, and the vehicle in the air was told nothing."""
+def test_a_failed_step_of_the_end_skips_no_other_step(monkeypatch: pytest.MonkeyPatch, step: str) -> None:
+    """The driver stayed open, and the flying vehicle got no command."""
     with Bench() as bench:
         bench.airborne()
         stopped: list[str] = []
@@ -222,7 +220,7 @@ def test_a_step_of_the_end_that_fails_keeps_no_other_one_from_being_taken(
         assert step == "handler.leave_hovering" or bench.driver.told[-1] == Hover()
 
 
-def test_a_landing_at_the_end_that_fails_leaves_it_hovering(
+def test_a_failed_landing_at_the_end_leaves_it_hovering(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bench.airborne()
@@ -233,10 +231,10 @@ def test_a_landing_at_the_end_that_fails_leaves_it_hovering(
     assert "the landing at the end of proxy bench failed" in caplog.text
 
 
-def test_what_fails_where_a_proxy_is_given_up_goes_to_the_log(
+def test_failures_of_an_abandoned_proxy_go_to_the_log(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An exception in one of its threads ended in the interpreter's hook, or kept the rest from being given back."""
+    """An exception in one of its threads ended in the interpreter's hook, or prevented the release of the rest."""
     monkeypatch.setattr(bench.proxy._requests, "stop", broken)
     monkeypatch.setattr(bench.server, "stop", broken)
     bench.proxy.end(reason="its driver hangs", hangs=True)
@@ -246,8 +244,8 @@ def test_what_fails_where_a_proxy_is_given_up_goes_to_the_log(
     bench.server.stop()
 
 
-def test_a_take_off_that_was_just_asked_for_is_called_off(bench: Bench) -> None:
-    """The vehicle does not show it yet; where it rises all the same, it is landed."""
+def test_a_recent_take_off_is_cancelled(bench: Bench) -> None:
+    """The vehicle does not show it yet; if it rises nevertheless, it is landed."""
     bench.driver.answers = False
     pilot = bench.pilot()
     pilot.command(Takeoff())
@@ -262,7 +260,7 @@ def test_a_take_off_that_was_just_asked_for_is_called_off(bench: Bench) -> None:
     assert set(bench.driver.told) == {Land()}
 
 
-def test_a_take_off_that_is_called_off_and_never_shows_is_waited_for_a_moment(bench: Bench) -> None:
+def test_a_cancelled_take_off_is_watched_for_a_moment(bench: Bench) -> None:
     bench.driver.answers = False
     bench.pilot().command(Takeoff())
     with ending(lambda: bench.proxy.end(LONG_S)) as thread:
@@ -272,27 +270,27 @@ def test_a_take_off_that_is_called_off_and_never_shows_is_waited_for_a_moment(be
     assert set(bench.driver.told) == {Takeoff(), Land()}
 
 
-def test_what_has_not_landed_in_time_goes_on_to_land_or_hovers(bench: Bench) -> None:
+def test_a_vehicle_not_landed_in_time_keeps_landing_or_hovers(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False
     assert not bench.proxy.end(0.05, unless_flying=True)
     pilot.command(Velocity(0.5))
-    assert pilot.refusals() == [Refusal.WRONG_STATE], "it is served, and lands"
+    assert pilot.refusals() == [Refusal.WRONG_STATE], "it is still served, and lands"
     assert not bench.proxy.end(0.05)
-    assert bench.driver.told[-1] == Hover(), "it never showed that it lands"
+    assert bench.driver.told[-1] == Hover(), "it never showed a landing"
     assert bench.driver.closed
 
 
-def test_a_second_signal_waits_no_longer(bench: Bench) -> None:
+def test_a_second_signal_ends_the_wait(bench: Bench) -> None:
     bench.airborne()
     hurry = threading.Event()
     with ending(lambda: bench.proxy.end(LONG_S, hurry=hurry.is_set)):
         land_told(bench)
         hurry.set()
-    assert bench.driver.told == [Land()], "a landing in progress goes on"
+    assert bench.driver.told == [Land()], "a landing in progress continues"
 
 
-def test_a_vehicle_that_does_not_hover_by_itself_is_landed_at_a_second_signal_too() -> None:
+def test_a_vehicle_without_native_hover_is_landed_even_at_a_second_signal() -> None:
     with Bench({"velocity"}) as bench:
         bench.driver.answers = False
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
@@ -306,7 +304,7 @@ def test_a_vehicle_that_does_not_hover_by_itself_is_landed_at_a_second_signal_to
 
 
 @pytest.mark.parametrize("native", ["velocity", "attitude"])
-def test_a_vehicle_that_does_not_hover_by_itself_is_left_at_a_standstill(native: str) -> None:
+def test_a_vehicle_without_native_hover_is_left_at_a_standstill(native: str) -> None:
     with Bench({native}) as bench:
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
         pilot = bench.pilot()
@@ -318,7 +316,7 @@ def test_a_vehicle_that_does_not_hover_by_itself_is_left_at_a_standstill(native:
         assert bench.driver.told[-1] == (Velocity() if native == "velocity" else Attitude())
 
 
-def test_a_landing_in_software_goes_on_when_the_proxy_ends() -> None:
+def test_a_software_landing_continues_when_the_proxy_ends() -> None:
     with Bench({"velocity"}) as bench:
         bench.driver.report(altitude_m=2.0, state=FlightState.FLYING)
         bench.pilot().command(Land())
@@ -328,7 +326,7 @@ def test_a_landing_in_software_goes_on_when_the_proxy_ends() -> None:
 
 
 def test_nothing_is_flown_while_the_end_waits_for_a_slow_request() -> None:
-    """Nobody guards the flight any more by then."""
+    """By then, nothing guards the flight."""
     done = threading.Event()
     with Bench(parameters=[Parameter("slow", ParameterType.FLOAT, 1.0)]) as bench:
         pilot = bench.airborne()
@@ -345,7 +343,7 @@ def test_nothing_is_flown_while_the_end_waits_for_a_slow_request() -> None:
             done.set()
 
 
-def test_an_end_that_lands_nothing_bars_everything_first_as_well(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_without_a_landing_also_bars_everything_first(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(1.0))
     barred: list[str] = []
@@ -369,8 +367,8 @@ def refused(app: App) -> list[object]:
     return [event.data["reason"] for event in app.events if event.kind is EventKind.COMMAND_REFUSED]
 
 
-def test_what_was_left_hovering_is_not_landed_by_who_leaves_then_nor_by_a_late_tick(bench: Bench) -> None:
-    """A tick that waited meanwhile, and an application that goes as it hears of the end, made the ladder land it."""
+def test_a_vehicle_left_hovering_is_not_landed_by_departures_or_a_late_tick(bench: Bench) -> None:
+    """A late tick, and an application that left when the end was announced, made the ladder land it."""
     pilot = bench.airborne()
     bench.proxy.handler.leave_hovering(bench.clock())
     assert bench.driver.told[-1] == Hover()

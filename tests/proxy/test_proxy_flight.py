@@ -1,4 +1,4 @@
-"""Whether a vehicle flies that is steered in software: what shows it, and what is done until it does."""
+"""Deciding whether a software-steered vehicle flies, and what the proxy does until it knows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ATTITUDE = {"idle", "attitude", "emergency_stop", "reset_emergency"}
 
 
 class Lift:
-    """A vehicle that does what it is told at 50 Hz, and says so unless it is out of reach. It knows no take-off."""
+    """A vehicle that follows its set-points at 50 Hz, and reports so unless out of reach. It has no take-off."""
 
     def __init__(self, actions: set[str], *, says: bool) -> None:
         self.bench = Bench(actions)
@@ -42,7 +42,7 @@ class Lift:
         return told.up if isinstance(told, Velocity) else told.climb if isinstance(told, Attitude) else 0.0
 
     def fly(self) -> None:
-        if self.heard:  # else it stays where it is
+        if self.heard:  # otherwise it stays where it is
             self.height = max(0.0, self.height + self.climb * 0.02)
             self.report()
 
@@ -85,8 +85,8 @@ def lift(request: pytest.FixtureRequest) -> Iterator[Lift]:
         yield lift
 
 
-def test_a_landing_lasts_while_the_vehicle_is_out_of_reach(lift: Lift) -> None:
-    """Its pilot is gone, and so is the link: it hangs where it is, and the ladder lands it when it is heard again."""
+def test_a_landing_continues_while_the_vehicle_is_out_of_reach(lift: Lift) -> None:
+    """Its pilot is gone, and so is the link: it hangs in place, and the ladder lands it when it is received again."""
     lift.hovering().end.close()
     lift.hear(False)
     lift.run(30.0)
@@ -116,8 +116,8 @@ def test_a_gap_in_the_feedback_late_in_a_long_landing_does_not_end_it(lift: Lift
     assert (lift.told, lift.height) == (FlightState.LANDED, 0.0)
 
 
-def test_what_others_landed_stands_and_is_not_taken_off_by_itself() -> None:
-    """A pilot takes the sticks, lands and disarms; later on somebody asks for a take-off, and gives the sticks away."""
+def test_a_vehicle_landed_by_others_does_not_take_off_unasked() -> None:
+    """A pilot takes the sticks, lands and disarms; later someone requests a take-off, and hands the sticks back."""
     lift = Lift(ATTITUDE, says=True)
     driver = lift.bench.driver
     with lift.bench:
@@ -128,7 +128,7 @@ def test_what_others_landed_stands_and_is_not_taken_off_by_itself() -> None:
         assert lift.bench.proxy.handler.flight.others
         lift.height = 0.0
         driver.told.clear()
-        lift.run(2.0, pilot)  # its driver says that it stands, as it flies past it
+        lift.run(2.0, pilot)  # its driver reports that it stands, as someone flies past the driver
         assert lift.told == FlightState.FLYING
         driver.left = ""
         lift.run(2.0, pilot)
@@ -149,7 +149,7 @@ def test_a_drifting_altimeter_makes_no_flight_of_a_vehicle_that_reports_to_stand
 
 
 def test_a_vehicle_that_reports_to_fly_flies(lift: Lift) -> None:
-    """Also one that lands itself in nobody's mind: its driver's word is believed, and a hover is no take-off."""
+    """Also one that lands itself on no one's command: its driver's report counts, and a hover is not a take-off."""
     lift.report()
     pilot = lift.bench.pilot()
     lift.bench.driver.report(altitude_m=0.0, state=FlightState.FLYING)
@@ -167,8 +167,8 @@ def sleep(bench: Bench, seconds: float) -> None:
     bench.slept_ns += round(seconds * 1e9)
 
 
-def test_what_was_asked_for_before_the_computer_slept_is_not_done_afterwards(bench: Bench) -> None:
-    """The program slept with it, and repeats its velocity as the first thing of all."""
+def test_requests_from_before_a_sleep_of_the_computer_are_not_executed(bench: Bench) -> None:
+    """The program slept with it, and first of all repeats its velocity."""
     pilot = bench.airborne()
     pilot.command(Velocity(1.0))
     sleep(bench, 1.0)
@@ -180,8 +180,8 @@ def test_what_was_asked_for_before_the_computer_slept_is_not_done_afterwards(ben
     assert "slept for 1.0 s" in bench.published(EventKind.VEHICLE_MESSAGE)[-1].text
 
 
-def test_a_command_that_waited_while_the_computer_slept_is_as_old_as_it_is(bench: Bench) -> None:
-    """It was received only now, and never before."""
+def test_a_command_that_waited_during_the_sleep_has_its_true_age(bench: Bench) -> None:
+    """It was received only now."""
     pilot = bench.airborne()
     sent_ns = bench.clock()
     sleep(bench, 600.0)
@@ -202,7 +202,7 @@ def test_silence_counts_while_the_computer_sleeps(bench: Bench) -> None:
     assert bench.proxy.handler.authority.holder is None
 
 
-def test_what_flies_after_a_long_sleep_may_be_somebody_elses(bench: Bench) -> None:
+def test_a_flight_after_a_long_sleep_may_be_others(bench: Bench) -> None:
     bench.airborne()
     sleep(bench, 3600.0)
     bench.run(6.0)
@@ -210,12 +210,12 @@ def test_what_flies_after_a_long_sleep_may_be_somebody_elses(bench: Bench) -> No
     assert bench.proxy.handler.flight.others
 
 
-def test_the_computers_own_sleep_is_known_where_it_says_so() -> None:
+def test_the_computers_own_sleep_is_measured() -> None:
     assert -(10**9) < slept_ns() < 10 * 365 * 24 * 3600 * 10**9
 
 
-def test_who_flies_is_told_when_a_vehicle_that_flies_by_attitude_drifts() -> None:
-    """It went level where its velocity went missing, and flew on at whatever speed it had, without a word."""
+def test_the_pilot_is_told_when_an_attitude_vehicle_drifts() -> None:
+    """It went level when its velocity was lost, and silently flew on at its speed."""
     bench = Bench(ATTITUDE)
     bench.driver.answers = False
     with bench.proxy:

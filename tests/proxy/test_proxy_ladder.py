@@ -1,4 +1,4 @@
-"""The ladder in the whole proxy: exact times, what is told, and who may end it."""
+"""The failsafe ladder in the whole proxy: exact times, reports, and who may end it."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_a_silent_pilot(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("leaves", ["killed", "releases"])
-def test_a_landing_that_does_not_show_yet_goes_on_without_its_pilot(bench: Bench, leaves: str) -> None:
-    """``land()`` as the last line of a program: it hovered first, and landed 5 s later."""
+def test_a_landing_that_does_not_show_yet_continues_without_its_pilot(bench: Bench, leaves: str) -> None:
+    """``land()`` as the last line of a program: the vehicle hovered first, and landed 5 s later."""
     pilot, witness = bench.airborne(), bench.join("witness")
     bench.driver.answers = False
     pilot.command(Land())
@@ -73,8 +73,8 @@ def test_a_landing_that_does_not_show_yet_goes_on_without_its_pilot(bench: Bench
     assert bench.driver.told == [], "it is over"
 
 
-def test_the_ladder_goes_on_to_ask_for_its_landing_while_the_vehicle_is_not_heard(bench: Bench) -> None:
-    """A driver keeps a landing for 3 s. Where it had shown before the link was lost, nobody asked again."""
+def test_the_ladder_keeps_repeating_its_landing_while_the_vehicle_is_silent(bench: Bench) -> None:
+    """A driver keeps a landing for 3 s. After it had shown before the loss of the link, it was not repeated."""
     bench.airborne()
     bench.run(5.1)
     assert bench.driver.told[-1] == Land()
@@ -96,14 +96,14 @@ def test_the_ladder_goes_on_to_ask_for_its_landing_while_the_vehicle_is_not_hear
 
 @pytest.mark.parametrize("noticed", [True, False])
 def test_a_pilots_landing_survives_a_broken_link(bench: Bench, noticed: bool) -> None:
-    """It ended with the link, the vehicle was told to hover when that was back, and the pilot waited for ever."""
+    """It ended with the link, the vehicle got a hover when that was back, and the pilot waited for ever."""
     pilot, witness = bench.airborne(), bench.join("witness")
     bench.driver.answers = False
     pilot.command(Land())
     bench.driver.link(LinkState.LOST, "a dead downlink")
     if noticed:
         bench.run(4.0, lambda: pilot.command(Idle(), repeat=True))
-        assert len(bench.driver.told) > 10, "a driver keeps it for 3 s only"
+        assert len(bench.driver.told) > 10, "a driver keeps it for only 3 s"
     bench.driver.link(LinkState.UP)
     bench.driver.report(state=FlightState.HOVERING)
     bench.run(0.6, lambda: pilot.command(Idle(), repeat=True))
@@ -111,7 +111,7 @@ def test_a_pilots_landing_survives_a_broken_link(bench: Bench, noticed: bool) ->
     bench.driver.told.clear()
     bench.run(0.6, lambda: pilot.command(Idle(), repeat=True))
     assert len(bench.driver.told) >= 2
-    assert set(bench.driver.told) == {Land()}, "it is in the air, and nobody wants anything else"
+    assert set(bench.driver.told) == {Land()}, "it is in the air, and no one wants anything else"
     assert steps(witness) == []
     outcome = pilot.last_feedback().outcome
     assert outcome is not None
@@ -141,8 +141,8 @@ def be_patient(app: App) -> None:
 
 
 @pytest.mark.parametrize("state", [FlightState.FLYING, FlightState.LANDING, FlightState.LANDED, FlightState.UNKNOWN])
-def test_a_landing_asked_for_in_the_dark_is_given_up_after_a_minute(bench: Bench, state: FlightState) -> None:
-    """A vehicle that was heard again ten minutes later was landed at once: by then it may be another flight."""
+def test_a_landing_requested_during_silence_is_abandoned_after_a_minute(bench: Bench, state: FlightState) -> None:
+    """A vehicle back after ten minutes was landed at once: by then it may be on another flight."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -167,12 +167,12 @@ def test_a_landing_asked_for_in_the_dark_is_given_up_after_a_minute(bench: Bench
     assert Land() not in bench.driver.told
     assert len(messages(pilot, "landing_given_up")) == 1
     pilot.command(Land())
-    assert bench.driver.told[-1] == Land(), "asked for anew, it lands"
+    assert bench.driver.told[-1] == Land(), "requested again, it lands"
 
 
 @pytest.mark.parametrize("ends", ["stays", "leaves", "hovers"])
-def test_a_landing_that_is_given_up_is_not_broken_off(bench: Bench, ends: str) -> None:
-    """A hover followed: what lands from high up, and hears although it is not heard, hung in the air from then on."""
+def test_an_abandoned_landing_is_not_aborted(bench: Bench, ends: str) -> None:
+    """A hover followed: a vehicle landing from high up that received but was not received hung in the air."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -192,7 +192,7 @@ def test_a_landing_that_is_given_up_is_not_broken_off(bench: Bench, ends: str) -
         for _ in range(8):
             bench.clock.advance(1.0)
             bench.tick()
-        assert set(bench.driver.told) == {Land()}, "with nobody there it is landed"
+        assert set(bench.driver.told) == {Land()}, "without a pilot it is landed"
     elif ends == "hovers":
         pilot.command(Hover())
         in_the_dark(bench, 1, pilot, Hover())
@@ -200,10 +200,10 @@ def test_a_landing_that_is_given_up_is_not_broken_off(bench: Bench, ends: str) -
 
 
 @pytest.mark.parametrize("asked", ["velocity", "hover"])
-def test_a_hover_that_nothing_shows_is_given_up_after_a_minute_and_what_is_found_later_is_left_alone(
+def test_a_hover_that_nothing_shows_is_abandoned_after_a_minute_and_later_flights_are_left_alone(
     bench: Bench, asked: str
 ) -> None:
-    """A link that has no answer and a pilot who stays: hovers went to whatever flew there, for ever."""
+    """On a link without answers, with a pilot who stayed, hovers went to whatever flew there, for ever."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -228,10 +228,10 @@ def test_a_hover_that_nothing_shows_is_given_up_after_a_minute_and_what_is_found
     assert bench.driver.told == []
     assert bench.proxy.handler.flight.whose is Whose.OTHERS
     pilot.command(Hover())
-    assert bench.driver.told == [Hover()], "asked for anew, it is taken"
+    assert bench.driver.told == [Hover()], "requested again, it is accepted"
 
 
-def test_a_hover_that_is_asked_for_anew_in_the_dark_is_its_pilots_for_another_minute(bench: Bench) -> None:
+def test_a_hover_requested_again_during_silence_is_its_pilots_for_another_minute(bench: Bench) -> None:
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -249,8 +249,8 @@ def test_a_hover_that_is_asked_for_anew_in_the_dark_is_its_pilots_for_another_mi
     assert bench.driver.told[-1] == Hover()
 
 
-def test_a_hover_that_is_given_up_ends_in_a_landing_when_its_pilot_leaves(bench: Bench) -> None:
-    """It may hear, although it is not heard."""
+def test_an_abandoned_hover_ends_in_a_landing_when_its_pilot_leaves(bench: Bench) -> None:
+    """It may receive, although it is not received."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -268,7 +268,7 @@ def test_a_hover_that_is_given_up_ends_in_a_landing_when_its_pilot_leaves(bench:
 
 
 def _given_up(bench: Bench) -> App:
-    """A pilot whose vehicle was not heard for 65 s, so that its hover was given up."""
+    """Return a pilot whose vehicle was silent for 65 s, so that its hover was abandoned."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -279,7 +279,7 @@ def _given_up(bench: Bench) -> App:
     return pilot
 
 
-def test_a_landing_asked_for_after_the_hover_was_given_up_goes_on_when_the_link_is_back(bench: Bench) -> None:
+def test_a_landing_requested_after_an_abandoned_hover_continues_when_the_link_is_back(bench: Bench) -> None:
     pilot = _given_up(bench)
     bench.driver.refuses = "busy"
     pilot.command(Land())
@@ -292,7 +292,7 @@ def test_a_landing_asked_for_after_the_hover_was_given_up_goes_on_when_the_link_
     assert set(bench.driver.told) == {Land()}
 
 
-def test_the_ladders_landing_after_a_hover_that_was_given_up_goes_on_when_the_link_is_back(bench: Bench) -> None:
+def test_the_ladders_landing_after_an_abandoned_hover_continues_when_the_link_is_back(bench: Bench) -> None:
     pilot = _given_up(bench)
     for name in ("failsafe.hover_after_s", "failsafe.land_after_s"):
         pilot.ask(SetParameter(name, 5.0, pilot.lease))
@@ -308,7 +308,7 @@ def test_the_ladders_landing_after_a_hover_that_was_given_up_goes_on_when_the_li
     assert bench.proxy.handler.flight.ours
 
 
-def test_a_link_that_comes_back_while_the_ladder_looks_leaves_what_is_found_to_others(
+def test_a_link_that_returns_during_the_ladders_check_leaves_the_flight_to_others(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pilot = _given_up(bench)
@@ -330,8 +330,8 @@ def test_a_link_that_comes_back_while_the_ladder_looks_leaves_what_is_found_to_o
 
 
 @pytest.mark.parametrize("stays", [True, False])
-def test_what_is_found_after_a_landing_was_given_up_is_left_alone(bench: Bench, stays: bool) -> None:
-    """One hover went to whatever was found by then."""
+def test_a_flight_found_after_an_abandoned_landing_is_left_alone(bench: Bench, stays: bool) -> None:
+    """Once, a hover was sent to whichever vehicle had been found by then."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -352,7 +352,7 @@ def test_what_is_found_after_a_landing_was_given_up_is_left_alone(bench: Bench, 
 
 
 @pytest.mark.parametrize("pilot_stays", [True, False])
-def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: Bench, pilot_stays: bool) -> None:
+def test_a_landing_in_progress_survives_a_broken_link_for_a_minute(bench: Bench, pilot_stays: bool) -> None:
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -363,7 +363,7 @@ def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: 
         pilot.ask(ReleaseAuthority())
     bench.driver.told.clear()
     in_the_dark(bench, 59, pilot, Idle())
-    assert bench.driver.told == [Land()] * 59, "a driver keeps it for 3 s only"
+    assert bench.driver.told == [Land()] * 59, "a driver keeps it for only 3 s"
     assert bench.published(EventKind.VEHICLE_MESSAGE) == []
     in_the_dark(bench, 1, pilot, Idle())
     bench.driver.told.clear()
@@ -378,10 +378,8 @@ def test_a_landing_that_is_under_way_outlives_a_broken_link_for_a_minute(bench: 
 
 @pytest.mark.parametrize("native", [ALL, ALL - {"land"}], ids=["native", "software"])
 @pytest.mark.parametrize("found", ["flying", "landed"])
-def test_the_failsafes_own_landing_is_given_up_after_a_minute_in_which_nothing_was_heard(
-    native: frozenset[str], found: str
-) -> None:
-    """It asked for ever: somebody else's vehicle that was found minutes later was landed."""
+def test_the_failsafes_own_landing_is_abandoned_after_a_minute_of_silence(native: frozenset[str], found: str) -> None:
+    """It repeated for ever: another vehicle found minutes later was landed."""
     with Bench(native) as bench:
         pilot, witness = bench.airborne(), bench.join("witness")
         bench.driver.answers = False
@@ -410,14 +408,14 @@ def test_the_failsafes_own_landing_is_given_up_after_a_minute_in_which_nothing_w
         bench.driver.link(LinkState.UP)
         bench.driver.report(state=FlightState.FLYING if found == "flying" else FlightState.LANDED)
         bench.run(10.0, lambda: bench.driver.report())
-        assert bench.driver.told == [], "whose it is by now, nobody here knows"
+        assert bench.driver.told == [], "no one here knows whose it is by now"
         assert told().count("landing_given_up") == 1
         assert steps(witness)[-1][0] == "none"
         if found == "flying":
             assert bench.proxy.handler.flight.whose is Whose.OTHERS
 
 
-def test_one_that_only_the_software_can_fly_is_given_up_as_well() -> None:
+def test_a_software_flown_vehicle_is_abandoned_as_well() -> None:
     with Bench({"velocity"}) as software:
         software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
         pilot = software.pilot()
@@ -436,8 +434,8 @@ def test_one_that_only_the_software_can_fly_is_given_up_as_well() -> None:
 
 
 @pytest.mark.parametrize("leaves", ["falls silent", "is killed", "releases"])
-def test_no_hover_breaks_off_a_landing_that_its_pilot_asked_for(bench: Bench, leaves: str) -> None:
-    """Also not the one of the ladder, nor that between two pilots."""
+def test_no_hover_aborts_a_landing_requested_by_its_pilot(bench: Bench, leaves: str) -> None:
+    """Neither the ladder's, nor that between two pilots."""
     pilot = bench.airborne()
     pilot.command(Land())
     assert bench.driver.now.state is FlightState.LANDING
@@ -453,7 +451,7 @@ def test_no_hover_breaks_off_a_landing_that_its_pilot_asked_for(bench: Bench, le
 
 
 def landing_in_the_dark(bench: Bench) -> App:
-    """A pilot who asked for a landing before the link broke; by now it is back, and the vehicle hovers."""
+    """Return a pilot who requested a landing before the link broke; by now it is back, and the vehicle hovers."""
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
@@ -473,7 +471,7 @@ def test_a_newer_command_ends_such_a_landing(bench: Bench, action: AnyAction) ->
     assert Land() not in bench.driver.told
 
 
-def test_a_newer_command_ends_such_a_landing_also_where_it_is_refused(bench: Bench) -> None:
+def test_even_a_refused_newer_command_ends_such_a_landing(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
@@ -488,15 +486,15 @@ def test_a_newer_command_ends_such_a_landing_also_where_it_is_refused(bench: Ben
     assert set(bench.driver.told) == {Hover()}
 
 
-def test_what_the_library_does_by_itself_does_not_end_such_a_landing(bench: Bench) -> None:
+def test_automatic_commands_do_not_end_such_a_landing(bench: Bench) -> None:
     pilot = landing_in_the_dark(bench)
     pilot.command(Hover(), automatic=True)
     bench.run(0.4, lambda: pilot.command(Hover(), automatic=True, repeat=True))
     assert set(bench.driver.told) == {Land()}
 
 
-def test_who_takes_the_vehicle_meanwhile_is_left_alone(bench: Bench) -> None:
-    """Also where the pilot's own repeats go on, which are no new decision."""
+def test_a_controller_that_has_taken_the_vehicle_is_left_alone(bench: Bench) -> None:
+    """Even if the pilot's own repeats continue, which are no new decision."""
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
@@ -510,8 +508,8 @@ def test_who_takes_the_vehicle_meanwhile_is_left_alone(bench: Bench) -> None:
     assert bench.driver.told == []
 
 
-def test_a_landing_that_was_asked_for_in_the_dark_is_done_when_the_vehicle_is_heard() -> None:
-    """One that only the software can fly is refused while nothing shows how it moves."""
+def test_a_landing_requested_during_silence_is_executed_once_the_vehicle_is_back() -> None:
+    """A vehicle that only the software can fly is refused while its motion is unknown."""
     with Bench({"velocity"}) as software:
         software.driver.report(altitude_m=2.0, state=FlightState.FLYING)
         pilot = software.pilot()
@@ -527,7 +525,7 @@ def test_a_landing_that_was_asked_for_in_the_dark_is_done_when_the_vehicle_is_he
         assert software.driver.told[-1] == Velocity(up=-0.4)
 
 
-def test_a_position_that_jumps_is_told_to_end_no_landing_that_goes_on_without_its_pilot(bench: Bench) -> None:
+def test_a_position_jump_ends_no_landing_that_continues_without_its_pilot(bench: Bench) -> None:
     pilot, witness = bench.airborne(), bench.join("witness")
     bench.driver.answers = False
     bench.driver.report(position_m=(0.0, 0.0, 1.0))
@@ -543,7 +541,7 @@ def test_a_position_that_jumps_is_told_to_end_no_landing_that_goes_on_without_it
     assert set(bench.driver.told) == {Land()}
 
 
-def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
+def test_the_next_pilot_adopts_such_a_landing(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
@@ -556,7 +554,7 @@ def test_the_next_pilot_takes_such_a_landing_over(bench: Bench) -> None:
     assert Land() not in bench.driver.told
 
 
-def test_a_set_point_of_the_librarys_own_does_not_break_off_the_ladders_landing(bench: Bench) -> None:
+def test_an_automatic_set_point_does_not_abort_the_ladders_landing(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.run(5.1)
     assert bench.driver.told[-1] == Land()
@@ -566,7 +564,7 @@ def test_a_set_point_of_the_librarys_own_does_not_break_off_the_ladders_landing(
     bench.run(0.2)
     assert bench.driver.told == []
     pilot.command(Velocity(0.5))
-    assert bench.driver.told == [Hover()], "a pilot who is back does"
+    assert bench.driver.told == [Hover()], "a returning pilot does"
 
 
 def test_a_killed_pilot(bench: Bench) -> None:
@@ -584,8 +582,10 @@ def test_a_killed_pilot(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("leaves", ["is killed", "falls silent", "releases"])
-def test_the_vehicle_hovers_before_anything_is_told(bench: Bench, leaves: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three events went out first, to every application, of which each takes its time."""
+def test_the_vehicle_hovers_before_anything_is_published(
+    bench: Bench, leaves: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three events were sent first, to every application, and each takes time."""
     pilot, witness = bench.airborne(), bench.join("witness")
     pilot.command(Velocity(0.5))
     told_first: list[list[Event]] = []
@@ -612,7 +612,7 @@ def test_the_vehicle_hovers_before_anything_is_told(bench: Bench, leaves: str, m
     assert kinds[-1] is EventKind.FAILSAFE
 
 
-def test_a_pilot_who_released(bench: Bench) -> None:
+def test_a_pilot_that_released(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     pilot.ask(ReleaseAuthority())
@@ -623,7 +623,7 @@ def test_a_pilot_who_released(bench: Bench) -> None:
     assert steps(pilot) == [("hover", "released")]
 
 
-def test_a_pilot_who_comes_back_ends_the_step_with_a_fresh_command_only(bench: Bench) -> None:
+def test_a_returning_pilot_ends_the_step_only_with_a_fresh_command(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.run(0.6)
@@ -636,14 +636,14 @@ def test_a_pilot_who_comes_back_ends_the_step_with_a_fresh_command_only(bench: B
     assert bench.driver.told == [Velocity(0.5), Hover(), Velocity(0.2)]
 
 
-def test_a_pilot_who_comes_back_breaks_the_ladders_landing_off(bench: Bench) -> None:
+def test_a_returning_pilot_aborts_the_ladders_landing(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.run(5.0)
     assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
     pilot.take_authority()
     bench.run(0.4, lambda: pilot.command(Idle(), repeat=True))
-    assert bench.driver.told[3:] == []  # to be there is not enough
+    assert bench.driver.told[3:] == []  # presence is not enough
     pilot.command(Velocity(0.2))
     pilot.command(Velocity(0.2), repeat=True)
     assert bench.driver.told[3:] == [Hover(), Velocity(0.2)]
@@ -671,33 +671,33 @@ def test_a_low_battery(bench: Bench) -> None:
     assert "battery" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
 
 
-def test_a_driver_that_fails_is_tried_again_at_a_bounded_pace(bench: Bench) -> None:
+def test_a_failing_driver_is_retried_at_a_bounded_pace(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.fail = {"apply"}
     bench.run(3.5)
     errors = pilot.told(EventKind.DRIVER_ERROR)
-    assert 3 <= len(errors) <= 4  # one at once, then a sum a second
+    assert 3 <= len(errors) <= 4  # one at once, then a sum each second
     tries = sum(count for event in errors if isinstance(count := event.data["count"], int))
-    assert 9 <= tries <= 13  # 4 a second, some not told yet
+    assert 9 <= tries <= 13  # 4 a second, some not reported yet
     bench.driver.fail = set()
     bench.run(0.26)
     assert bench.driver.told == [Hover()]
 
 
-def test_a_driver_that_fails_to_say_who_flies_keeps_no_failsafe_back(bench: Bench) -> None:
+def test_a_driver_that_fails_to_report_who_flies_delays_no_failsafe(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.driver.fail = {"left_to"}
     for _ in range(255):  # 5.1 s
         bench.clock.advance(0.02)
-        with pytest.raises(Exception, match="left_to is broken"):  # counted, and told, by the ticker
+        with pytest.raises(Exception, match="left_to is broken"):  # counted and reported by the ticker
             bench.tick()
     assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
 
 
 @pytest.mark.parametrize("where", ["command", "link", "others"])
-def test_words_of_a_driver_that_can_not_be_sent_keep_nothing_back(bench: Bench, where: str) -> None:
-    """The name of a file that is no UTF-8: feedback ended, and a step of the ladder was not told."""
+def test_unsendable_texts_of_a_driver_delay_nothing(bench: Bench, where: str) -> None:
+    """With the name of a file that is not UTF-8, feedback ended, and a step of the ladder was not reported."""
     pilot = bench.airborne()
     odd = "/dev/tty\udcff"
     if where == "command":
@@ -724,13 +724,13 @@ def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
     assert steps(pilot) == []
 
 
-def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -> None:
+def test_an_earlier_runs_flight_waits_for_its_pilot_and_is_ended() -> None:
     bench = Bench()
     bench.driver.now = Feedback(captured_ns=0)
     bench.proxy.handler.flight.began_before(bench.clock() + BELIEF_NS)
     with bench:
         witness = bench.join("witness")
-        bench.run(20.0)  # until the vehicle is heard
+        bench.run(20.0)  # until the vehicle is received
         bench.driver.report(state=FlightState.FLYING)
         bench.run(0.5)
         assert bench.driver.told == []
@@ -741,7 +741,7 @@ def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -
         assert "before its restart" in messages(witness, "flight")[0]
 
 
-def test_a_vehicle_that_never_tells_its_state_is_watched_from_its_first_command_on(bench: Bench) -> None:
+def test_a_vehicle_without_a_state_is_watched_from_its_first_command_on(bench: Bench) -> None:
     bench.driver.answers = False
     bench.driver.report(state=FlightState.UNKNOWN)
     pilot = bench.pilot()
@@ -761,7 +761,7 @@ def test_landing_before_the_end(bench: Bench) -> None:
     assert pilot.refusals() == [Refusal.WRONG_STATE]
     bench.driver.report(state=FlightState.LANDED)
     assert bench.proxy.end(1.0, reason="it is late")
-    # What was published before the end still comes, on the pilot's own thread.
+    # Packets published before the end still arrive, on the pilot's own thread.
     wait_until(lambda: any(event.kind is EventKind.PROXY_CLOSING for event in pilot.events), "the pilot hears of it")
     assert "it is late" in next(event.text for event in pilot.events if event.kind is EventKind.PROXY_CLOSING)
     assert bench.driver.told == [Land()]
@@ -787,10 +787,10 @@ def test_a_vehicle_that_lacks_hover_gets_it_from_the_autopilot() -> None:
         assert bench.driver.told[-1] == Land()
         after = len(bench.driver.told)
         bench.run(0.2)
-        assert len(bench.driver.told) == after  # the vehicle lands: the autopilot steers no longer
+        assert len(bench.driver.told) == after  # the vehicle lands: the autopilot no longer steers
 
 
-def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
+def test_a_driver_whose_failsafe_raises_against_its_contract_is_retried(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pilot = bench.airborne()
@@ -808,10 +808,10 @@ def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
 
 @pytest.mark.parametrize("by", ["its pilot", "the failsafe"])
 @pytest.mark.parametrize("action", [Hover(), Land()])
-def test_what_is_steered_in_software_stands_still_where_the_vehicle_fails_to_hover_or_land(
+def test_software_steering_stops_if_the_vehicle_fails_to_hover_or_land(
     monkeypatch: pytest.MonkeyPatch, action: Hover | Land, by: str
 ) -> None:
-    """The velocity that was asked for before went on, as long as the driver failed."""
+    """The previous velocity continued while the driver failed."""
     with Bench(actions=ALL - {"velocity", "position"}) as bench:
         pilot = bench.airborne()
         level = {"velocity_m_s": (0.0, 0.0, 0.0), "roll_rad": 0.0, "pitch_rad": 0.0, "yaw_rad": 0.0}
@@ -840,8 +840,8 @@ def test_what_is_steered_in_software_stands_still_where_the_vehicle_fails_to_hov
         assert abs(bench.driver.told[-1].pitch) < 0.05  # type: ignore[union-attr]
 
 
-def test_pilots_who_hang_one_after_another_keep_it_in_the_air_no_longer_than_one_does(bench: Bench) -> None:
-    """Ten programs wait in the queue and hang: each is granted the authority, and never heard."""
+def test_pilots_that_hang_one_after_another_keep_it_in_the_air_no_longer_than_one(bench: Bench) -> None:
+    """Ten programs wait in the queue and hang: each gets the authority, and is never heard."""
     bench.airborne()
     for number in range(10):
         bench.join(f"pilot {number}").ask(RequestAuthority(16, queue=True))
@@ -853,7 +853,7 @@ def test_pilots_who_hang_one_after_another_keep_it_in_the_air_no_longer_than_one
 
 
 def test_a_landing_is_repeated_until_the_vehicle_shows_it(bench: Bench) -> None:
-    """It flew, and has told nothing of its flight since the ladder's landing was sent."""
+    """It flew, and has reported nothing since the ladder's landing was sent."""
     bench.airborne()
     bench.tick()
     bench.driver.answers = False
@@ -866,8 +866,8 @@ def test_a_landing_is_repeated_until_the_vehicle_shows_it(bench: Bench) -> None:
     assert len(bench.driver.told) == count
 
 
-def test_nothing_is_at_rest_from_a_grant_until_the_flight_is_over(bench: Bench) -> None:
-    """What is at rest may be ticked seldom: neither a pilot on the ground nor anything in the air is."""
+def test_from_a_grant_until_the_end_of_the_flight_nothing_is_at_rest(bench: Bench) -> None:
+    """A proxy at rest may be ticked rarely: neither a pilot on the ground nor a flight is rest."""
     bench.driver.report(state=FlightState.LANDED)
     bench.run(1.1)
     assert bench.proxy.at_rest
@@ -882,7 +882,7 @@ def test_nothing_is_at_rest_from_a_grant_until_the_flight_is_over(bench: Bench) 
     assert bench.proxy.at_rest
 
 
-def test_a_link_that_broke_and_feedback_that_is_due_are_no_rest(bench: Bench) -> None:
+def test_a_broken_link_and_due_feedback_are_no_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.LANDED)
     bench.run(1.1)
     bench.driver.link(LinkState.UP)
@@ -896,7 +896,7 @@ def test_a_link_that_broke_and_feedback_that_is_due_are_no_rest(bench: Bench) ->
     assert not bench.proxy.at_rest
 
 
-def test_what_others_fly_is_not_at_rest(bench: Bench) -> None:
+def test_a_flight_of_others_is_not_at_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.FLYING)
     bench.run(1.1)
     assert bench.proxy.handler.flight.others

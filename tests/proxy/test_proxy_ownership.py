@@ -1,4 +1,4 @@
-"""What others arm, fly, switch or land is observed, told and left alone; and who takes it."""
+"""Arming, flying, switching and landing by others is observed, reported and not interfered with; and takeovers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.proxy_bench import Bench, messages, steps
 
 
 @pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING])
-def test_a_proxy_beside_a_vehicle_that_somebody_else_flies_does_nothing(bench: Bench, state: FlightState) -> None:
+def test_a_proxy_does_nothing_while_others_fly_the_vehicle(bench: Bench, state: FlightState) -> None:
     bench.driver.report(state=state)
     bench.run(20.0)
     bench.driver.report(battery=0.05)
@@ -45,7 +45,7 @@ def test_a_proxy_beside_a_vehicle_that_somebody_else_flies_does_nothing(bench: B
     assert "left alone until an application" in told
 
 
-def test_who_only_has_the_authority_does_not_take_it(bench: Bench) -> None:
+def test_the_authority_alone_does_not_take_it(bench: Bench) -> None:
     bench.driver.report(state=FlightState.FLYING)
     first = bench.pilot("first")
     bench.run(1.0)
@@ -57,7 +57,7 @@ def test_who_only_has_the_authority_does_not_take_it(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("action", [Hover(), Land(), Takeoff()])
-def test_a_new_order_takes_it_and_is_told(bench: Bench, action: AnyAction) -> None:
+def test_a_new_command_takes_it_and_is_reported(bench: Bench, action: AnyAction) -> None:
     bench.driver.report(state=FlightState.FLYING)
     pilot = bench.pilot()
     pilot.command(action)
@@ -66,12 +66,12 @@ def test_a_new_order_takes_it_and_is_told(bench: Bench, action: AnyAction) -> No
     assert told.startswith("pilot took the vehicle by ")
     bench.driver.report(state=FlightState.FLYING)
     bench.run(0.5)
-    assert bench.driver.told[-1] == Hover(), "from here on it is this proxy's to look after"
+    assert bench.driver.told[-1] == Hover(), "from here on, it is this proxy's to look after"
 
 
 @pytest.mark.parametrize("action", [Hover(), Land()])
-def test_what_the_library_does_by_itself_takes_nothing_from_others(bench: Bench, action: AnyAction) -> None:
-    """A safety pilot switches the mode, and then a program ends, fails or lets a key go: its hover is not its own."""
+def test_automatic_commands_take_nothing_from_others(bench: Bench, action: AnyAction) -> None:
+    """A safety pilot switches the mode; then a program ends, fails or lets a key go: its hover is not a decision."""
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.driver.told.clear()
@@ -88,7 +88,7 @@ def test_what_the_library_does_by_itself_takes_nothing_from_others(bench: Bench,
     assert bench.driver.told == [action], "the application's own is a decision"
 
 
-def test_an_automatic_hover_flies_what_is_ours_and_breaks_off_no_landing(bench: Bench) -> None:
+def test_an_automatic_hover_flies_our_vehicle_and_aborts_no_landing(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Hover(), automatic=True)
     assert bench.driver.told == [Hover()]
@@ -131,9 +131,7 @@ def test_a_set_point_does_not_take_it_and_is_refused_with_the_reason(bench: Benc
 
 @pytest.mark.parametrize("state", [FlightState.LANDING, FlightState.FLYING, FlightState.HOVERING])
 @pytest.mark.parametrize("action", [Takeoff(), Hover(), Land(), Velocity(0.5)])
-def test_when_others_take_it_in_flight_no_repeat_takes_it_back(
-    bench: Bench, state: FlightState, action: AnyAction
-) -> None:
+def test_no_repeat_takes_the_vehicle_back_from_others(bench: Bench, state: FlightState, action: AnyAction) -> None:
     """A take-off in progress, a hover, a landing or a set-point: the library repeats each 32 times a second."""
     pilot = bench.airborne()
     pilot.command(action)
@@ -149,7 +147,7 @@ def test_when_others_take_it_in_flight_no_repeat_takes_it_back(
     assert steps(pilot) == []
 
 
-def test_a_set_points_decay_to_hover_is_no_new_order(bench: Bench) -> None:
+def test_a_set_points_decay_to_hover_is_not_a_new_command(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Velocity(0.5))
     bench.driver.told.clear()
@@ -177,7 +175,7 @@ def test_a_step_of_the_ladder_ends_when_others_take_the_vehicle(bench: Bench) ->
     assert pilot.last_feedback().failsafe is Failsafe.NONE
 
 
-def test_a_vehicle_that_only_the_software_steers_is_let_go() -> None:
+def test_a_software_steered_vehicle_is_released() -> None:
     with Bench(actions={"attitude", "takeoff", "land"}) as bench:
         pilot = bench.airborne()
         pilot.command(Velocity(0.3))
@@ -192,7 +190,7 @@ def test_a_vehicle_that_only_the_software_steers_is_let_go() -> None:
         assert bench.driver.told == []
 
 
-def test_a_landing_that_others_chose_goes_on_when_an_application_wants_the_same(bench: Bench) -> None:
+def test_a_landing_by_others_continues_when_an_application_wants_the_same(bench: Bench) -> None:
     pilot = bench.airborne()
     bench.driver.left = "LAND"
     bench.driver.report(state=FlightState.LANDING)
@@ -202,7 +200,7 @@ def test_a_landing_that_others_chose_goes_on_when_an_application_wants_the_same(
     assert pilot.refusals() == []
 
 
-def test_the_driver_is_told_which_orders_are_new(bench: Bench) -> None:
+def test_the_driver_learns_which_commands_are_new(bench: Bench) -> None:
     pilot = bench.airborne()
     pilot.command(Hover())
     assert bench.driver.repeats == 0
@@ -213,7 +211,7 @@ def test_the_driver_is_told_which_orders_are_new(bench: Bench) -> None:
     assert (len(bench.driver.told), bench.driver.repeats) == (4, 2)
 
 
-def test_a_refusal_of_the_vehicle_is_told_once_in_its_own_words_and_by_its_newest(
+def test_a_refusal_by_the_vehicle_is_reported_once_in_its_newest_words(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reasons = iter(["System not initialised", *["GPS has no fix"] * 100])
@@ -235,7 +233,7 @@ def test_a_refusal_of_the_vehicle_is_told_once_in_its_own_words_and_by_its_newes
 
 
 def fly_and_die(path: Path) -> None:
-    """A proxy that begins a flight, and ends without landing."""
+    """Run a proxy that starts a flight and ends without landing."""
     with Bench() as bench:
         bench.proxy.keep_record(record := FlightRecord(path, "fake://"))
         record.start()
@@ -245,7 +243,7 @@ def fly_and_die(path: Path) -> None:
         record.close()
 
 
-def test_a_proxy_that_was_killed_ends_its_own_flight_when_it_is_back(tmp_path: Path) -> None:
+def test_a_killed_proxy_ends_its_own_flight_after_its_restart(tmp_path: Path) -> None:
     path = tmp_path / "alpha.flight"
     fly_and_die(path)
     again = Bench()
@@ -259,8 +257,8 @@ def test_a_proxy_that_was_killed_ends_its_own_flight_when_it_is_back(tmp_path: P
         wait_until(lambda: not path.exists(), "the note goes with the flight")
 
 
-def test_a_flight_that_is_found_long_after_the_proxy_was_killed_is_somebody_elses(tmp_path: Path) -> None:
-    """The vehicle was away, for another battery, and comes back in the air."""
+def test_a_flight_found_long_after_the_proxy_was_killed_is_others(tmp_path: Path) -> None:
+    """The vehicle was away for a new battery, and returns in the air."""
     path = tmp_path / "alpha.flight"
     fly_and_die(path)
     again = Bench()
@@ -287,7 +285,7 @@ def test_the_note_of_a_flight_goes_when_the_vehicle_is_found_standing(tmp_path: 
 
 
 @pytest.mark.parametrize("what", ["another vehicle", "old", "damaged", "of the future"])
-def test_a_note_that_may_be_of_another_flight_is_not_believed(tmp_path: Path, what: str) -> None:
+def test_a_note_that_may_be_of_another_flight_does_not_count(tmp_path: Path, what: str) -> None:
     path = tmp_path / "alpha.flight"
     fly_and_die(path)
     at_s = path.stat().st_mtime
@@ -299,7 +297,7 @@ def test_a_note_that_may_be_of_another_flight_is_not_believed(tmp_path: Path, wh
     assert FlightRecord(path, vehicle, lambda: at_s + later_s).left_s() == 0.0
 
 
-def test_a_note_that_can_not_be_written_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unwritable_note_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     record = FlightRecord(tmp_path / "missing" / "alpha.flight", "fake://")
     assert record.left_s() == 0.0
     record.start()
@@ -308,7 +306,7 @@ def test_a_note_that_can_not_be_written_stops_nothing(tmp_path: Path, caplog: py
     record.close()
 
 
-def test_a_flight_that_others_took_is_noted_no_more(tmp_path: Path) -> None:
+def test_a_flight_taken_by_others_is_no_longer_noted(tmp_path: Path) -> None:
     path = tmp_path / "alpha.flight"
     with Bench() as bench:
         bench.proxy.keep_record(record := FlightRecord(path, "fake://"))
@@ -320,8 +318,8 @@ def test_a_flight_that_others_took_is_noted_no_more(tmp_path: Path) -> None:
         wait_until(lambda: not path.exists(), "it is somebody else's")
 
 
-def test_the_last_word_about_a_flight_is_written(tmp_path: Path) -> None:
-    """What changed while the file was written, just before the end, was lost: a landed flight stayed noted."""
+def test_the_last_state_of_a_flight_is_written(tmp_path: Path) -> None:
+    """A change during the write just before the end was lost: a landed flight stayed noted."""
     record = FlightRecord(tmp_path / "alpha.flight", "fake://")
     writing, go_on = threading.Event(), threading.Event()
     write = record._write
@@ -337,7 +335,7 @@ def test_the_last_word_about_a_flight_is_written(tmp_path: Path) -> None:
     assert writing.wait(10)
     assert record.path.exists()
     record.set(False)
-    record._closing = True  # close() was called while it still wrote
+    record._closing = True  # close() was called during the write
     go_on.set()
     record.close()
     assert not record.path.exists()

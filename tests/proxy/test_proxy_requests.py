@@ -1,4 +1,4 @@
-"""Requests: parameters, refusals, and who waits for whom."""
+"""Requests: parameters, refusals, and the order in which requests wait for each other."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def refused(app: App, body: AnyRequest) -> Refused:
     return reply
 
 
-def test_the_welcome_says_who_and_what(bench: Bench) -> None:
+def test_the_welcome_has_the_identity_and_the_capabilities(bench: Bench) -> None:
     app = bench.stranger()
     welcome = app.hello("me", Role.OBSERVER)
     assert isinstance(welcome, Welcome)
@@ -76,11 +76,11 @@ def test_hello_comes_once(bench: Bench) -> None:
     assert refused(bench.join("me"), Hello("you")).code is Refusal.PROTOCOL
 
 
-def test_ping_tells_the_proxys_time(bench: Bench) -> None:
+def test_ping_returns_the_proxys_time(bench: Bench) -> None:
     assert bench.join("me").ask(Ping(77)) == Pong(77, bench.clock())
 
 
-def test_a_parameter_is_written_told_and_in_force(bench: Bench) -> None:
+def test_a_parameter_is_written_reported_and_in_force(bench: Bench) -> None:
     pilot, witness = bench.airborne(), bench.join("witness", Role.OBSERVER)
     reply = pilot.ask(SetParameter("limits.speed", 1, pilot.lease))
     assert isinstance(reply, ParameterValue)
@@ -121,7 +121,7 @@ def test_writing_needs_the_authority(bench: Bench) -> None:
     assert bench.proxy.parameters.number("limits.tilt") == 0.35
 
 
-def test_all_parameters_are_listed_the_drivers_too() -> None:
+def test_all_parameters_are_listed_including_the_drivers() -> None:
     with Bench(parameters=[FPS]) as bench:
         page = bench.join("me").ask(ListParameters())
         assert isinstance(page, ParameterPage)
@@ -145,7 +145,7 @@ def test_the_timings_follow_their_parameters(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("call", ["set_parameter", "parameters"])
-def test_a_driver_that_raises_is_told_and_refused(call: str) -> None:
+def test_a_raising_driver_is_reported_and_refused(call: str) -> None:
     with Bench(parameters=[FPS]) as bench:
         pilot = bench.airborne()
         bench.driver.fail = {call}
@@ -153,7 +153,7 @@ def test_a_driver_that_raises_is_told_and_refused(call: str) -> None:
             reply = refused(pilot, SetParameter("camera.fps", 20, pilot.lease))
             assert reply.code is Refusal.DRIVER_FAILED
             assert "set_parameter is broken" in reply.message
-        else:  # those known before are listed all the same
+        else:  # those known before are still listed
             page = pilot.ask(ListParameters())
             assert isinstance(page, ParameterPage)
             assert "camera.fps" in [parameter.name for parameter in page.parameters]
@@ -162,7 +162,7 @@ def test_a_driver_that_raises_is_told_and_refused(call: str) -> None:
         assert bench.driver.told == [Velocity(0.5)]
 
 
-def test_a_slow_driver_delays_neither_commands_nor_a_take_over() -> None:
+def test_a_slow_driver_delays_neither_commands_nor_a_takeover() -> None:
     with Bench(parameters=[FPS]) as bench:
         alice, bob = bench.airborne("alice"), bench.join("bob")
         begun, go_on = threading.Event(), threading.Event()
@@ -180,7 +180,7 @@ def test_a_slow_driver_delays_neither_commands_nor_a_take_over() -> None:
         assert bench.driver.told[0] == Velocity(0.5)
         assert bench.driver.told[-1] == Velocity(0.25)
         many = [bob.post(GetStatistics()) for _ in range(MAX_PENDING + 3)]
-        for number in many[MAX_PENDING:]:  # refused at once, before those that wait
+        for number in many[MAX_PENDING:]:  # refused at once, before the waiting ones
             reply = bob.answer(number)
             assert isinstance(reply, Refused)
             assert reply.code is Refusal.BUSY
@@ -191,7 +191,7 @@ def test_a_slow_driver_delays_neither_commands_nor_a_take_over() -> None:
         assert isinstance(bob.ask(GetStatistics()), Statistics)
 
 
-def test_releasing_what_is_not_held_is_harmless(bench: Bench) -> None:
+def test_releasing_without_holding_is_harmless(bench: Bench) -> None:
     assert bench.join("me").ask(ReleaseAuthority()) == Done()
 
 
@@ -201,22 +201,22 @@ def test_the_drivers_parameters_are_read_again_when_its_link_comes_up() -> None:
         bench.driver.native = [FPS]
         bench.driver.link(LinkState.LOST)
         bench.driver.link(LinkState.UP)
-        app.ask(GetStatistics())  # the worker takes one thing after the other
+        app.ask(GetStatistics())  # the worker runs one job after another
         assert isinstance(app.ask(GetParameter("camera.fps")), ParameterValue)
 
 
-def test_a_driver_parameter_too_large_to_send_is_told() -> None:
+def test_a_driver_parameter_too_large_to_send_is_reported() -> None:
     with Bench(parameters=[Parameter("a.huge", ParameterType.TEXT, "x" * 10_000), FPS]) as bench:
         app = bench.join("me")
         page = app.ask(ListParameters())
         assert isinstance(page, ParameterPage)
         assert "a.huge" not in [parameter.name for parameter in page.parameters]
-        bench.run(1.0)  # it was told when the proxy started: this is the sum
+        bench.run(1.0)  # it was reported when the proxy started: this is the sum
         assert "a.huge" in app.told(EventKind.DRIVER_ERROR)[-1].text
 
 
-def test_a_repeated_request_joins_the_one_that_is_being_answered() -> None:
-    """One write of a parameter that takes the vehicle a second is written once, and the next read gets its answer."""
+def test_a_repeated_request_joins_the_pending_one() -> None:
+    """A write that takes the vehicle a second is written once, and the next read gets its answer."""
     with Bench(parameters=[FPS]) as bench:
         app, begun, go_on = bench.pilot(), threading.Event(), threading.Event()
         written: list[int] = []
@@ -253,8 +253,8 @@ def test_a_repeated_write_is_answered_and_not_written_again() -> None:
         assert len(written) == 1
 
 
-def test_an_action_that_waited_behind_a_slow_driver_is_not_done_long_after_it_was_asked_for() -> None:
-    """Who asked for the flip was told after 2 s that there is no answer, and does not expect it any more."""
+def test_a_momentary_write_that_waited_behind_a_slow_driver_is_dropped() -> None:
+    """The flip's requester got a time-out after 2 s, and no longer expects it."""
     flip = Parameter("flip", ParameterType.TEXT, "none", choices=("none", "left"), momentary=True)
     with Bench(parameters=[FPS, flip]) as bench:
         app = bench.pilot()
@@ -284,8 +284,8 @@ def test_an_action_that_waited_behind_a_slow_driver_is_not_done_long_after_it_wa
 
 
 @pytest.mark.parametrize("why", ["closing", "battery", "failsafe", "others", ""])
-def test_nothing_is_done_once_while_something_else_has_the_vehicle(why: str) -> None:
-    """A flip was written to the driver while the vehicle came down because its proxy ended."""
+def test_momentary_parameters_are_refused_while_others_have_the_vehicle(why: str) -> None:
+    """A flip was written to the driver while the vehicle descended because its proxy was ending."""
     flip = Parameter("flip", ParameterType.TEXT, "none", choices=("none", "left"), momentary=True)
     with Bench(parameters=[flip, FPS]) as bench:
         done: list[object] = []
@@ -319,7 +319,7 @@ def test_a_repeated_request_does_not_undo_a_release(bench: Bench) -> None:
     granted = app.answer(number)
     assert app.ask(ReleaseAuthority()) == Done()
     app.repeat(number, request)
-    assert app.answer(number) == granted  # which is not granted again
+    assert app.answer(number) == granted  # it is not granted again
     assert bench.proxy.handler.authority.holder is None
 
 
@@ -335,7 +335,7 @@ def test_a_request_that_arrives_after_its_release_is_refused(bench: Bench) -> No
     assert bench.proxy.handler.authority.holder is None
 
 
-def test_kept_answers_are_bounded_and_a_forgotten_request_is_not_carried_out_again() -> None:
+def test_stored_answers_are_bounded_and_a_forgotten_request_is_not_executed_again() -> None:
     with Bench(parameters=[FPS]) as bench:
         app = bench.pilot()
         written: list[int] = []
@@ -350,7 +350,7 @@ def test_kept_answers_are_bounded_and_a_forgotten_request_is_not_carried_out_aga
         assert len(written) == MAX_KEPT + 2
 
 
-def test_a_repeated_read_is_answered_with_what_is_true_now(bench: Bench) -> None:
+def test_a_repeated_read_is_answered_with_the_current_value(bench: Bench) -> None:
     app = bench.pilot()
     read = GetParameter("limits.tilt")
     number = app.post(read)

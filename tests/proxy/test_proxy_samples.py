@@ -1,4 +1,4 @@
-"""What the vehicle tells: feedback, frames, events; and what goes to whom."""
+"""The vehicle's reports (feedback, frames, events) and their recipients."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ def test_a_silent_vehicle_leaves_the_proxys_own_feedback(bench: Bench) -> None:
     app.sync()
     news = app.feedback[seen:]
     assert 4 <= len(news) <= 10
-    assert {feedback.captured_ns for feedback in news} == {captured}  # it is no newer than it is
+    assert {feedback.captured_ns for feedback in news} == {captured}  # it is no newer than its capture time
     bench.driver.link(LinkState.LOST, "gone")
     bench.tick()
     assert app.last_feedback().vehicle_link is LinkState.LOST
 
 
-def test_before_anything_was_heard_there_is_feedback_without_invented_data() -> None:
+def test_feedback_before_any_report_has_no_invented_data() -> None:
     with Bench() as bench:
         app = bench.join("me")
         bench.proxy.publisher._raw = None
@@ -82,7 +82,7 @@ def test_before_anything_was_heard_there_is_feedback_without_invented_data() -> 
         assert (feedback.state, feedback.altitude_m, feedback.battery) == (FlightState.UNKNOWN, None, None)
 
 
-def test_changes_of_the_flight_state_are_told(bench: Bench) -> None:
+def test_changes_of_the_flight_state_are_reported(bench: Bench) -> None:
     app = bench.join("me")
     bench.driver.report(state=FlightState.FLYING)
     bench.driver.report(state=FlightState.FLYING)
@@ -92,7 +92,7 @@ def test_changes_of_the_flight_state_are_told(bench: Bench) -> None:
     assert emergency.severity is Severity.ERROR
 
 
-def test_native_telemetry_that_is_too_large_is_left_out_and_told(bench: Bench) -> None:
+def test_native_telemetry_that_is_too_large_is_dropped_and_reported(bench: Bench) -> None:
     app = bench.join("me")
     bench.driver.report(altitude_m=3.0, native={"text": "x" * 70_000})
     feedback = app.last_feedback()
@@ -104,7 +104,7 @@ def test_frames_carry_their_number_time_and_intrinsics(bench: Bench) -> None:
     app = bench.join("me")
     sink = sink_of(bench)
     assert not sink.wants("front")
-    sink.frame("front", PIXELS, 5, width=4, height=3)  # nobody looks: counted all the same
+    sink.frame("front", PIXELS, 5, width=4, height=3)  # no viewers: still counted
     app.end.subscribe("video/front")
     assert sink.wants("front")
     intrinsics = Intrinsics(1.0, 1.0, 2.0, 1.5)
@@ -117,7 +117,7 @@ def test_frames_carry_their_number_time_and_intrinsics(bench: Bench) -> None:
     assert header.intrinsics == intrinsics
 
 
-def test_pictures_as_they_came_go_to_whoever_subscribed(bench: Bench) -> None:
+def test_undecoded_pictures_reach_their_subscribers(bench: Bench) -> None:
     app = bench.join("me")
     sink = sink_of(bench)
     assert not sink.wants_stream("front")
@@ -133,7 +133,7 @@ def test_pictures_as_they_came_go_to_whoever_subscribed(bench: Bench) -> None:
     app.sync()
     first, second = [sample for sample in app.others if isinstance(sample, EncodedFrame)]
     assert first == EncodedFrame("front", 1, 5, bench.clock(), 4, 3, "h264", True, b"key", intrinsics)
-    assert (second.seq, second.captured_ns, second.data) == (3, 7, b"next")  # there is a gap for who takes them
+    assert (second.seq, second.captured_ns, second.data) == (3, 7, b"next")  # a gap for its subscribers
     (told,) = app.told(EventKind.DRIVER_ERROR)
     assert f"{MAX_ENCODED + 1} bytes" in told.text
     statistics = app.ask(GetStatistics())
@@ -164,7 +164,7 @@ def test_a_cameras_nominal_intrinsics_are_used_for_frames_of_its_size() -> None:
         assert [header.intrinsics for header, _ in app.frames] == [nominal, None]
 
 
-def test_a_frame_of_the_wrong_size_is_told_and_not_shown(bench: Bench) -> None:
+def test_a_frame_of_the_wrong_size_is_reported_and_not_shown(bench: Bench) -> None:
     app = bench.join("me")
     app.end.subscribe("video/front")
     sink_of(bench).frame("front", PIXELS, 1, width=4, height=4)
@@ -174,7 +174,7 @@ def test_a_frame_of_the_wrong_size_is_told_and_not_shown(bench: Bench) -> None:
     assert app.frames == []
 
 
-def test_pixels_that_no_transport_takes_are_told(bench: Bench) -> None:
+def test_unsendable_pixels_are_reported(bench: Bench) -> None:
     app = bench.join("me")
     app.end.subscribe("video/front")
     sink_of(bench).frame("front", PIXELS[:, ::-1], 1, width=4, height=3)
@@ -189,7 +189,7 @@ def test_the_vehicles_own_events_are_passed_on(bench: Bench) -> None:
     assert (event.text, event.data) == ("touched a wall", {"speed_m_s": 0.4})
 
 
-def test_an_event_with_particulars_that_cannot_be_sent_is_told_without_them(
+def test_an_event_with_unsendable_data_is_published_without_them(
     bench: Bench, caplog: pytest.LogCaptureFixture
 ) -> None:
     app = bench.join("me")
@@ -210,7 +210,7 @@ def test_events_are_numbered_without_gaps(bench: Bench) -> None:
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
-def test_events_that_could_not_be_handed_over_are_told(bench: Bench) -> None:
+def test_undelivered_events_are_reported(bench: Bench) -> None:
     witness = bench.join("witness")
     refusing = 3
 
@@ -230,7 +230,7 @@ def test_events_that_could_not_be_handed_over_are_told(bench: Bench) -> None:
     assert statistics.counters["events.missed"] == 3
 
 
-def test_annotations_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
+def test_annotations_reach_their_subscribers_from_any_role(bench: Bench) -> None:
     observer, viewer = bench.join("tracker", Role.OBSERVER), bench.join("viewer")
     small = Annotation("tracker", "front", 1, 4, 3, (Text("here", (1.0, 2.0)),))
     large = Annotation("tracker", "front", 1, 4, 3, tuple(Text("x" * 256, (1.0, 2.0)) for _ in range(200)))
@@ -243,7 +243,7 @@ def test_annotations_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
     assert "32768" in event.text
 
 
-def test_logs_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
+def test_logs_reach_their_subscribers_from_any_role(bench: Bench) -> None:
     observer, viewer = bench.join("tracker", Role.OBSERVER), bench.join("viewer")
     viewer.end.subscribe("logs")
     entry = LogEntry("tracker", "error", 1, number=0.5)
@@ -277,7 +277,7 @@ def test_the_software_autopilots_state_is_shown() -> None:
         pilot.command(Velocity(0.5))
         bench.run(0.1)
         assert pilot.last_feedback().state is FlightState.FLYING
-        bench.run(0.5)  # silent: the ladder uses the autopilot too
+        bench.run(0.5)  # silent: the ladder uses the autopilot, too
         assert pilot.last_feedback().state is FlightState.HOVERING
         bench.driver.fail = {"apply"}
         bench.run(0.1)
@@ -318,7 +318,7 @@ def test_a_server_end_that_cannot_be_started_opens_no_driver() -> None:
         assert second.driver.sink is None
 
 
-def test_the_ticker_takes_the_ladders_step_by_itself() -> None:
+def test_the_ticker_takes_the_ladders_step() -> None:
     class Clocked(FakeDriver):
         hovered = threading.Event()
 

@@ -1,4 +1,4 @@
-"""Poses from outside: who may tell them, what the driver gets, and what is told of those that it can't take."""
+"""External poses: who may send them, what the driver gets, and how refusals are reported."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ POSE = VehiclePose(3_000, (1.0, 2.0, 3.0), (0.1, 0.3, 0.5, 0.8062257748298549), 
 
 @pytest.fixture
 def taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[ExternalPose]:
-    """What the driver was told."""
+    """Record the driver's calls."""
     poses: list[ExternalPose] = []
     monkeypatch.setattr(bench.driver, "external_pose", poses.append)
     return poses
@@ -55,7 +55,7 @@ def test_an_observers_pose_is_refused(bench: Bench, taken: list[ExternalPose]) -
         (VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), -1.0), "position_std_m is -1.0"),
     ],
 )
-def test_what_is_no_pose_is_refused(bench: Bench, taken: list[ExternalPose], pose: VehiclePose, said: str) -> None:
+def test_an_invalid_pose_is_refused(bench: Bench, taken: list[ExternalPose], pose: VehiclePose, said: str) -> None:
     app = bench.join("mocap")
     assert app.end.send(encode(pose))
     [(reason, text)] = refusals(app)
@@ -64,7 +64,7 @@ def test_what_is_no_pose_is_refused(bench: Bench, taken: list[ExternalPose], pos
     assert taken == []
 
 
-def test_a_vehicle_that_takes_none_is_told_of(bench: Bench) -> None:
+def test_a_vehicle_without_external_poses_is_reported(bench: Bench) -> None:
     app = bench.join("mocap")
     for _ in range(3):
         assert app.end.send(encode(POSE))
@@ -72,7 +72,7 @@ def test_a_vehicle_that_takes_none_is_told_of(bench: Bench) -> None:
     assert (reason, text) == ("unsupported", "mocap: pose refused: fake:// does not accept external poses")
 
 
-def test_a_driver_that_fails_is_told_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_driver_is_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(pose: ExternalPose) -> None:
         raise DriverError("no data from the vehicle")
 

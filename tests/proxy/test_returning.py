@@ -1,4 +1,4 @@
-"""Where the start is, the flight back there, and who ends it: pilots, low batteries, lost pilots."""
+"""The start, the flight back there, and what ends it: pilots, low batteries, lost pilots."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def observed(*seen: tuple[float, FlightState, Feedback | None]) -> StartPoint:
 GROUND = at(1.0, 2.0, 0.1)
 
 
-def test_the_start_is_where_it_stood_when_it_took_off() -> None:
+def test_the_start_is_where_it_took_off() -> None:
     start = observed((0, FlightState.LANDED, GROUND))
     assert start.position is None
     start.observe(FlightState.TAKING_OFF, GROUND, NOW)
@@ -93,25 +93,25 @@ def test_each_take_off_has_its_own_start() -> None:
     assert start.position == (5.0, 5.0, 0.0)
     start.observe(FlightState.LANDED, None, NOW + 2 * S)
     start.observe(FlightState.FLYING, at(6.0, 5.0, 0.0, NOW + 4 * S), NOW + 4 * S)
-    assert start.position == (6.0, 5.0, 0.0), "some vehicles never say that they are taking off"
+    assert start.position == (6.0, 5.0, 0.0), "some vehicles never report that they are taking off"
 
 
-def test_a_moment_of_landed_in_the_air_does_not_move_it() -> None:
+def test_a_brief_landed_in_the_air_does_not_move_it() -> None:
     start = observed((0, FlightState.LANDED, GROUND), (0.1, FlightState.TAKING_OFF, GROUND))
     for state in (FlightState.FLYING, FlightState.LANDED, FlightState.FLYING):
         start.observe(state, at(9.0, 9.0, 3.0), NOW + S // 2)
     assert start.position == (1.0, 2.0, 0.1)
 
 
-def test_a_vehicle_that_is_found_in_the_air_has_none() -> None:
+def test_a_vehicle_found_in_the_air_has_none() -> None:
     assert observed((0, FlightState.FLYING, GROUND), (1, FlightState.HOVERING, GROUND)).position is None
 
 
-def test_a_take_off_that_is_found_in_progress_counts_on_the_ground_below() -> None:
+def test_a_take_off_found_in_progress_counts_from_the_ground_below() -> None:
     assert observed((0, FlightState.TAKING_OFF, at(1.0, 2.0, 0.75, altitude_m=0.5))).position == (1.0, 2.0, 0.25)
 
 
-def test_a_position_that_comes_during_the_take_off_counts_on_the_ground_below() -> None:
+def test_a_position_that_arrives_during_the_take_off_counts_from_the_ground_below() -> None:
     start = observed((0, FlightState.LANDED, at(0, 0, 0, position_m=None)))
     start.observe(FlightState.TAKING_OFF, at(0, 0, 0, position_m=None), NOW)
     start.observe(FlightState.TAKING_OFF, at(1.0, 2.0, 0.75, altitude_m=0.5), NOW)
@@ -121,7 +121,7 @@ def test_a_position_that_comes_during_the_take_off_counts_on_the_ground_below() 
     assert late.position is None, "it may have flown anywhere since"
 
 
-def test_an_old_position_is_none() -> None:
+def test_an_old_position_does_not_count() -> None:
     old = at(1.0, 2.0, 0.0, NOW - S)
     assert observed((0, FlightState.LANDED, old), (0, FlightState.TAKING_OFF, old)).position is None
 
@@ -148,8 +148,8 @@ def test_it_climbs_flies_over_its_start_and_lands() -> None:
     [{100: 8.0}, dict.fromkeys(range(100, 103), 7.0), {0: 8.0}, dict.fromkeys(range(100, 150), 7.0)],
     ids=["one sample", "a narrow hole", "the first sample", "a second long"],
 )
-def test_wrong_heights_do_not_lower_the_way_for_good(wrong: dict[int, float]) -> None:
-    """One reading of 8 m lowered the way back for good: it slanted down to 4 cm, half a metre before the start."""
+def test_wrong_heights_do_not_lower_the_return_for_good(wrong: dict[int, float]) -> None:
+    """One reading of 8 m lowered the return for good: it descended to 4 cm, half a metre before the start."""
     back, airspace = flight(settings=ReturnSettings(height=3.0)), within(LIMITS, ANYWHERE)
     x, z, lowest, overhead = 8.0, 4.0, 4.0, 0.0
     for step in range(-10, 2000):
@@ -172,16 +172,16 @@ def test_wrong_heights_do_not_lower_the_way_for_good(wrong: dict[int, float]) ->
     assert lowest > (2.9 if len(wrong) > 10 else 3.9)
 
 
-def test_it_stays_above_its_start_if_it_is_to() -> None:
+def test_it_stays_above_its_start_if_requested() -> None:
     back = flight(ReturnToStart(land=False))
     back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 3.0), NOW)
-    assert str(back.phase) == "flying", "it is high enough, and never comes down on the way"
+    assert str(back.phase) == "flying", "it is high enough, and never descends on the way"
     assert place(back.step(within(LIMITS, ANYWHERE), at(0.0, 0.0, 3.0), NOW)) == (0.0, 0.0, 3.0)
     assert str(back.phase) == "arrived"
     assert place(back.step(within(LIMITS, ANYWHERE), at(2.0, 0.0, 3.0, NOW + 60 * S), NOW + 60 * S)) == (0.0, 0.0, 3.0)
 
 
-def test_the_command_goes_before_the_settings() -> None:
+def test_the_command_overrides_the_settings() -> None:
     settings = ReturnSettings(height=1.0, speed=0.5, land=False)
     decided = flight(settings=settings).step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 0.5), NOW)
     assert place(decided) == (5.0, 0.0, 1.1)
@@ -204,7 +204,9 @@ def test_the_command_goes_before_the_settings() -> None:
     ],
     ids=["room", "box", "limit", "comes down to the limit", "near its start"],
 )
-def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedback: Feedback, top: float) -> None:
+def test_the_height_is_limited_to_the_permitted_space(
+    space: Space, limits: Limits, feedback: Feedback, top: float
+) -> None:
     assert place(flight().step(within(limits, space), feedback, NOW))[2] == pytest.approx(top)
 
 
@@ -222,7 +224,7 @@ def test_the_height_is_kept_where_it_may_fly(space: Space, limits: Limits, feedb
         (HOME, Space(box=Box((1, -9, 0), (9, 9, 9))), at(5, 0, 1), Refusal.OUT_OF_RANGE, "outside the safety box"),
     ],
 )
-def test_what_is_against_it(
+def test_objections_to_a_return(
     start: tuple[float, float, float] | None, space: Space, feedback: Feedback | None, reason: Refusal, words: str
 ) -> None:
     back = flight(start=start)
@@ -232,17 +234,17 @@ def test_what_is_against_it(
     assert str(back.phase) == "none"
 
 
-def test_a_height_that_makes_no_sense_is_refused() -> None:
+def test_a_nonsensical_height_is_refused() -> None:
     decided = flight(ReturnToStart(-1.0)).step(within(LIMITS, ANYWHERE), at(5, 0, 1), NOW)
     assert (decided.refusal, "height is -1 m" in decided.why) == (Refusal.OUT_OF_RANGE, True)
 
 
-def test_from_outside_of_the_box_it_flies_straight_back_inside() -> None:
+def test_from_outside_the_box_it_flies_straight_back_inside() -> None:
     space = Space(box=Box((-4, -4, 0), (4, 4, 9)))
     assert place(flight().step(within(LIMITS, space), at(5.0, 0.0, 1.0), NOW)) == (0.0, 0.0, 2.1)
 
 
-def test_a_zone_that_is_set_on_the_way_stops_it() -> None:
+def test_a_zone_added_on_the_way_stops_it() -> None:
     back = flight()
     back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)
     zones = Space(zones=(Cylinder(2, 0, 0.5, 0, 5),))
@@ -251,7 +253,7 @@ def test_a_zone_that_is_set_on_the_way_stops_it() -> None:
     assert back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 2.1), NOW).action is not None
 
 
-def test_it_stops_without_a_young_position_and_goes_on_with_one() -> None:
+def test_it_stops_without_a_fresh_position_and_continues_with_one() -> None:
     back = flight()
     back.step(within(LIMITS, ANYWHERE), at(5.0, 0.0, 1.0), NOW)
     later = NOW + 60 * S
@@ -262,7 +264,7 @@ def test_it_stops_without_a_young_position_and_goes_on_with_one() -> None:
 
 
 def stuck(back: ReturnFlight, x: float, seconds: float) -> ReturnDecision:
-    """What is decided while it comes no nearer: the last place to fly to, or what is decided instead."""
+    """Return the decision while it gets no closer: the last target, or the action instead."""
     decided = ReturnDecision()
     for tick in range(round(seconds * 10)):
         now_ns = NOW + tick * S // 10
@@ -272,14 +274,14 @@ def stuck(back: ReturnFlight, x: float, seconds: float) -> ReturnDecision:
     return decided
 
 
-def test_a_way_that_leads_nowhere_is_given_up() -> None:
+def test_a_return_that_leads_nowhere_is_abandoned() -> None:
     assert isinstance(stuck(flight(), 5.0, 10.0).action, Position)
     decided = stuck(flight(), 5.0, 10.3)
     assert (decided.refusal, decided.lasting) == (Refusal.WRONG_STATE, True)
     assert "got no closer to its start for 10 s, and 5.0 m remain" in decided.why
 
 
-def test_close_by_it_lands_if_it_comes_no_nearer() -> None:
+def test_near_the_start_it_lands_if_it_gets_no_closer() -> None:
     assert stuck(flight(), 0.8, 10.3).action == Land()
 
 
@@ -297,7 +299,7 @@ def fall_below_the_charge_to_return_at(bench: Bench, pilot: App) -> None:
 
 
 def away(bench: Bench, x: float = 5.0) -> App:
-    """A pilot whose vehicle took off at (0, 0) and hovers somewhere else."""
+    """Return a pilot whose vehicle took off at (0, 0) and hovers somewhere else."""
     pilot = bench.pilot()
     still = {"yaw_rad": 0.0, "velocity_m_s": (0.0, 0.0, 0.0)}
     bench.driver.report(state=FlightState.LANDED, position_m=(0.0, 0.0, 0.0), altitude_m=0.0, **still)
@@ -337,14 +339,14 @@ def test_a_pilots_return() -> None:
         assert bench.driver.now.state is FlightState.LANDING
         bench.driver.report(state=FlightState.LANDED, altitude_m=0.0)
         bench.run(0.5, lambda: pilot.command(ReturnToStart(), repeat=True))
-        assert pilot.refusals() == [], "repeats of what is done are not refused"
+        assert pilot.refusals() == [], "repeats of a completed return are not refused"
         assert phases(pilot) == ["none", "climbing", "flying", "landing", "none"]
         pilot.command(ReturnToStart())
         assert pilot.refusals() == [Refusal.WRONG_STATE], "a new one is"
 
 
-def test_feedback_never_tells_of_a_return_beside_the_arrival_of_the_one_before() -> None:
-    """A sample between the command and the next tick did: return_to_start() was over before the vehicle landed."""
+def test_feedback_never_shows_a_new_return_beside_the_previous_arrival() -> None:
+    """A sample between the command and the next tick did: return_to_start() ended before the vehicle landed."""
     with Bench() as bench:
         pilot = away(bench)
         pilot.command(ReturnToStart(land=False))
@@ -401,7 +403,7 @@ def test_without_a_position_it_is_refused() -> None:
         assert pilot.last_feedback().start_position_m is None
 
 
-def test_a_low_battery_brings_it_back_whatever_set_points_come() -> None:
+def test_a_low_battery_returns_it_whatever_set_points_arrive() -> None:
     with Bench() as bench:
         pilot = away(bench)
         write(bench, pilot, "battery.return", 0.3)
@@ -428,8 +430,8 @@ def test_a_low_battery_brings_it_back_whatever_set_points_come() -> None:
         assert bench.driver.told[-1] == Takeoff()
 
 
-def test_no_hover_or_landing_of_the_librarys_own_ends_a_return_for_a_low_battery() -> None:
-    """A route's end, a page that closes half-way, a key that is let go: only a person's own command ends it."""
+def test_no_automatic_hover_or_landing_ends_a_return_for_a_low_battery() -> None:
+    """A route's end, a page closed half-way, a key let go: only a person's own command ends it."""
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)
@@ -443,8 +445,8 @@ def test_no_hover_or_landing_of_the_librarys_own_ends_a_return_for_a_low_battery
         assert bench.driver.told[-1] == Hover()
 
 
-def test_a_landing_that_a_waiting_call_asks_for_again_is_not_refused_meanwhile() -> None:
-    """After a lost link ``land()`` raised, while the vehicle was on its way to land."""
+def test_a_repeated_landing_of_a_waiting_call_is_not_refused() -> None:
+    """After a lost link, ``land()`` raised while the vehicle was on its way to land."""
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)
@@ -457,7 +459,7 @@ def test_a_landing_that_a_waiting_call_asks_for_again_is_not_refused_meanwhile()
         assert {type(action) for action in bench.driver.told} == {Position}, "it still lands at its start"
 
 
-def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:
+def test_the_pilot_takes_over_with_a_new_hover_until_it_is_charged() -> None:
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)
@@ -475,7 +477,7 @@ def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:
         assert steps(pilot)[-1] == ("land", "battery_return", True), "it rose, and fell again"
         bench.driver.report(battery=0.09)
         bench.tick()
-        assert bench.driver.told[-1] == Land(), "at battery.land it lands where it is"
+        assert bench.driver.told[-1] == Land(), "at battery.land it lands in place"
         assert steps(pilot)[-1] == ("land", "battery", False)
         pilot.command(Hover())
         assert bench.driver.told[-1] == Land()
@@ -490,13 +492,13 @@ def test_a_low_battery_without_a_start_lands() -> None:
         assert "it can't return to its start: the vehicle does not report" in pilot.told(EventKind.FAILSAFE)[0].text
 
 
-def test_a_position_that_is_lost_on_the_way_ends_in_a_landing() -> None:
+def test_a_position_lost_on_the_way_ends_in_a_landing() -> None:
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)
         bench.driver.answers = False
         bench.run(1.0)
-        assert bench.driver.told[-1] == Hover(), "it waits for a younger position"
+        assert bench.driver.told[-1] == Hover(), "it waits for a fresh position"
         bench.driver.report(position_m=None, state=FlightState.FLYING)
         bench.run(0.98, bench.driver.report)
         assert Land() not in bench.driver.told
@@ -505,7 +507,7 @@ def test_a_position_that_is_lost_on_the_way_ends_in_a_landing() -> None:
         assert steps(pilot)[-1] == ("land", "battery_return", False)
 
 
-def test_a_link_that_breaks_on_the_way_and_is_back_does_not_end_it() -> None:
+def test_a_link_that_breaks_and_returns_on_the_way_does_not_end_it() -> None:
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)
@@ -536,7 +538,7 @@ def test_a_driver_that_fails_to_fly_it_there_lands_it() -> None:
 
 
 @pytest.mark.parametrize("actions", [ALL, ALL - {"position"}], ids=["native", "software"])
-def test_a_lost_pilots_vehicle_returns_if_it_is_to(actions: frozenset[str]) -> None:
+def test_a_lost_pilots_vehicle_returns_if_configured(actions: frozenset[str]) -> None:
     with Bench(actions) as bench:
         pilot, witness = away(bench), bench.join("witness")
         write(bench, pilot, "failsafe.return", True)
@@ -552,13 +554,13 @@ def test_a_lost_pilots_vehicle_returns_if_it_is_to(actions: frozenset[str]) -> N
         assert witness.last_feedback().return_phase is ReturnPhase.CLIMBING
         pilot.take_authority()
         pilot.command(Velocity(0.2))
-        assert bench.driver.told[-1] == Velocity(0.2), "a pilot who is back flies on at once"
+        assert bench.driver.told[-1] == Velocity(0.2), "a returning pilot flies on at once"
         bench.tick()
         assert steps(witness)[-1] == ("none", "fresh command", False)
         assert witness.last_feedback().return_phase is ReturnPhase.NONE
 
 
-def test_what_others_fly_is_not_brought_back() -> None:
+def test_a_vehicle_flown_by_others_is_not_brought_back() -> None:
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)

@@ -1,4 +1,4 @@
-"""Box and zones: pure rules first, then through the proxy, then flown against in simulated time."""
+"""Safety box and zones: pure rules first, then through the proxy, then flown in simulated time."""
 
 from __future__ import annotations
 
@@ -70,32 +70,32 @@ def test_the_speed_allowed_is_the_one_that_can_be_stopped() -> None:
     assert BOXED.allowed_speed(0.0, 0.3) == BOXED.allowed_speed(-1.0, 0.3) == 0.0
 
 
-def test_what_runs_along_the_wall_stays() -> None:
+def test_motion_along_the_wall_stays() -> None:
     allowed, limits = clamp(BOXED, Velocity(2.0, 0.4, 0.1, 0.5), at(1.5, 0.0))
     assert allowed.forward == pytest.approx(BOXED.allowed_speed(0.5, 0.3))
     assert (allowed.left, allowed.up, allowed.yaw_rate) == pytest.approx((0.4, 0.1, 0.5))
     assert limits == [BOX]
 
 
-def test_axes_are_the_world_s() -> None:
+def test_axes_are_the_worlds() -> None:
     allowed, _ = clamp(BOXED, Velocity(left=-2.0), at(1.9, 0.0, yaw=math.pi / 2))  # looks north, its right is the east
     assert allowed.left == pytest.approx(-BOXED.allowed_speed(0.1, 0.3))
     assert clamp(BOXED, Velocity(forward=1.0), at(1.9, 0.0, yaw=math.pi))[1] == []
 
 
-def test_an_old_position_costs_way() -> None:
+def test_an_old_position_costs_distance() -> None:
     late = at(1.0, 0.0, captured_ns=NOW - NS_PER_S // 5)
     assert clamp(BOXED, Velocity(2.0), late)[0].forward == pytest.approx(BOXED.allowed_speed(1.0, 0.5))
 
 
-def test_who_is_too_fast_is_braked() -> None:
+def test_excess_speed_is_braked() -> None:
     most = BOXED.allowed_speed(0.2, 0.3)
     braked, _ = clamp(BOXED, Velocity(2.0), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))
     assert braked.forward == pytest.approx(most - 0.5 * (1.5 - most))
     assert clamp(BOXED, Velocity(), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))[1] == [], "it does not ask to go there"
 
 
-def test_outside_it_may_only_come_back() -> None:
+def test_outside_only_coming_back_is_allowed() -> None:
     outside = at(2.5, 0.0)
     assert clamp(BOXED, Velocity(1.0, yaw_rate=0.3), outside) == (Velocity(-0.5, yaw_rate=0.3), [BOX])
     assert clamp(BOXED, Velocity(left=1.0), outside)[0] == Velocity(), "along the wall is not back"
@@ -108,7 +108,7 @@ def test_outside_it_may_only_come_back() -> None:
     assert clamp(BOXED, Velocity(-1.0, 0.2), corner)[0] == Velocity(left=-0.5)
 
 
-def test_safety_are_gone_round() -> None:
+def test_zones_are_passed_around() -> None:
     allowed, limits = clamp(PILLAR, Velocity(2.0), at(1.3, 0.0))
     assert allowed.forward == pytest.approx(PILLAR.allowed_speed(0.2, 0.3))
     assert limits == [ZONES]
@@ -128,7 +128,7 @@ def test_safety_are_gone_round() -> None:
     assert clamp(PILLAR, Velocity(1.0, up=-1.0), at(1.4, 0.0, 2.1))[1] == [ZONES], "over the edge"
 
 
-def test_a_tilt_is_turned_into_one_that_brakes() -> None:
+def test_a_tilt_becomes_one_that_brakes() -> None:
     slow = at(0.0, 0.0, velocity_m_s=(0.2, 0.0, 0.0))
     assert clamp(BOXED, Attitude(pitch=0.2), slow)[1] == []
     fast = at(1.5, 0.0, velocity_m_s=(1.5, 0.0, 0.0))
@@ -136,7 +136,7 @@ def test_a_tilt_is_turned_into_one_that_brakes() -> None:
     assert limits == [BOX]
     assert braked.pitch == pytest.approx(-math.atan(1.0 / 9.80665), abs=1e-3)
     assert (braked.roll, braked.yaw_rate) == pytest.approx((0.1, 0.4))
-    assert clamp(BOXED, Attitude(pitch=0.2), at(2.5, 0.0))[0].pitch < 0.0, "outside it is led back"
+    assert clamp(BOXED, Attitude(pitch=0.2), at(2.5, 0.0))[0].pitch < 0.0, "outside, it is led back"
     assert clamp(BOXED, Attitude(climb=1.0), at(0.0, 0.0, 2.9))[0].climb == pytest.approx(BOXED.allowed_speed(0.1, 0.3))
     assert clamp(BOXED, Attitude(pitch=0.2), at(2.0, 0.0))[0].pitch == pytest.approx(0.0), "without a known speed"
 
@@ -180,7 +180,7 @@ def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
 def against_the_net(
     by_attitude: bool, position_hz: int, gust: float, thick: float = 0.05, seconds: float = 30.0
 ) -> float:
-    """How far east a vehicle with lag comes that pushes at a net at x = 2 m; positions are the same in between."""
+    """Return how far east a vehicle with lag gets that pushes at a net at x = 2 m; positions repeat in between."""
     safety, x, v, far, dt = walled(None, Box((2.0, -5.0, 0.0), (2.0 + thick, 5.0, 3.0))), 0.0, 0.0, 0.0, 0.02
     for step in range(round(seconds / dt)):
         if step % (50 // position_hz) == 0:
@@ -203,13 +203,13 @@ def against_the_net(
 @pytest.mark.parametrize("gust", [0.0, 1.5])
 @pytest.mark.parametrize("position_hz", [50, 5, 2, 1])
 @pytest.mark.parametrize("by_attitude", [False, True], ids=["velocity", "attitude"])
-def test_nothing_comes_through_a_thin_zone(by_attitude: bool, position_hz: int, gust: float) -> None:
-    """Behind its middle, a net was left on the far side: 5 cm by velocity and 20 cm by attitude were flown through."""
+def test_nothing_crosses_a_thin_zone(by_attitude: bool, position_hz: int, gust: float) -> None:
+    """Behind its middle, a net was left on the far side: 5 cm were crossed by velocity and 20 cm by attitude."""
     assert against_the_net(by_attitude, position_hz, gust) < 2.0 + (0.3 if gust else 0.0)
 
 
-def test_a_vehicle_in_a_zone_is_led_back_to_the_side_that_it_came_from() -> None:
-    """A gust brings it beyond the middle of a zone: it must not leave on the far side."""
+def test_a_vehicle_in_a_zone_is_led_back_to_the_side_it_came_from() -> None:
+    """A gust takes it beyond the middle of a zone: it must not leave on the far side."""
     zone = walled(None, Box((1.0, -5.0, 0.0), (2.0, 5.0, 3.0)))
     clamp(zone, Velocity(1.0), at(0.9, 0.0))
     assert clamp(zone, Velocity(1.0), at(1.8, 0.0))[0] == Velocity(-0.5)
@@ -218,13 +218,13 @@ def test_a_vehicle_in_a_zone_is_led_back_to_the_side_that_it_came_from() -> None
     assert clamp(zone, Velocity(1.0), at(1.8, 0.0))[0] == Velocity(1.0)
 
 
-def test_a_position_that_does_not_change_while_it_flies_is_as_old_as_it_is() -> None:
-    """Positions of up to a second counted as new, as the rest of the sample was: at 2 m/s, 2 m were flown blind."""
+def test_a_repeated_position_in_flight_has_its_true_age() -> None:
+    """Positions of up to a second counted as new, like the rest of the sample: at 2 m/s, 2 m were flown blind."""
 
     def seen(late_s: float, moves: float) -> Feedback:
         return at(0.0, 0.0, captured_ns=NOW + round(late_s * NS_PER_S), velocity_m_s=(moves, 0.0, 0.0))
 
-    for moves, late_s, expected in ((1.0, 0.0, 0.3), (1.0, 0.8, 1.1), (0.0, 0.8, 0.3)):  # it rests in the last
+    for moves, late_s, expected in ((1.0, 0.0, 0.3), (1.0, 0.8, 1.1), (0.0, 0.8, 0.3)):  # it is at rest in the last
         boxed = walled(BOX_M)
         boxed.observe(seen(0.0, moves))
         new = seen(late_s, moves)
@@ -245,7 +245,7 @@ def test_a_position_that_does_not_change_while_it_flies_is_as_old_as_it_is() -> 
     )
 
 
-def test_a_hover_above_a_lowered_ceiling_comes_down() -> None:
+def test_a_hover_above_a_lowered_ceiling_descends() -> None:
     airspace, altitude, steps = Airspace(), 7.4, 0
     assert airspace.judge(Hover(), None, NOW).action == Hover()
     assert airspace.judge(Hover(), at(0, 0, 5.2, altitude_m=5.2), NOW) == Verdict(Hover())
@@ -258,7 +258,7 @@ def test_a_hover_above_a_lowered_ceiling_comes_down() -> None:
 
 
 def test_a_hover_above_a_lowered_ceiling_does_not_sink_into_a_zone() -> None:
-    """It sank 0.96 m deep into a zone that was below it, and nobody was told."""
+    """It sank 0.96 m deep into a zone below it without any notice."""
     people = Box((-1.5, -1.5, 0.0), (1.5, 1.5, 1.8))
     airspace = Airspace(AirspaceSettings(Limits(altitude=1.0), Space(zones=(people,))))
     z, told, last = 2.4, set[str](), Verdict()
@@ -272,7 +272,7 @@ def test_a_hover_above_a_lowered_ceiling_does_not_sink_into_a_zone() -> None:
 
 
 def test_a_ceiling_is_not_lowered_into_a_zone_below_the_vehicle(bench: Bench) -> None:
-    """A vehicle with a ceiling of its own sank to it by itself, 0.96 m deep into a zone, whatever was commanded."""
+    """A vehicle with its own ceiling sank to it, 0.96 m deep into a zone, regardless of the commands."""
     pilot = bench.airborne()
     pilot.ask(SetParameter(ZONES, "people: box -1.5 -1.5 0 1.5 1.5 1.8", pilot.lease))
     bench.driver.report(position_m=(0.0, 0.0, 2.4), yaw_rad=0.0, altitude_m=2.4)
@@ -299,7 +299,7 @@ def test_no_take_off_in_a_zone_or_into_one() -> None:
     assert airspace.judge(Takeoff(), None, NOW, new=True).action == Takeoff(), "a vehicle may not know its position"
 
 
-def test_safety_as_they_are_written() -> None:
+def test_parsing_zones() -> None:
     assert parse_zones("") == parse_zones(" ; ") == ()
     assert parse_zones(" the  old tree :cylinder 1 2 0.5 0 3") == (Cylinder(1.0, 2.0, 0.5, 0.0, 3.0, "the old tree"),)
     assert str(parse_zones("table: box 3 3 2 1 1 0")[0]) == "table: box 1 1 0 3 3 2"
@@ -325,12 +325,12 @@ def test_safety_as_they_are_written() -> None:
         ("tree: bush: box 1 2 3 4 5 6", "a box or a cylinder"),
     ],
 )
-def test_safety_that_make_no_sense(text: str, why: str) -> None:
+def test_nonsensical_zones(text: str, why: str) -> None:
     with pytest.raises(ParameterError, match=why):
         parse_zones(text)
 
 
-def test_walls_that_go_not_together_are_refused() -> None:
+def test_contradicting_walls_are_refused() -> None:
     values = {f"{BOX}.{axis}_{end}": 0.0 for axis in "xyz" for end in ("low", "high")}
     check_written(f"{BOX}.x_low", -1.0, values.__getitem__)
     with pytest.raises(ParameterError, match="below the box's other wall, 0 m"):
@@ -340,7 +340,7 @@ def test_walls_that_go_not_together_are_refused() -> None:
     check_written("limits.tilt", 0.1, values.__getitem__)
 
 
-def test_nothing_is_looked_at_unless_it_is_asked_for() -> None:
+def test_nothing_is_checked_unless_configured() -> None:
     values: dict[str, float] = {
         f"{BOX}.{axis}_{end}": far for axis in "xyz" for end, far in (("low", -1e4), ("high", 1e4))
     }
@@ -350,7 +350,7 @@ def test_nothing_is_looked_at_unless_it_is_asked_for() -> None:
         return space_of(number, {ZONES: zones, ROOM: room}.__getitem__)
 
     assert not space().walled
-    assert not space(room="box -1 -1 0 1 1 2").walled, "a room refuses places and shortens nothing"
+    assert not space(room="box -1 -1 0 1 1 2").walled, "a room refuses targets and shortens nothing"
     only = space("cylinder 0 0 1 0 1")
     assert only.walled
     assert only == Space(None, None, (Cylinder(0.0, 0.0, 1.0, 0.0, 1.0),))
@@ -367,11 +367,11 @@ def test_nothing_is_looked_at_unless_it_is_asked_for() -> None:
         ("box 0 0 0 1 1 1; box 2 2 2 3 3 3", None),
     ],
 )
-def test_a_room_is_what_a_driver_reports_as_one_box(text: str, room: Box | None) -> None:
+def test_a_room_is_a_drivers_single_box(text: str, room: Box | None) -> None:
     assert space_of(lambda _: 1e4, {ZONES: "", ROOM: text}.__getitem__).room == room
 
 
-def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
+def test_the_proxy_enforces_and_reports_the_parameters(bench: Bench) -> None:
     pilot = bench.airborne()
 
     def write(name: str, value: Value) -> object:
@@ -382,7 +382,7 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     assert isinstance(refused, Refused)
     assert "a box or a cylinder" in refused.message
     pilot.command(Velocity(1.5))
-    assert bench.driver.told[-1] == Velocity(1.5), "its position is not known"
+    assert bench.driver.told[-1] == Velocity(1.5), "its position is unknown"
     bench.driver.report(position_m=(1.9, 0.0, 1.0), yaw_rad=0.0)
     pilot.command(Velocity(1.5))
     applied = bench.driver.told[-1]
@@ -403,7 +403,7 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     assert bench.driver.told[-1] == Velocity(1.5)
 
 
-def test_thin_zones_are_kept_clear_of_as_if_they_were_thicker_and_that_is_told(bench: Bench) -> None:
+def test_thin_zones_are_enforced_as_if_thicker_and_reported(bench: Bench) -> None:
     pilot = bench.airborne()
     thin = Space(zones=parse_zones("net: box 1 -5 0 1.05 5 3; mast: cylinder 3 3 0.02 0 0.1; box 5 5 0 6 6 3"))
     net, mast, thick = thin.barriers
@@ -421,8 +421,8 @@ def test_thin_zones_are_kept_clear_of_as_if_they_were_thicker_and_that_is_told(b
     assert "net: box 1 -5 0 1.05 5 3" in event.text
 
 
-def test_a_zone_with_a_name_is_told_by_it(bench: Bench) -> None:
-    """Its name was in what was refused, and not in what was shortened."""
+def test_a_zone_with_a_name_is_reported_by_it(bench: Bench) -> None:
+    """Its name was in refusals, but not in shortened set-points."""
     pilot = bench.airborne()
     zones = "tree: cylinder 2 0 0.5 0 3; pond: box -3 -1 0 -2 1 3; box 5 5 0 6 6 3"
     assert isinstance(pilot.ask(SetParameter(ZONES, zones, pilot.lease)), ParameterValue)
@@ -448,8 +448,8 @@ def test_a_refused_take_off_leaves_the_vehicle_where_it_stands(bench: Bench) -> 
     assert bench.driver.told == []
 
 
-def test_each_step_of_the_software_autopilot_is_judged_and_what_stops_it_is_told() -> None:
-    """A wall that stopped a ``go_to`` was told to nobody, and a take-off went through the upper wall of the box."""
+def test_each_step_of_the_software_autopilot_is_judged_and_stops_are_reported() -> None:
+    """A wall that stopped a ``go_to`` was not reported, and a take-off crossed the top of the box."""
     with Bench(ALL - {"position", "takeoff", "hover", "land", "attitude"}) as bench:
         pilot = bench.pilot()
         pilot.ask(SetParameter(f"{BOX}.z_high", 0.7, pilot.lease))
@@ -463,7 +463,7 @@ def test_each_step_of_the_software_autopilot_is_judged_and_what_stops_it_is_told
         assert (event.data["limit"], event.app) == (BOX, "pilot")
 
 
-def test_walls_that_stop_a_vehicle_on_its_way_to_a_place_are_told() -> None:
+def test_walls_that_stop_a_vehicle_on_its_way_are_reported() -> None:
     with Bench(ALL - {"position"}) as bench:
         pilot = bench.airborne()
         pilot.ask(SetParameter(ZONES, "pillar: cylinder 2 0 0.5 0 3", pilot.lease))
@@ -482,8 +482,8 @@ def test_walls_that_stop_a_vehicle_on_its_way_to_a_place_are_told() -> None:
 @pytest.mark.parametrize(
     ("action", "farthest"), [(Velocity(2.0), 2.0), (Attitude(pitch=0.2), 2.15)], ids=["velocity", "attitude"]
 )
-def test_the_simulated_drone_does_not_come_through_a_net(action: Velocity | Attitude, farthest: float) -> None:
-    """A no-fly zone of 5 cm was flown through at default settings; 0.3 m of overshoot by attitude are documented."""
+def test_the_simulated_drone_does_not_cross_a_net(action: Velocity | Attitude, farthest: float) -> None:
+    """A no-fly zone of 5 cm was crossed at default settings; an overshoot of 0.3 m by attitude is documented."""
     with rehearse("sim://?world=empty&cameras=none&wind=0.5", radio=Radio(seed=1)) as drone:
         drone.config[ZONES] = "net: box 2 -50 0 2.05 50 50"
         drone.takeoff()

@@ -1,4 +1,4 @@
-"""A proxy as a process: how it says that it is ready, and how it ends."""
+"""A proxy as a process: how it reports readiness, and how it ends."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def rest_of(process: subprocess.Popen[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_lands_first_and_tells_why(start: Start, number: signal.Signals) -> None:
+def test_a_signal_lands_first_and_has_a_reason(start: Start, number: signal.Signals) -> None:
     process = start()
     app = flying()
     process.send_signal(number)
@@ -77,13 +77,13 @@ def test_a_signal_lands_first_and_tells_why(start: Start, number: signal.Signals
     app.end.close()
 
 
-def test_the_end_of_the_parent_lands_what_flies(start: Start) -> None:
-    """A program that is killed over its private proxy leaves nobody who could fly, and nobody who starts it again."""
+def test_the_end_of_the_parent_lands_a_flying_vehicle(start: Start) -> None:
+    """A program killed over its private proxy leaves no one to fly, and no one to restart it."""
     reading, writing = os.pipe()
     try:
         process = start(str(reading), descriptors=(reading,))
         app = flying()
-        process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is the parent's to handle
+        process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is for the parent
         app.sync()
     finally:
         os.close(reading)
@@ -93,7 +93,7 @@ def test_the_end_of_the_parent_lands_what_flies(start: Start) -> None:
     app.end.close()
 
 
-def test_in_this_process_it_gives_everything_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_this_process_it_releases_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
     drivers: list[Toy] = []
 
@@ -114,10 +114,10 @@ def test_in_this_process_it_gives_everything_back(tmp_path: Path, monkeypatch: p
     assert list((tmp_path / "run").iterdir()) == []
 
 
-def test_a_process_that_fails_lands_first_too(
+def test_a_failing_process_lands_first_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What looks after the keys raised, and the process left what flew in the air: what can't hover by itself falls."""
+    """The key check raised, and the process abandoned the flying vehicle, which falls if it can't hover by itself."""
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
     monkeypatch.setattr("skyloop.proxy.serve.make_driver", lambda _uri: Toy(monotonic_ns))
     apps: list[App] = []
@@ -141,7 +141,7 @@ def test_a_descriptor_that_is_not_open_is_refused() -> None:
         serve("fake://", "toy", parent_fd=reading)
 
 
-def test_a_process_that_serves_hands_the_interpreter_over_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_serving_process_hands_over_the_interpreter_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[float] = []
     monkeypatch.setattr("sys.setswitchinterval", told.append)
 

@@ -1,4 +1,4 @@
-"""The rate of a stream that follows its path, on paths that are simulated."""
+"""The rate of a stream that follows its path, on simulated paths."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ PERIOD_MS = 33
 
 @dataclass
 class Run:
-    """A stream over a path whose capacity changes, a millisecond a step."""
+    """A stream over a path with changing capacity, in steps of a millisecond."""
 
     capacity_kbit_s: Callable[[int], float]  #: at a time [ms]
     loss: float = 0.0
     most_kbit_s: int = 3000
     one_way_ms: int = 20
-    ages_ms: list[tuple[int, int]] = field(default_factory=list)  #: when captured, and how old on arrival
-    rates: list[float] = field(default_factory=list)  #: each 100 ms
+    ages_ms: list[tuple[int, int]] = field(default_factory=list)  #: capture time, and age on arrival
+    rates: list[float] = field(default_factory=list)  #: every 100 ms
 
     def go(self, length_ms: int, seed: int = 0) -> Run:
         rng, rate = random.Random(seed), StreamRate(self.most_kbit_s, 0)
-        queue: deque[list[float]] = deque()  # bytes left, number, captured
+        queue: deque[list[float]] = deque()  # bytes left, number, capture time
         arriving: deque[tuple[int, int]] = deque()
         seq, budget = 0, 0.0
         for ms in range(length_ms):
@@ -63,10 +63,10 @@ class Run:
 
 
 @pytest.mark.parametrize("kbit_s", [300, 1000, 2500])
-def test_a_steady_path_is_used_and_not_filled(kbit_s: int) -> None:
+def test_a_steady_path_is_used_but_not_filled(kbit_s: int) -> None:
     run = Run(lambda _: kbit_s).go(30_000)
     later = run.rates[150:]
-    assert 0.5 * kbit_s <= sum(later) / len(later) <= 1.1 * kbit_s  # what is too much is not begun
+    assert 0.5 * kbit_s <= sum(later) / len(later) <= 1.1 * kbit_s  # excess pictures are not started
     assert run.age_ms(0.95, since_ms=5000) <= 150
     assert len(run.ages_ms) > 0.7 * 30_000 / PERIOD_MS
 
@@ -75,23 +75,23 @@ def test_a_wide_path_takes_the_most() -> None:
     assert Run(lambda _: 50_000).go(15_000).rates[-1] == 3000
 
 
-def test_after_a_fall_of_the_capacity_delay_comes_first_and_the_rate_comes_back() -> None:
+def test_after_a_fall_of_the_capacity_delay_comes_first_and_the_rate_recovers() -> None:
     run = Run(lambda ms: 400 if 10_000 <= ms < 20_000 else 2500).go(40_000)
     ages = [age for captured, age in run.ages_ms if captured >= 10_000]
-    assert max(ages) < 1000  # two pictures of before the fall
+    assert max(ages) < 1000  # two pictures from before the fall
     assert sum(age > 250 for age in ages) <= 4
     assert run.rates[199] < 450
     assert run.rates[-1] > 1200
 
 
-def test_an_uneven_path_that_carries_enough_is_used() -> None:
+def test_an_uneven_path_with_enough_capacity_is_used() -> None:
     run = Run(lambda ms: 0 if ms % 300 < 70 else 2500).go(30_000)
     later = run.rates[150:]
     assert sum(later) / len(later) > 1000
     assert run.age_ms(0.95, since_ms=5000) <= 150
 
 
-def test_while_nothing_passes_little_is_sent_and_soon_after_it_goes_on() -> None:
+def test_little_is_sent_during_a_stall_and_it_resumes_soon_after() -> None:
     run = Run(lambda ms: 0 if 10_000 <= ms < 15_000 else 1500).go(20_000)
     stuck = [captured for captured, _ in run.ages_ms if 10_000 <= captured < 15_000]
     assert len(stuck) <= 25
@@ -99,16 +99,16 @@ def test_while_nothing_passes_little_is_sent_and_soon_after_it_goes_on() -> None
     assert run.age_ms(1.0, since_ms=15_500) < 200
 
 
-def test_on_a_path_that_is_silent_now_and_then_the_rate_stays_where_few_pictures_are_late() -> None:
+def test_on_a_path_with_pauses_the_rate_stays_where_few_pictures_are_late() -> None:
     often = Run(lambda ms: 0 if ms % 1000 < 150 else 2000).go(60_000)
     seldom = Run(lambda ms: 0 if ms % 10_000 < 150 else 2000).go(60_000)
-    assert min(often.rates[50:]) >= 270, "below that the silences are the path's own"
+    assert min(often.rates[50:]) >= 270, "below that, the silences are the path's own"
     assert sum(often.rates[200:]) < 0.7 * sum(seldom.rates[200:])
     for run in (often, seldom):
         assert run.age_ms(0.99, since_ms=5000) < 283
 
 
-def test_over_a_mobile_network_the_picture_is_seldom_older_than_it_must_be() -> None:
+def test_over_a_mobile_network_pictures_are_rarely_older_than_necessary() -> None:
     trace, seconds = traces.synthetic(), 60
     run = Run(lambda ms: trace.kbit(ms, ms + 1) * 1000, most_kbit_s=1843).go(seconds * 1000)
     came = sorted((captured + age, captured) for captured, age in run.ages_ms)
@@ -124,7 +124,7 @@ def test_over_a_mobile_network_the_picture_is_seldom_older_than_it_must_be() -> 
     assert sum(run.rates) / len(run.rates) > 300
 
 
-def test_while_the_path_stands_still_a_small_picture_is_sent_now_and_then() -> None:
+def test_a_small_picture_is_sent_now_and_then_during_a_stall() -> None:
     rate = StreamRate(2000, 0)
     for seq in range(1, 4):
         rate.sent(seq, 1000, seq * 33 * MS)
@@ -141,7 +141,7 @@ def test_while_the_path_stands_still_a_small_picture_is_sent_now_and_then() -> N
     assert rate.kbit_s == pytest.approx(before / 2), "it fell once"
 
 
-def test_the_longer_the_path_stands_still_the_less_waits_in_it_and_a_young_picture_goes_first_after_it() -> None:
+def test_longer_stalls_queue_less_and_a_fresh_picture_comes_first() -> None:
     rate = StreamRate(2000, 0)
     for seq in range(1, 4):
         rate.sent(seq, 1000, seq * 33 * MS)
@@ -157,10 +157,10 @@ def test_the_longer_the_path_stands_still_the_less_waits_in_it_and_a_young_pictu
     assert len([ms for ms in begun if 500 < ms < 4500]) <= 12
     assert all(1000 * SELDOM_S <= pause <= 1000 * SELDOM_S + 33 for pause in pauses[-4:])
     rate.acknowledged(4, 8230 * MS)  # long given up
-    assert rate.may_send(8231 * MS), "something passes again"
+    assert rate.may_send(8231 * MS), "the path is open again"
     for again in range(1, 4):
         rate.sent(seq + again, 1000, (8231 + again) * MS)
-    assert not rate.may_send(8240 * MS), "and then as ever"
+    assert not rate.may_send(8240 * MS), "and then as usual"
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.1])
@@ -175,7 +175,7 @@ def test_loss_does_not_end_the_stream(loss: float) -> None:
         st.tuples(st.sampled_from(("send", "ack", "wait")), st.integers(0, 60), st.integers(0, 5000)), max_size=200
     )
 )
-def test_whatever_is_acknowledged_the_rate_stays_in_its_range_and_sending_goes_on(
+def test_the_rate_stays_in_its_range_and_sending_continues_whatever_is_acknowledged(
     events: list[tuple[str, int, int]],
 ) -> None:
     rate, now_ns, seq = StreamRate(2000, 0), 0, 0
@@ -190,7 +190,7 @@ def test_whatever_is_acknowledged_the_rate_stays_in_its_range_and_sending_goes_o
     assert rate.may_send(now_ns + round(2 * LOST_S * 1e9))
 
 
-def test_what_was_never_sent_changes_nothing() -> None:
+def test_acknowledgements_of_unsent_pictures_change_nothing() -> None:
     rate = StreamRate(2000, 0)
     rate.acknowledged(7, MS)
     rate.sent(1, 1000, 2 * MS)
@@ -198,7 +198,7 @@ def test_what_was_never_sent_changes_nothing() -> None:
     assert (rate.kbit_s, rate.lost, rate.wait_s) == (300, 0, 0.0)
 
 
-def test_what_is_forgotten_holds_nothing_up() -> None:
+def test_forgotten_pictures_delay_nothing() -> None:
     rate = StreamRate(2000, 0)
     for seq in range(1, 5):
         rate.sent(seq, 5000, seq * MS)

@@ -1,4 +1,4 @@
-"""The proxy's encoded video, with a vehicle and a clock that a test moves."""
+"""The proxy's encoded video, with a vehicle and a clock moved by the test."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LENS = Intrinsics(60.0, 60.0, 31.5, 23.5)
 
 
 def shoot(bench: Bench, value: int = 90, size: tuple[int, int] = (64, 48), **fields: Any) -> None:
-    """Let the vehicle give a picture, a thirtieth of a second after the last."""
+    """Let the vehicle send a picture, a thirtieth of a second after the last."""
     bench.clock.advance(0.033)
     width, height = size
     pixels = np.full((height, width, 3), value, np.uint8)
@@ -67,7 +67,7 @@ def wait_for(app: App, count: int) -> list[EncodedFrame]:
 
 
 def shown(bench: Bench, app: App, count: int, **fields: Any) -> list[EncodedFrame]:
-    """Take so many pictures, each encoded before the next."""
+    """Send ``count`` pictures, each encoded before the next."""
     for _ in range(count):
         before = len(pictures(app))
         shoot(bench, **fields)
@@ -101,7 +101,7 @@ def test_the_vehicle_knows_how_many_frames_are_used(bench: Bench) -> None:
     assert publisher.wanted_fps("front") == math.inf
 
 
-def test_nothing_is_encoded_for_nobody(bench: Bench) -> None:
+def test_nothing_is_encoded_without_viewers(bench: Bench) -> None:
     app = watcher(bench)
     assert bench.proxy.publisher.wants("front")
     shown(bench, app, 1)
@@ -117,7 +117,7 @@ def test_nothing_is_encoded_for_nobody(bench: Bench) -> None:
 def test_other_formats_of_pixels(bench: Bench, encoding: Encoding, channels: int) -> None:
     app = watcher(bench)
     pixels = np.full((48, 64, channels), 30, np.uint8)
-    pixels[..., 0] = 200  # red, where there are colours
+    pixels[..., 0] = 200  # red, in colour formats
     assert bench.driver.sink is not None
     bench.driver.sink.frame("front", pixels, bench.clock(), width=64, height=48, encoding=encoding)
     (picture,) = wait_for(app, 1)
@@ -125,7 +125,7 @@ def test_other_formats_of_pixels(bench: Bench, encoding: Encoding, channels: int
     assert np.allclose(image(picture).mean(axis=(0, 1)), expected, atol=12)
 
 
-def test_frames_that_come_as_jpeg_are_encoded_and_damaged_ones_reported(bench: Bench) -> None:
+def test_jpeg_frames_are_encoded_and_damaged_ones_reported(bench: Bench) -> None:
     cv2 = pytest.importorskip("cv2", reason="JPEG needs OpenCV")
     app = watcher(bench)
     _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 120, np.uint8))
@@ -140,7 +140,7 @@ def test_frames_that_come_as_jpeg_are_encoded_and_damaged_ones_reported(bench: B
         assert time.monotonic() < deadline
         time.sleep(0.002)
     assert "can't be encoded" in bench.published(EventKind.DRIVER_ERROR)[0].text
-    assert shown(bench, app, 1)[0].key, "it begins anew"
+    assert shown(bench, app, 1)[0].key, "it restarts"
 
 
 def test_a_camera_that_changes_its_size(bench: Bench) -> None:
@@ -151,7 +151,7 @@ def test_a_camera_that_changes_its_size(bench: Bench) -> None:
     assert image(larger).shape == (60, 80, 3), "both are even"
 
 
-def test_key_pictures_are_made_when_asked_for_and_not_too_often(bench: Bench) -> None:
+def test_key_pictures_are_made_on_request_and_not_too_often(bench: Bench) -> None:
     app = watcher(bench)
     shown(bench, app, 2)
     bench.clock.advance(KEY_NS / 1e9)
@@ -168,7 +168,7 @@ def test_key_pictures_are_made_when_asked_for_and_not_too_often(bench: Bench) ->
     assert shown(bench, app, 1)[0].key
 
 
-def test_reports_of_what_is_no_stream_are_malformed(bench: Bench) -> None:
+def test_reports_on_unknown_streams_are_malformed(bench: Bench) -> None:
     app = watcher(bench)
     for topic in ("feedback", "stream/front?kbit_s=77"):
         assert app.end.send(encode(StreamReport(topic, 1)))
@@ -176,7 +176,7 @@ def test_reports_of_what_is_no_stream_are_malformed(bench: Bench) -> None:
     assert "a report of 'feedback'" in event.text
 
 
-def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
+def test_a_form_for_one_subscriber_follows_its_acknowledgements(bench: Bench) -> None:
     app = watcher(bench, MINE)
     (form,) = bench.proxy.publisher.streams.known
     for _ in range(60):
@@ -192,7 +192,7 @@ def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
     assert form.skipped >= 12
 
 
-def test_who_comes_again_over_a_new_link_gets_a_key_at_once(bench: Bench) -> None:
+def test_a_returning_subscriber_gets_a_key_picture_at_once(bench: Bench) -> None:
     app = watcher(bench, MINE)
     for _ in range(20):  # the link is lost: nothing is acknowledged
         shoot(bench)
@@ -210,10 +210,10 @@ def test_who_comes_again_over_a_new_link_gets_a_key_at_once(bench: Bench) -> Non
     assert form.skipped == skipped
 
 
-def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(bench: Bench) -> None:
+def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_later(bench: Bench) -> None:
     app = watcher(bench, MINE)
     (form,) = bench.proxy.publisher.streams.known
-    form._kbit_s = 5000  # the pictures are larger than the camera said
+    form._kbit_s = 5000  # the pictures are larger than the camera announced
     rate = form._rate
     assert rate is not None
     rate.acknowledged = lambda *_: None  # type: ignore[method-assign]
@@ -244,7 +244,7 @@ def header(seq: int) -> FrameHeader:
     return FrameHeader("front", seq, seq * 33_000_000, 0, 64, 48, Encoding.BGR8, 64 * 48 * 3)
 
 
-def test_the_newest_frame_takes_the_place_of_one_that_waits(
+def test_the_newest_frame_replaces_a_waiting_one(
     form: tuple[StreamForm, list[EncodedFrame], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, came, _ = form
@@ -271,7 +271,7 @@ def test_the_newest_frame_takes_the_place_of_one_that_waits(
     assert made.skipped == 2
 
 
-def test_an_encoder_that_fails_is_reported_and_made_anew(
+def test_a_failed_encoder_is_reported_and_replaced(
     form: tuple[StreamForm, list[EncodedFrame], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, came, failed = form
@@ -290,7 +290,9 @@ def test_an_encoder_that_fails_is_reported_and_made_anew(
     assert came[0].key
 
 
-def test_without_pyav_a_form_is_refused_with_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyav_a_form_is_refused_with_the_package_to_install(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def missing(purpose: str) -> None:
         raise MissingExtraError(purpose, "video")
 
@@ -300,7 +302,7 @@ def test_without_pyav_a_form_is_refused_with_what_to_install(bench: Bench, monke
     assert "skyloop install video" in event.text
 
 
-def test_the_vehicles_own_pictures_come_in_pieces_if_they_are_large(bench: Bench) -> None:
+def test_large_pictures_of_the_vehicle_are_split(bench: Bench) -> None:
     app = watcher(bench, "stream/front")
     sink = bench.driver.sink
     assert sink is not None
@@ -329,19 +331,19 @@ def test_the_vehicles_own_pictures_come_in_pieces_if_they_are_large(bench: Bench
         "video/front?encoding=h264&kbit_s=3000000",
     ],
 )
-def test_topics_that_make_no_sense_are_malformed(bench: Bench, topic: str) -> None:
+def test_nonsensical_topics_are_malformed(bench: Bench, topic: str) -> None:
     app = watcher(bench, topic)
     assert len(app.told(EventKind.PACKET_MALFORMED)) == 1
     assert bench.proxy.publisher.streams.known == ()
 
 
-def test_a_request_says_what_is_wrong_with_it() -> None:
+def test_a_request_is_refused_with_its_fault() -> None:
     with pytest.raises(UsageError, match="1 to 32 letters"):
         VideoRequest("front", encoding="h264", subscriber="x" * 33)
 
 
 class OwnStream:
-    """A camera that sends H.264 itself, 15 pictures a second with a key each second, over a path that is played."""
+    """A camera that sends its own H.264, 15 pictures a second with a key each second, over a scripted path."""
 
     def __init__(self, kbit_s: int) -> None:
         self.clock = ManualClock(10**12)
@@ -356,7 +358,7 @@ class OwnStream:
         self.rate = self.form._rate
 
     def play(self, seconds: float, *, round_trip_s: float = 0.02, path_kbit_s: float = 1e9) -> list[EncodedFrame]:
-        """Let the vehicle send for some time; return what was handed on of it."""
+        """Let the vehicle send for some time; return its forwarded pictures."""
         before = len(self.sent)
         for _ in range(round(seconds * 15)):
             self.clock.advance(1 / 15)
@@ -372,7 +374,7 @@ class OwnStream:
         return self.sent[before:]
 
 
-def test_the_vehicles_own_pictures_are_handed_on_from_a_key_while_the_path_carries_them() -> None:
+def test_the_vehicles_own_pictures_are_forwarded_from_a_key_picture_on_while_the_path_carries_them() -> None:
     camera = OwnStream(1000)
     assert camera.play(3.0) == [], "the rate is not known to be enough"
     camera.rate.kbit_s = 2000
@@ -381,10 +383,10 @@ def test_the_vehicles_own_pictures_are_handed_on_from_a_key_while_the_path_carri
     assert camera.form.passing
     assert [one.seq for one in handed] == list(range(handed[0].seq, handed[0].seq + len(handed)))
     assert {(one.topic, len(one.data)) for one in handed} == {(MINE, 1000 * 1000 // 8 // 15)}
-    assert not camera.form.wants(header(1), 1), "nothing is encoded meanwhile"
+    assert not camera.form.wants(header(1), 1), "nothing is encoded at that time"
 
 
-def test_what_the_path_does_not_carry_is_encoded_again_and_tried_later_and_later() -> None:
+def test_pictures_beyond_the_paths_rate_are_encoded_and_retried_later_and_later() -> None:
     camera = OwnStream(1000)
     camera.play(3.0)
     camera.rate.kbit_s = 2000
@@ -392,7 +394,7 @@ def test_what_the_path_does_not_carry_is_encoded_again_and_tried_later_and_later
     assert camera.form.passing
     camera.rate.kbit_s = 300
     assert camera.play(0.2) == []
-    assert camera.form._needs_encoder, "what is encoded now begins with a key picture"
+    assert camera.form._needs_encoder, "the next encoded picture is a key picture"
     camera.rate.kbit_s = 2000
     assert camera.play(4.0) == []
     assert camera.play(3.0)
@@ -403,7 +405,7 @@ def test_what_the_path_does_not_carry_is_encoded_again_and_tried_later_and_later
     assert camera.play(4.0)
 
 
-def test_a_subscriber_that_needs_a_key_gets_one_that_is_encoded_until_the_vehicle_sends_the_next() -> None:
+def test_a_subscriber_that_needs_a_key_picture_gets_encoded_ones_until_the_vehicles_next() -> None:
     camera = OwnStream(1000)
     camera.play(3.0)
     camera.rate.kbit_s = 2000
@@ -414,7 +416,7 @@ def test_a_subscriber_that_needs_a_key_gets_one_that_is_encoded_until_the_vehicl
     assert camera.play(1.5)[0].key
 
 
-def test_a_vehicle_that_stops_to_send_its_own_pictures_has_its_frames_encoded() -> None:
+def test_a_vehicle_that_stops_sending_its_own_pictures_has_its_frames_encoded() -> None:
     camera = OwnStream(1000)
     camera.play(3.0)
     camera.rate.kbit_s = 2000
@@ -423,10 +425,10 @@ def test_a_vehicle_that_stops_to_send_its_own_pictures_has_its_frames_encoded() 
     camera.clock.advance(1.1)
     assert not camera.form.passing
     assert camera.form.wants(header(1), 1)
-    assert camera.form._needs_encoder, "what is encoded now begins with a key picture"
+    assert camera.form._needs_encoder, "the next encoded picture is a key picture"
 
 
-def test_only_a_form_that_asks_for_all_pictures_at_full_size_takes_the_vehicles_own() -> None:
+def test_only_a_form_for_all_pictures_at_full_size_forwards_the_vehicles_own() -> None:
     camera = CameraInfo("front", 640, 360, 30.0, stream="h264")
     for options in ("subscriber=me&scale=0.5", "max_fps=5&subscriber=me", "kbit_s=500"):
         topic = f"stream/front?{options}"

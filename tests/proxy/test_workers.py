@@ -1,4 +1,4 @@
-"""Workers of processors: who takes which frames, and whose results are handed on."""
+"""Workers of processors: shares of the frames, and relayed results."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def states(app: App) -> list[tuple[str, str]]:
     return [(str(event.app), str(event.data["state"])) for event in app.told(EventKind.PROCESSOR)]
 
 
-def test_shares_are_told_as_workers_come_and_go(bench: Bench) -> None:
+def test_shares_are_sent_as_workers_come_and_go(bench: Bench) -> None:
     eye, one = bench.join("eye"), worker(bench, "one")
     assert shares(one) == [(0, 1, 1)]
     two = worker(bench, "two")
@@ -65,7 +65,7 @@ def test_shares_are_told_as_workers_come_and_go(bench: Bench) -> None:
     assert states(eye) == [("one", "joined"), ("two", "joined"), ("one", "left")]
 
 
-def test_a_renewal_tells_the_share_again_and_is_no_event(bench: Bench) -> None:
+def test_a_renewal_repeats_the_share_without_an_event(bench: Bench) -> None:
     one = worker(bench, "one")
     for _ in range(3):
         bench.run(SILENT_S / 2)
@@ -74,7 +74,7 @@ def test_a_renewal_tells_the_share_again_and_is_no_event(bench: Bench) -> None:
     assert states(one) == [("one", "joined")]
 
 
-def test_who_falls_silent_loses_its_share_until_it_is_heard(bench: Bench) -> None:
+def test_a_silent_worker_loses_its_share_until_it_returns(bench: Bench) -> None:
     eye, one, two = bench.join("eye"), worker(bench, "one"), worker(bench, "two")
     bench.run(2 * SILENT_S, each=lambda: two.ask(asked()))
     assert shares(two)[-1] == (0, 1, 2)
@@ -85,7 +85,7 @@ def test_who_falls_silent_loses_its_share_until_it_is_heard(bench: Bench) -> Non
     assert states(eye)[2:] == [("one", "silent"), ("one", "back")]
 
 
-def test_who_is_busy_gives_its_share_to_the_others(bench: Bench) -> None:
+def test_a_busy_worker_gives_its_share_to_the_others(bench: Bench) -> None:
     eye, one, two = bench.join("eye"), worker(bench, "one"), worker(bench, "two")
     assert one.ask(asked(ready=False)) == Done()
     assert (shares(one)[-1], shares(two)[-1]) == ((0, 0, 2), (0, 1, 2))
@@ -95,14 +95,14 @@ def test_who_is_busy_gives_its_share_to_the_others(bench: Bench) -> None:
     assert states(eye)[2:] == [("one", "busy"), ("one", "back")]
 
 
-def test_all_take_all_where_that_is_chosen(bench: Bench) -> None:
+def test_all_workers_get_all_frames_if_chosen(bench: Bench) -> None:
     apps = [bench.join(name) for name in ("one", "two")]
     for app in apps:
         assert app.ask(asked(shared=False)) == Done()
     assert [shares(app)[-1] for app in apps] == [(0, 1, 2), (0, 1, 2)]
 
 
-def test_cameras_are_shared_apart(bench: Bench) -> None:
+def test_cameras_are_shared_separately(bench: Bench) -> None:
     one, two = bench.join("one"), bench.join("two")
     assert bench.driver.sink is not None
     bench.driver.sink.frame("bottom", np.zeros(3, np.uint8), 1, width=1, height=1)
@@ -124,7 +124,7 @@ def test_cameras_are_shared_apart(bench: Bench) -> None:
         ),
     ],
 )
-def test_one_name_is_one_code_and_one_way_to_share(bench: Bench, other: JoinProcessor, words: str) -> None:
+def test_one_name_has_one_code_and_one_way_to_share(bench: Bench, other: JoinProcessor, words: str) -> None:
     one, two = worker(bench, "one"), bench.join("two")
     refused = two.ask(other)
     assert isinstance(refused, Refused)
@@ -136,7 +136,7 @@ def test_one_name_is_one_code_and_one_way_to_share(bench: Bench, other: JoinProc
     assert two.ask(other) == Done()
 
 
-def test_one_application_works_for_a_few_processors_only(bench: Bench) -> None:
+def test_one_application_works_for_only_a_few_processors(bench: Bench) -> None:
     app = bench.join("one")
     for number in range(MAX_JOINED):
         assert app.ask(asked(f"p{number}")) == Done()
@@ -146,7 +146,7 @@ def test_one_application_works_for_a_few_processors_only(bench: Bench) -> None:
     assert app.ask(asked("p0")) == Done()
 
 
-def test_results_of_workers_are_handed_on_under_their_own_number(bench: Bench) -> None:
+def test_results_of_workers_are_relayed_under_their_own_number(bench: Bench) -> None:
     eye, one = bench.join("eye"), worker(bench, "one")
     eye.end.subscribe(results("detector"))
     eye.sync()
@@ -160,10 +160,10 @@ def test_results_of_workers_are_handed_on_under_their_own_number(bench: Bench) -
     assert one.end.send(encode(result(number=2)))
     one.sync()
     eye.sync()
-    assert sum(isinstance(sample, ProcessorResult) for sample in eye.others) == 3  # by either topic
+    assert sum(isinstance(sample, ProcessorResult) for sample in eye.others) == 3  # on either topic
 
 
-def test_results_of_others_are_refused_and_told(bench: Bench) -> None:
+def test_results_of_non_workers_are_refused_and_reported(bench: Bench) -> None:
     eye, one = bench.join("eye"), worker(bench, "one")
     eye.end.subscribe(RESULTS)
     for _ in range(5):
@@ -177,18 +177,18 @@ def test_results_of_others_are_refused_and_told(bench: Bench) -> None:
     assert "results.relayed" not in counters.counters
 
 
-def test_before_hello_nothing_is_taken(bench: Bench) -> None:
+def test_nothing_is_accepted_before_hello(bench: Bench) -> None:
     stranger, eye = bench.stranger(), bench.join("eye")
     refused = stranger.ask(asked())
     assert isinstance(refused, Refused)
     assert refused.code is Refusal.PROTOCOL
     assert stranger.end.send(encode(result()))
-    stranger.ask(asked())  # the answer comes after what was sent before was looked at
+    stranger.ask(asked())  # the answer comes after earlier packets have been handled
     told = eye.told(EventKind.PACKET_MALFORMED)
     assert "a result arrived before Hello" in told[0].text
 
 
-def test_shares_are_for_the_proxy_to_send(bench: Bench) -> None:
+def test_only_the_proxy_may_send_shares(bench: Bench) -> None:
     app = bench.join("one")
     assert app.end.send(encode(ProcessorShare("detector", "front", 0, 1, 1)))
     assert "ProcessorShare may only be sent by the proxy" in app.told(EventKind.PACKET_MALFORMED)[0].text

@@ -1,6 +1,6 @@
 """A proxy as a process with a toy vehicle: ``python -m tests.proxy.toy_process NAME [PARENT_FD]``.
 
-It writes what its driver was told to standard output. It takes off at once and lands within 50 ms.
+It writes the calls its driver received to standard output. It takes off at once and lands within 50 ms.
 """
 
 from __future__ import annotations
