@@ -1,4 +1,4 @@
-"""Proxies of several vehicles that do at once what they are told, and some that refuse."""
+"""Proxies for several vehicles that obey commands at once, some of which refuse actions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ QUICK = RedialPolicy(first_s=0.005, cap_s=0.05, hello_s=0.3, thresholds=Threshol
 
 
 class Stubborn(FakeVehicle):
-    """Refuses some actions, and stays as it is on others."""
+    """Refuses some actions, and ignores others."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class Field:
         return Swarm({name: self.connect(name) for name in self.vehicles}, **options)
 
     def broken(self, *names: str) -> None:
-        """These refuse to take off, from when everybody knows."""
+        """Make these vehicles refuse to take off; returns once their state is published."""
         self._become(names, FlightState.EMERGENCY)
 
     def mended(self, *names: str) -> None:

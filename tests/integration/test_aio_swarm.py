@@ -1,4 +1,4 @@
-"""A swarm for asyncio, over the memory transport, with the proxies of the swarm's own tests."""
+"""The asyncio swarm over the memory transport, with the proxies of the synchronous swarm's tests."""
 
 from __future__ import annotations
 
@@ -98,13 +98,13 @@ def test_awaited_without_a_block(field: Field) -> None:
     run(fly())
 
 
-def test_each_awaits_all_at_the_same_time(field: Field) -> None:
+def test_each_awaits_all_drones_concurrently(field: Field) -> None:
     async def fly() -> None:
         async with aio.swarm(*NAMES) as drones:
             all_there = asyncio.Barrier(len(NAMES))
 
             async def meet(drone: aio.Drone) -> str:
-                await all_there.wait()  # only if each waits for the others
+                await all_there.wait()  # set only if each drone waits for the others
                 return drone.name
 
             assert await drones.each(meet) == {name: name for name in NAMES}
@@ -129,7 +129,7 @@ def test_each_awaits_all_at_the_same_time(field: Field) -> None:
 
 
 def test_a_cancelled_each_flies_no_more(field: Field) -> None:
-    """Its coroutines went on, and took back each landing that was asked for since."""
+    """Its coroutines kept running, and took back each landing requested since."""
 
     async def fly() -> None:
         async with aio.swarm(*NAMES) as drones:
@@ -141,7 +141,7 @@ def test_a_cancelled_each_flies_no_more(field: Field) -> None:
                 await flying.wait()
                 try:
                     while True:
-                        drone.hover()  # which a cancelled wait does not refuse
+                        drone.hover()  # this one is not refused by the cancelled wait
                         await asyncio.sleep(0.01)
                 finally:
                     ended.append(drone.name)
@@ -163,7 +163,7 @@ def test_a_cancelled_each_flies_no_more(field: Field) -> None:
 def test_a_policy_that_lands_the_others_does_not_hold_up_the_event_loop(field: Field) -> None:
     others = [field.vehicles[name] for name in NAMES if name != "bravo"]
     for vehicle in others:
-        vehicle.ignores.add(Land)  # it lands when the event loop lets it
+        vehicle.ignores.add(Land)  # it lands when the event loop permits
 
     async def let_them_land() -> None:
         for vehicle in others:
@@ -194,7 +194,7 @@ def test_an_emergency_stop_is_a_plain_call(field: Field) -> None:
     run(fly())
 
 
-def test_what_cannot_be_connected_to(field: Field) -> None:
+def test_an_address_that_can_not_be_connected_to(field: Field) -> None:
     async def fly() -> None:
         with pytest.raises(SwarmError, match="connecting failed for 1 of 2"):
             await aio.swarm("alpha", "delta")
@@ -208,7 +208,7 @@ def test_what_cannot_be_connected_to(field: Field) -> None:
     run(fly())
 
 
-def test_whose_loop_gave_up_waiting_for_it_is_closed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drone_whose_loop_stopped_waiting_for_it_is_closed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[str] = []
 
     class Late:
@@ -233,10 +233,10 @@ def test_whose_loop_gave_up_waiting_for_it_is_closed(field: Field, monkeypatch: 
     run(fly())
 
 
-def test_it_has_what_the_other_swarm_has() -> None:
+def test_it_has_the_names_of_the_other_swarm() -> None:
     """Names, and the arguments of each method."""
     ours, theirs = _public(aio.Swarm), _public(skyloop.Swarm)
-    assert set(theirs) - set(ours) == {"fail"}, "the rest is there"
+    assert set(theirs) - set(ours) == {"fail"}, "everything else exists"
     for name in set(ours) & set(theirs) - {"active", "errors", "names", "spread"}:
         assert list(inspect.signature(ours[name]).parameters) == list(inspect.signature(theirs[name]).parameters), name
 

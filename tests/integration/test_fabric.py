@@ -1,4 +1,4 @@
-"""Client, fabric transport and proxy: flying over a network, video as each asks for it, clocks that differ."""
+"""Client, fabric transport and proxy: flying over a network, video in each requested form, clocks that differ."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_flight_over_the_network(far: Node) -> None:
         assert drone.link.application == "up"
 
 
-def test_frames_come_as_jpeg_from_afar_and_raw_from_near(node: Node) -> None:
+def test_frames_arrive_as_jpeg_from_afar_and_raw_from_near(node: Node) -> None:
     with node.connected() as drone:
         frame = drone.next_frame(timeout_s=WAIT_S)
         assert frame.shape == (24, 32, 3)
@@ -44,7 +44,7 @@ def test_frames_come_as_jpeg_from_afar_and_raw_from_near(node: Node) -> None:
         assert "video/front" in drone.stats
 
 
-def test_raw_frames_are_the_same_to_the_bit(node: Node) -> None:
+def test_raw_frames_are_bit_identical(node: Node) -> None:
     with node.connected() as drone:
         for frame in take(drone.frames(encoding="raw"), 5):
             assert frame.header.encoding == "bgr8"
@@ -91,7 +91,7 @@ def test_two_forms_of_one_camera_at_the_same_time(node: Node) -> None:
         assert next(large).shape == (24, 32, 3)
 
 
-def test_wishes_that_make_no_sense_are_refused(node: Node) -> None:
+def test_invalid_forms_are_refused(node: Node) -> None:
     with node.connected() as drone:
         for wrong in (
             {"scale": 0.0},
@@ -106,7 +106,7 @@ def test_wishes_that_make_no_sense_are_refused(node: Node) -> None:
                 next(drone.frames(**wrong))
 
 
-def test_nobody_encodes_what_nobody_wants(far: Node) -> None:
+def test_nothing_is_encoded_without_a_subscriber(far: Node) -> None:
     server = far.proxy.server
     with far.connected() as drone:
         frames = drone.frames(max_fps=20)
@@ -117,7 +117,7 @@ def test_nobody_encodes_what_nobody_wants(far: Node) -> None:
 
 
 class Wrong:
-    """A clock that is set wrong and runs fast."""
+    """A clock that has an offset and runs fast."""
 
     def __init__(self, ahead_s: float, drift: float) -> None:
         self._ahead_ns = round(ahead_s * 1e9)
@@ -130,12 +130,12 @@ class Wrong:
 
     @property
     def truth_ns(self) -> int:
-        """The proxy's clock less this one."""
+        """The proxy's clock minus this one."""
         return time.monotonic_ns() - self()
 
 
 @pytest.mark.parametrize("ahead_s", [-300.0, 86_400.0])
-def test_ages_are_true_to_their_uncertainty_whatever_the_clocks_say(far: Node, ahead_s: float) -> None:
+def test_ages_are_within_their_uncertainty_whatever_the_clocks(far: Node, ahead_s: float) -> None:
     clock = Wrong(ahead_s, drift=150e-6)
     with far.connected(scheduler=Scheduler(clock)) as drone:
         drone.takeoff()
@@ -157,7 +157,7 @@ def test_ages_are_true_to_their_uncertainty_whatever_the_clocks_say(far: Node, a
         delay = stats["feedback"].delay_s
         assert delay is not None
         assert delay.median > -stats["feedback"].uncertainty_s - 0.01
-        assert far.proxy.handler.airborne, "commands were not taken for stale"
+        assert far.proxy.handler.airborne, "the commands counted as stale"
 
 
 def test_one_host_needs_no_estimate() -> None:

@@ -1,4 +1,4 @@
-"""Observers that ask for less feedback, over each transport: what comes, and how the link is judged."""
+"""Observers that request less feedback, over each transport: the samples they get, and the state of their link."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def transport(
         yield request.param()
 
 
-def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
+def test_an_observer_gets_the_rate_its_consumers_request_and_its_link_is_up(
     transport: tuple[TransportServer, Dialer],
 ) -> None:
     server, dial = transport
@@ -93,7 +93,7 @@ def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
             wait_until(lambda: len(got) >= 5, "samples come")
             before = drone.stats["feedback"].count
             wait_until(lambda: len(got) >= 10, "samples come")
-            assert drone.stats["feedback"].count - before <= 7, "no more were sent than were asked for"
+            assert drone.stats["feedback"].count - before <= 7, "more were sent than requested"
             wait_until(lambda: drone.link.application is LinkState.UP, "the link is up")
             with drone.on_feedback(fast.append, max_hz=50):
                 both = "feedback?max_hz=50"
@@ -102,13 +102,13 @@ def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
             wait_until(lambda: server.subscribers(topic) == 1, "narrowed again")
         wait_until(lambda: server.subscribers(FEEDBACK) == 1, "all again, as nobody asks for less")
         wait_until(lambda: drone.feedback().skipped == 0, "whole")
-        assert drone.stats["feedback"].lost == 0 or isinstance(server, FabricServer)  # there it travels as datagrams
+        assert drone.stats["feedback"].lost == 0 or isinstance(server, FabricServer)  # the fabric sends it as datagrams
     assert {(sample.battery, sample.altitude_m) for sample in (*got, *fast)} == {(0.9, 1.0)}
     for one, other in itertools.pairwise(got):
         assert other.published_ns - one.published_ns > 0.05e9
 
 
-def test_reading_is_a_consumer_too_and_waiting_needs_all() -> None:
+def test_reading_counts_as_a_consumer_and_waiting_needs_all_samples() -> None:
     server, dial = _memory()
     with Beating(server) as beating, open_drone(dial, app="eye", access="observe") as drone:
         assert drone.feedback(max_hz=2).altitude_m == 1.0
@@ -127,7 +127,7 @@ def test_reading_is_a_consumer_too_and_waiting_needs_all() -> None:
         wait_until(lambda: server.subscribers(FEEDBACK) == 1 and not server.subscribers(slow), "all, for good")
 
 
-def test_a_pilot_is_sent_all_and_its_consumers_get_what_they_ask_for() -> None:
+def test_a_pilot_gets_all_samples_and_its_consumers_the_rate_they_request() -> None:
     server, dial = _memory()
     got: list[Feedback] = []
     with (
@@ -144,7 +144,7 @@ def test_a_pilot_is_sent_all_and_its_consumers_get_what_they_ask_for() -> None:
         assert other.published_ns - one.published_ns > 0.02e9
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_rates_are_refused() -> None:
     server, dial = _memory()
     with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
         calls: list[Callable[[], object]] = [
@@ -164,24 +164,24 @@ def _observing(proxy: ScriptedProxy) -> Iterator[Drone]:
         yield drone
 
 
-def test_a_proxy_of_an_earlier_version_sends_all_and_the_rest_is_left_out_here() -> None:
+def test_a_proxy_of_an_earlier_version_sends_all_samples_and_the_client_drops_the_rest() -> None:
     got: list[Feedback] = []
     with scripted() as proxy, _observing(proxy) as drone:
-        # It publishes nothing on the topic that was asked for, and answers pings all the same.
+        # It publishes nothing on the requested topic, but still answers pings.
         with drone.on_feedback(got.append, max_hz=4):
             wait_until(lambda: proxy.server.subscribers("feedback?max_hz=4") == 1, "it is asked for")
             wait_until(lambda: proxy.server.subscribers(FEEDBACK) == 1, "plain feedback instead")
             wait_until(lambda: len(got) >= 3, "samples come")
             wait_until(lambda: drone.link.application is LinkState.UP, "the link is up")
             with drone.on_feedback(got.append, max_hz=8):
-                assert proxy.server.subscribers("feedback?max_hz=8") == 0, "it is not asked for again"
+                assert proxy.server.subscribers("feedback?max_hz=8") == 0, "it is not requested again"
         assert proxy.server.subscribers(FEEDBACK) == 1
         newest = drone.feedback()
         wait_until(lambda: drone.feedback().seq > newest.seq + 3, "all come")
     assert got[1].published_ns - got[0].published_ns > 0.15e9
 
 
-def test_another_connection_asks_for_the_same() -> None:
+def test_another_connection_requests_the_same_rate() -> None:
     server, dial = _memory()
     with Beating(server), open_drone(dial, app="eye", access="observe", policy=QUICK) as drone:
         got: list[Feedback] = []
@@ -198,7 +198,7 @@ def test_another_connection_asks_for_the_same() -> None:
             assert server.subscribers(FEEDBACK) == 0
 
 
-def test_the_overview_comes_to_who_asks_for_it(transport: tuple[TransportServer, Dialer]) -> None:
+def test_the_overview_is_sent_on_request(transport: tuple[TransportServer, Dialer]) -> None:
     server, dial = transport
     got: list[Overview] = []
     with Beating(server), open_drone(dial, app="eye", access="observe") as drone:

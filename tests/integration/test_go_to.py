@@ -1,4 +1,4 @@
-"""Flights to a place and back to the start: the proxy's on simulated vehicles, the autopilots' own on emulated ones."""
+"""Flights to a place and back to the start: the proxy's on simulated vehicles, the autopilots' on emulated ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONG_S = 60.0
 
 @contextmanager
 def flown(vehicle: str) -> Iterator[Drone]:
-    """A drone in the air: the address of a simulated one, or the kind of an emulated autopilot."""
+    """A drone in the air, given the address of a simulated one or the kind of an emulated autopilot."""
     with ExitStack() as stack:
         address = vehicle
         if vehicle in KINDS:
@@ -58,8 +58,8 @@ def place(feedback: Feedback) -> tuple[float, float, float]:
 
 
 @pytest.mark.parametrize("vehicle", [SIM, *AUTOPILOTS])
-def test_a_place_that_is_refused_is_not_flown_to_afterwards(vehicle: str) -> None:
-    """``go_to(z=-4, wait=False)`` was refused, and the vehicle stood on the floor 3 s later: its repeats flew it."""
+def test_a_refused_place_is_not_flown_to_afterwards(vehicle: str) -> None:
+    """``go_to(z=-4, wait=False)`` was refused, yet 3 s later its repeats had flown the vehicle to the floor."""
     with flown(vehicle) as drone:
         refused: queue.Queue[str] = queue.Queue()
         drone.on_event(lambda event: refused.put(event.text) if event.kind is EventKind.COMMAND_REFUSED else None)
@@ -89,13 +89,15 @@ def test_round_trip(vehicle: str) -> None:
             there = drone.feedback()
             assert math.dist(place(there), (x + 2.0, y - 1.0, z + 0.6)) <= 0.2
             assert there.yaw_rad == pytest.approx(1.0, abs=0.16)
-            assert max(speeds) < 0.8 + 0.3, "no faster than it was asked to, but for what it overshoots"
+            assert max(speeds) < 0.8 + 0.3, "it exceeded the requested speed by more than its overshoot"
             drone.go_to(x=x, y=y, z=z, timeout_s=LONG_S)
             back = drone.feedback()
             assert math.dist(place(back), (x, y, z)) <= 0.2
             assert back.yaw_rad == pytest.approx(1.0, abs=0.2), "the heading is kept"
         kinds = {type(echo.applied) for echo in echoes if echo.app_id == 0}
-        assert kinds <= ({Hover} if native else {Velocity, Hover, *kinds}), "the proxy only steers what does not itself"
+        assert kinds <= ({Hover} if native else {Velocity, Hover, *kinds}), (
+            "the proxy steers only what the vehicle can't do itself"
+        )
         drone.velocity(up=0.2)
         drone.wait("flying", WAIT_S)
         drone.hover()
@@ -120,7 +122,7 @@ def test_a_place_on_the_earth(vehicle: str) -> None:
         origin, (x, y, z) = feedback.origin, place(feedback)
         assert origin is not None
         assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx(ORIGIN[:2], abs=2e-6), (
-            "the emulated earth is a little rounder than the autopilot's: 0.2 m at most here"
+            "the emulated earth is slightly rounder than the autopilot's: 0.2 m at most here"
         )
         latitude_deg, longitude_deg, altitude_m = origin.place_of((x + 2.0, y + 1.0, z + 0.5))
         drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m, timeout_s=LONG_S)
@@ -128,7 +130,7 @@ def test_a_place_on_the_earth(vehicle: str) -> None:
         height_m = place(drone.feedback())[2]
         latitude_deg, longitude_deg, _ = origin.place_of((x, y, z))
         drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, timeout_s=LONG_S)
-        assert math.dist(place(drone.feedback()), (x, y, height_m)) <= 0.35, "at the height that it had"
+        assert math.dist(place(drone.feedback()), (x, y, height_m)) <= 0.35, "it did not stay at its height"
         with pytest.raises(UsageError, match=r"must be within 100000 m of the origin"):
             drone.go_to(latitude_deg=0.0, longitude_deg=0.0)
 
@@ -142,7 +144,7 @@ def test_a_vehicle_that_does_not_know_its_place_on_the_earth_refuses_latitudes()
 
 
 @pytest.mark.parametrize("vehicle", [SIM, *AUTOPILOTS])
-def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
+def test_walls_apply_to_the_place_and_the_way_there(vehicle: str) -> None:
     with flown(vehicle) as drone:
         x, y, z = place(drone.feedback())
         drone.config["safety.box.x_high"] = x + 1.5
@@ -159,7 +161,7 @@ def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
         assert max(furthest) < x + 1.5 + 0.1
 
 
-def test_an_application_that_is_gone_on_the_way_gets_the_failsafe() -> None:
+def test_when_the_application_is_gone_on_the_way_the_failsafe_follows() -> None:
     with flown(SIM) as drone:
         x, y, z = place(drone.feedback())
         drone.go_to(x=x + 12.0, y=y, z=z, speed=1.0, wait=False)
@@ -170,7 +172,7 @@ def test_an_application_that_is_gone_on_the_way_gets_the_failsafe() -> None:
         assert drone.feedback().failsafe == "hover"
 
 
-def test_a_place_that_is_too_far_for_the_time_is_held_on_to() -> None:
+def test_a_place_too_far_for_the_time_out_is_still_flown_to() -> None:
     with flown(SIM) as drone:
         x, y, z = place(drone.feedback())
         with pytest.raises(NoAnswerError, match=r"position was not completed within 0\.5 s: the vehicle is flying"):
@@ -248,7 +250,7 @@ def test_back_to_the_start(vehicle: str) -> None:
 
 
 @pytest.mark.slow
-def test_above_its_start_it_stays_if_it_is_to() -> None:
+def test_above_its_start_it_stays_if_requested() -> None:
     with flown(SIM) as drone:
         x, y, z = place(drone.feedback())
         drone.go_to(x=x + 1.5, y=y, z=z, timeout_s=LONG_S)
@@ -257,7 +259,7 @@ def test_above_its_start_it_stays_if_it_is_to() -> None:
         assert across(place(drone.feedback()), start(drone)) < 0.35
 
 
-def test_a_low_battery_flies_it_back() -> None:
+def test_a_low_battery_makes_it_return() -> None:
     with flown(SIM + "&battery=0.5") as drone:
         x, y, z = place(drone.feedback())
         drone.go_to(x=x + 1.5, y=y, z=z, timeout_s=LONG_S)

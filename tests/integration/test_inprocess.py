@@ -1,4 +1,4 @@
-"""Client, transport and proxy in one process, with a vehicle that does at once what it is told."""
+"""Client, transport and proxy in one process, with a vehicle that obeys commands at once."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_a_frame_knows_the_state_at_its_capture(node: Node, drone: Drone) -> Non
     assert frame.feedback_reach_s < 0.5
     assert frame.feedback.yaw_rad is not None
     frames_of_yaw = frame.feedback.yaw_rad / 0.01
-    assert frames_of_yaw % 256 == pytest.approx(int(frame[0, 0, 0]), abs=0.01), "the picture shows the same number"
+    assert frames_of_yaw % 256 == pytest.approx(int(frame[0, 0, 0]), abs=0.01), "the picture and the state disagree"
 
 
 def test_parameters(node: Node, drone: Drone) -> None:
@@ -119,7 +119,7 @@ def test_parameters(node: Node, drone: Drone) -> None:
     assert {"limits.tilt", "command.max_age_s"} <= set(drone.config)
 
 
-def test_set_points_beyond_a_limit_are_clamped_and_told(node: Node, drone: Drone) -> None:
+def test_set_points_beyond_a_limit_are_clamped_with_an_event(node: Node, drone: Drone) -> None:
     echoes: list[Applied] = []
     drone.takeoff()
     with drone.on_command(echoes.append):
@@ -148,7 +148,7 @@ def test_pre_emption_by_priority_and_the_return(node: Node, drone: Drone) -> Non
     node.vehicle.applied.clear()
     seq = drone.feedback().seq
     drone.wait(lambda feedback: feedback.seq > seq + 10, WAIT_S)
-    assert not any(isinstance(action, Velocity) for action in node.vehicle.applied), "an old set-point was taken up"
+    assert not any(isinstance(action, Velocity) for action in node.vehicle.applied), "an old set-point was resumed"
     assert drone.velocity(forward=0.25)
     drone.wait(lambda _: applied(node, Velocity(forward=0.25)), WAIT_S)
 
@@ -181,7 +181,7 @@ def test_waiting_pilots_are_served_in_order(node: Node, drone: Drone) -> None:
     assert order == ["one", "two"]
 
 
-def test_one_flies_and_others_look_on(node: Node, drone: Drone) -> None:
+def test_one_flies_and_others_observe(node: Node, drone: Drone) -> None:
     with connected(node, "eye", access="observe") as eye, connected(node, "ear", access="observe") as ear:
         drone.takeoff()
         eye.wait("hovering", WAIT_S)
@@ -206,7 +206,7 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     node.proxy = Proxy(node.vehicle, node.server, name="alpha")
     node.proxy.handler.flight.began_before(
         node.proxy.clock() + BELIEF_NS
-    )  # as the note of its flight says to a named proxy that was killed
+    )  # as the flight record tells a named proxy that was killed
     started_s = time.monotonic()
     node.proxy.start()
     drone.wait(lambda _: drone.link.application is LinkState.UP and drone.authority.state == "held", WAIT_S)
@@ -243,7 +243,7 @@ def test_emergency(node: Node, drone: Drone) -> None:
     drone.takeoff()
 
 
-def test_a_pilot_whose_link_is_cut_leaves_a_hovering_then_landing_vehicle(node: Node) -> None:
+def test_the_vehicle_hovers_then_lands_when_the_pilots_link_is_cut(node: Node) -> None:
     steps: list[Failsafe] = []
     with connected(node, "eye", access="observe") as eye:
         eye.on_feedback(lambda feedback: steps.append(feedback.failsafe), inline=True)
@@ -260,7 +260,7 @@ def test_a_pilot_whose_link_is_cut_leaves_a_hovering_then_landing_vehicle(node: 
     assert order[:3] == [Failsafe.NONE, Failsafe.HOVER, Failsafe.LAND]
 
 
-def test_a_client_that_idles_keeps_a_hovering_vehicle(node: Node, drone: Drone) -> None:
+def test_an_idle_client_keeps_a_vehicle_hovering(node: Node, drone: Drone) -> None:
     drone.config["failsafe.hover_after_s"] = 0.1
     drone.takeoff()
     since_ns = drone.feedback().captured_ns
@@ -270,7 +270,7 @@ def test_a_client_that_idles_keeps_a_hovering_vehicle(node: Node, drone: Drone) 
 
 
 class Deaf:
-    """Takes nothing in."""
+    """Receives nothing."""
 
     def packet(self, packet: bytes) -> None: ...
     def frame(self, header: object, pixels: object, topic: str = "") -> None: ...

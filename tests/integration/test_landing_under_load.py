@@ -1,4 +1,4 @@
-"""A landing that is asked for while a loaded machine makes every command come too late. The clock is the test's."""
+"""A landing requested while an overloaded machine makes every command late. The test controls the clock."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_landing_whose_commands_all_came_too_late_is_completed() -> None:
             driver.report(state=FlightState.HOVERING)
             drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
 
-            usual_ns, checks.max_age_ns = checks.max_age_ns, -1  # nothing is young enough
+            usual_ns, checks.max_age_ns = checks.max_age_ns, -1  # no command is recent enough
             landing = user.submit(drone.land, timeout_s=3 * WAIT_S)
             wait_until(lambda: any(echo.asked == Land() for echo in list(witness.applied)), "the command came")
             bench.run(0.6, driver.report)

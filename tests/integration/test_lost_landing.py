@@ -1,4 +1,4 @@
-"""A vehicle that takes velocities only is landed in software while its link is out."""
+"""A vehicle that accepts only velocities is landed in software while its link is out."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from skyloop.transport.testing import wait_until
 pytestmark = pytest.mark.slow
 
 LONG_S = 30.0
-OUT_S = 17.0  #: longer than any landing from a metre takes
+OUT_S = 17.0  #: longer than any landing from one metre takes
 
 
-def test_nothing_says_that_it_has_landed_until_it_stands() -> None:
+def test_it_is_not_reported_as_landed_until_it_stands() -> None:
     server = MemoryServer("v")
     driver = make_driver("sim://?native=velocity&cameras=none&noise=0&wind=0&world=empty")
     with Proxy(driver, server, name="v") as proxy, open_drone(server.dial, app="me", on_exit="hover") as drone:

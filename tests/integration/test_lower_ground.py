@@ -1,4 +1,4 @@
-"""A flight controller without a landing of its own, landed beside the table that it took off from."""
+"""A flight controller without a landing function lands beside the table from which it took off."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ box = [{ name = "table", stands_at = [0, 0], size = [1.2, 1.2, 1], texture = "br
 
 
 def test_a_landing_over_lower_ground_ends_on_that_ground(tmp_path: Path) -> None:
-    """Its altimeter counts from the table: it is at zero a metre above the floor, where the vehicle still flies."""
+    """Its altimeter measures from the table: it reads zero a metre above the floor, while the vehicle still flies."""
     (tmp_path / "table.toml").write_text(TABLE)
     world = SimHost(with_racers(SimOptions(world=str(tmp_path / "table.toml"), seed=4, wind=0.0)))
     with ExitStack() as stack:

@@ -32,7 +32,7 @@ class Shared:
 
     @contextmanager
     def joined(self, app: str, *, priority: int = 16, **options: Any) -> Iterator[Drone]:
-        """A pilot, or an observer; gives everything back at the end without landing."""
+        """A pilot or an observer; at the end it releases everything without landing."""
         access = options.pop("access", "pilot")
         authority = Authority(priority=priority, **options)
         drone = open_drone(self.server.dial, app=app, access=access, authority=authority)
@@ -54,7 +54,7 @@ def held(drone: Drone) -> None:
     wait_until(lambda: drone.authority.state == "held", "it has the authority")
 
 
-def test_a_holder_that_grants_hands_over_and_has_it_back_later(shared: Shared) -> None:
+def test_a_holder_that_grants_a_request_hands_over_and_gets_it_back_later(shared: Shared) -> None:
     asked: list[TakeoverRequest] = []
 
     def grant(request: TakeoverRequest) -> bool:
@@ -77,7 +77,7 @@ def test_a_holder_that_grants_hands_over_and_has_it_back_later(shared: Shared) -
         assert alice.authority.lease > before
 
 
-def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Shared) -> None:
+def test_a_holder_that_declines_keeps_it_and_the_requester_gets_the_reason(shared: Shared) -> None:
     with shared.joined("alice") as alice, shared.joined("bob", stay=True) as bob:
         assert (bob.authority.state, bob.authority.holder, bob.authority.position) == ("queued", "alice", 1)
         alice.on_takeover(lambda _: "landing")
@@ -89,7 +89,7 @@ def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Share
     assert "within 3 s; alice: no: wait longer" in _busy(AuthorityStatus("queued", holder="alice"), 3.0, "alice: no")
 
 
-def test_who_does_not_answer_loses_it_after_the_time_to_ask(shared: Shared) -> None:
+def test_a_holder_that_does_not_answer_loses_it_after_the_time_to_answer(shared: Shared) -> None:
     with shared.joined("alice") as alice:
         alice.on_takeover(lambda _: None)
         alice.config["authority.ask_s"] = 0.2
@@ -98,7 +98,7 @@ def test_who_does_not_answer_loses_it_after_the_time_to_ask(shared: Shared) -> N
             wait_until(lambda: alice.authority.holder == "bob", "alice knows")
 
 
-def test_a_callback_that_raises_is_told_and_answers_nothing(shared: Shared) -> None:
+def test_a_callback_that_raises_is_reported_and_does_not_answer(shared: Shared) -> None:
     heard: list[Event] = []
 
     def fail(request: TakeoverRequest) -> bool:
@@ -114,7 +114,7 @@ def test_a_callback_that_raises_is_told_and_answers_nothing(shared: Shared) -> N
             alice.on_takeover("grant")  # type: ignore[arg-type]
 
 
-def test_a_line_with_expected_waits_moves_up(shared: Shared) -> None:
+def test_a_queue_with_expected_waits_moves_up(shared: Shared) -> None:
     with (
         shared.joined("alice", for_s=60.0) as alice,
         shared.joined("bob", stay=True, for_s=30.0) as bob,
@@ -132,26 +132,26 @@ def test_a_line_with_expected_waits_moves_up(shared: Shared) -> None:
             open_drone(shared.server.dial, app="dave")
 
 
-def test_whose_time_is_over_is_relieved_and_does_not_ask_again(shared: Shared) -> None:
+def test_a_holder_whose_time_is_over_is_relieved_and_does_not_ask_again(shared: Shared) -> None:
     heard: list[Event] = []
     with shared.joined("alice", priority=4, for_s=0.3) as alice:
         alice.on_event(heard.append)
         wait_until(lambda: any(e.kind is EventKind.AUTHORITY_EXPIRED for e in heard), "it is told")
-        assert alice.authority.state == "held"  # nobody else wants it
+        assert alice.authority.state == "held"  # there is no other request
         with shared.joined("bob", priority=16) as bob:
             wait_until(lambda: alice.authority.state == "none", "alice knows")
             assert bob.authority.state == "held"
             with pytest.raises(AuthorityError, match="request_authority"):
                 alice.hover()
-            alice.request_authority()  # on purpose, with its higher priority
+            alice.request_authority()  # explicitly, with its higher priority
             held(alice)
 
 
-def test_a_pilot_that_was_silent_finds_its_name_there_and_gets_a_new_lease(shared: Shared) -> None:
+def test_a_silent_pilot_finds_its_name_kept_and_gets_a_new_lease(shared: Shared) -> None:
     with shared.joined("alice") as alice, shared.joined("eve", access="observe") as eve:
         lease = alice.authority.lease
         transmit = alice._connection.transmit
-        alice._connection.transmit = lambda packet: True  # nothing leaves it any more
+        alice._connection.transmit = lambda packet: True  # nothing it sends gets out from now on
         kept = eve.wait(lambda feedback: not feedback.lease, WAIT_S)
         assert kept.owner == "alice"
         alice._connection.transmit = transmit
@@ -194,6 +194,6 @@ def test_with_asyncio(shared: Shared) -> None:
     ],
     ids=str,
 )
-def test_what_can_not_be_wished_for(wish: dict[str, Any]) -> None:
+def test_invalid_requests_are_refused(wish: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="must be"):
         authority_request(**wish)

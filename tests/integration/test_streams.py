@@ -1,4 +1,4 @@
-"""H.264 from the proxy to the application: encoded once, in any number of forms, decoded, damaged on the way."""
+"""H.264 from the proxy to the application: encoded once per form, decoded, and damaged on the way."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["far", "node"]
 
 
 class Watch:
-    """Takes the pictures of a stream while it is open, and reports each."""
+    """Receives the pictures of a stream while it is open, and reports each."""
 
     def __init__(self, stream: StreamChannel, *, reports: bool = True) -> None:
         self.stream = stream
@@ -72,7 +72,7 @@ def test_a_stream_begins_with_a_key_and_each_picture_is_one_whole_image(node: No
         assert [image.shape for image in images] == [(24, 32, 3)] * 10
 
 
-def test_frames_come_as_h264_from_afar_and_as_they_are_from_near(node: Node) -> None:
+def test_frames_arrive_as_h264_from_afar_and_raw_from_near(node: Node) -> None:
     with node.connected() as drone:
         frames = drone.frames(encoding="h264")
         for frame in take(frames, 5):
@@ -98,7 +98,7 @@ def test_smaller_and_fewer_pictures(far: Node) -> None:
         assert frames[-1].captured_ns - frames[0].captured_ns >= 370_000_000
 
 
-def test_many_watch_one_encoding(node: Node) -> None:
+def test_many_subscribers_share_one_encoding(node: Node) -> None:
     with node.connected() as one, node.connected(access="observe") as other:  # noqa: SIM117
         with (
             Watch(one._state.video.stream(kbit_s=400)) as first,
@@ -106,21 +106,21 @@ def test_many_watch_one_encoding(node: Node) -> None:
         ):
             first.take(3)
             (late, *_) = second.take(3)
-            assert late.key, "whoever comes later gets a key picture"
+            assert late.key, "a later subscriber starts with a key picture"
             (form,) = node.proxy.publisher.streams.known
             assert form.topic == "stream/front?kbit_s=400"
             same = {picture.seq: picture.data for picture in first.take(10)}
             assert all(same.get(picture.seq, picture.data) == picture.data for picture in second.take(10))
 
 
-def test_a_subscriber_that_misses_a_picture_asks_for_a_key(node: Node) -> None:
+def test_a_subscriber_that_misses_a_picture_requests_a_key(node: Node) -> None:
     with node.connected() as drone, Watch(drone._state.video.stream(kbit_s=400)) as watch:
         last = watch.take(8)[-1]
         watch.stream.report(last.seq, wants_key=True)
         assert any(picture.key for picture in watch.take(40))
 
 
-def test_what_is_lost_on_the_way_costs_pictures_and_never_shows(far: Node) -> None:
+def test_lost_packets_cost_pictures_but_are_never_visible(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
@@ -145,7 +145,7 @@ def test_what_is_lost_on_the_way_costs_pictures_and_never_shows(far: Node) -> No
         assert decoder.dropped > 0
         for frame in later:
             assert frame.captured_ns in whole
-            assert np.allclose(frame, frame[0, 0], atol=8), "a picture is of one colour: anything else is smeared"
+            assert np.allclose(frame, frame[0, 0], atol=8), "the picture should have one colour: it is smeared"
 
 
 def test_a_damaged_picture_is_not_shown(far: Node) -> None:
@@ -167,7 +167,7 @@ def test_a_damaged_picture_is_not_shown(far: Node) -> None:
         assert not damaged & {frame.captured_ns for frame in seen}
 
 
-def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
+def test_a_decoder_that_is_too_slow_continues_with_a_key(far: Node) -> None:
     with far.connected() as drone:
         frames = drone.frames(encoding="h264", kbit_s=400)
         next(frames)
@@ -186,7 +186,7 @@ def test_a_decoder_that_is_too_slow_goes_on_with_a_key(far: Node) -> None:
         assert take(frames, 2)
 
 
-def test_after_a_silence_the_stream_goes_on_without_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_pause_the_stream_continues_without_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(video, "_IDLE_S", 0.01)
     encoder, stream = H264Encoder(32, 24, 30.0, 200), Mock(spec=StreamChannel)
     shown: queue.Queue[int] = queue.Queue()
@@ -198,7 +198,7 @@ def test_after_a_silence_the_stream_goes_on_without_a_key(monkeypatch: pytest.Mo
         assert shown.get(timeout=WAIT_S) == seq
         wait_until(lambda: not decoder._running, "its thread has ended")
     assert decoder.dropped == 0
-    assert all(not call.kwargs for call in stream.report.call_args_list), "no key picture was asked for"
+    assert all(not call.kwargs for call in stream.report.call_args_list), "a key picture was requested"
 
 
 def test_the_encoder_ends_with_its_last_subscriber(node: Node) -> None:
@@ -211,7 +211,7 @@ def test_the_encoder_ends_with_its_last_subscriber(node: Node) -> None:
             assert watch.take(2)[0].key
 
 
-def test_a_stream_that_nobody_acknowledges_stops_and_takes_up_again(near: Drone) -> None:
+def test_a_stream_without_acknowledgements_stops_and_resumes(near: Drone) -> None:
     with Watch(near._state.video.stream(subscriber="me"), reports=False) as watch:
         few = watch.take(2)
         near.wait(lambda _: watch.came.qsize() == 0, WAIT_S)
@@ -242,7 +242,7 @@ def near() -> Iterator[Drone]:
         ({"kbit_s": 500}, "kbit_s and subscriber need"),
     ],
 )
-def test_wishes_that_make_no_sense_are_refused(near: Drone, options: dict[str, object], why: str) -> None:
+def test_invalid_forms_are_refused(near: Drone, options: dict[str, object], why: str) -> None:
     with pytest.raises(UsageError, match=why):
         next(near.frames(**options))  # type: ignore[arg-type]
 
@@ -258,7 +258,7 @@ def test_a_listener_gets_pictures_that_can_be_decoded(node: Node) -> None:
             drone.on_encoded(came.put, depth=0)
 
 
-def test_forms_are_bounded(near: Drone) -> None:
+def test_the_number_of_forms_is_bounded(near: Drone) -> None:
     streams = [near._state.video.stream(kbit_s=100 + number) for number in range(MAX_FORMS + 1)]
     watches = [Watch(stream) for stream in streams]
     problems: queue.Queue[str] = queue.Queue()
@@ -272,7 +272,7 @@ def test_forms_are_bounded(near: Drone) -> None:
         watch.__exit__()
 
 
-def test_without_a_rate_or_a_name_a_form_makes_no_sense(near: Drone) -> None:
+def test_a_form_without_a_rate_or_a_name_is_invalid(near: Drone) -> None:
     problems: queue.Queue[str] = queue.Queue()
     told = near.on_event(lambda event: problems.put(event.text) if event.kind == "packet_malformed" else None)
     with told, Watch(near._state.video.stream(scale=0.5)):

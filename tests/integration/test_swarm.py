@@ -1,4 +1,4 @@
-"""Swarms: client, transport and proxies in one process, with vehicles that do at once what they are told."""
+"""Swarms: client, transport and proxies in one process, with vehicles that obey commands at once."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def field() -> Iterator[Field]:
 
 @contextmanager
 def swarming(field: Field, **options: Any) -> Iterator[Swarm]:
-    """A swarm that is closed at the end whatever became of it, without a report."""
+    """A swarm that is closed without a report at the end, whatever happened."""
     drones = field.swarm(**options)
     try:
         yield drones
@@ -52,7 +52,7 @@ def swarming(field: Field, **options: Any) -> Iterator[Swarm]:
 
 
 def gone(field: Field, drones: Swarm, name: str) -> None:
-    """The proxy of one of them is killed, and the swarm's end has seen it."""
+    """Kill one drone's proxy, and wait until the swarm's side has noticed."""
     field.proxies[name].end()
     wait_until(lambda: drones[name].link.application is LinkState.LOST, "the link is lost")
 
@@ -92,7 +92,7 @@ def test_it_is_a_collection_of_drones(field: Field) -> None:
         assert repr(drones) == "<Swarm alpha, bravo, charlie>"
 
 
-def test_one_that_fails_is_set_aside_and_the_others_go_on(field: Field, caplog: pytest.LogCaptureFixture) -> None:
+def test_one_that_fails_is_set_aside_and_the_others_continue(field: Field, caplog: pytest.LogCaptureFixture) -> None:
     field.broken("bravo")
 
     def fly() -> None:
@@ -120,7 +120,7 @@ def test_one_that_fails_is_set_aside_and_the_others_go_on(field: Field, caplog: 
     assert field.states() == {FlightState.LANDED, FlightState.EMERGENCY}
 
 
-def test_one_that_failed_is_taken_back(field: Field) -> None:
+def test_a_failed_drone_can_be_taken_back(field: Field) -> None:
     field.broken("bravo")
     with field.swarm() as drones:
         drones.takeoff()
@@ -135,7 +135,7 @@ def test_one_that_failed_is_taken_back(field: Field) -> None:
     assert field.states() == {FlightState.LANDED}
 
 
-def test_when_none_is_left_it_says_so(field: Field) -> None:
+def test_when_no_drone_remains_it_says_so(field: Field) -> None:
     field.broken(*NAMES)
     with swarming(field) as drones, pytest.raises(SwarmError) as raised:
         drones.takeoff()
@@ -143,7 +143,7 @@ def test_when_none_is_left_it_says_so(field: Field) -> None:
     assert str(raised.value).count("\n") == 3
 
 
-def test_raise_leaves_the_others_as_they_are(field: Field) -> None:
+def test_raise_does_not_affect_the_others(field: Field) -> None:
     field.broken("alpha")
     with swarming(field, on_error="raise") as drones:
         with pytest.raises(SwarmError) as raised:
@@ -154,7 +154,7 @@ def test_raise_leaves_the_others_as_they_are(field: Field) -> None:
         assert field.vehicles["charlie"].state is FlightState.HOVERING
 
 
-def test_stop_lets_the_others_hover(field: Field) -> None:
+def test_stop_makes_the_others_hover(field: Field) -> None:
     with swarming(field, on_error="stop") as drones:
         drones.takeoff()
         drones.velocity(forward=0.5)
@@ -177,7 +177,7 @@ def test_land_lands_the_others(field: Field) -> None:
         assert {field.vehicles[name].state for name in ("alpha", "bravo")} == {FlightState.LANDED}
 
 
-def test_one_whose_link_is_lost_takes_part_again_when_it_is_back(field: Field) -> None:
+def test_a_drone_whose_link_was_lost_takes_part_again_when_it_is_back(field: Field) -> None:
     with field.swarm() as drones:
         drones.takeoff()
         gone(field, drones, "bravo")
@@ -198,7 +198,7 @@ def test_a_lost_link_is_not_taken_for_hovering(field: Field) -> None:
         assert "it is hovering, and its link is lost" in str(drones.errors["bravo"])
 
 
-def test_waiting_for_all_names_each_that_did_not_come(field: Field) -> None:
+def test_waiting_for_all_names_each_that_did_not_arrive(field: Field) -> None:
     with swarming(field, on_error="raise") as drones:
         drones["alpha"].takeoff()
         with pytest.raises(SwarmError) as raised:
@@ -207,29 +207,29 @@ def test_waiting_for_all_names_each_that_did_not_come(field: Field) -> None:
         assert "was not as wanted within 0.1 s: it is landed" in str(raised.value)
         with pytest.raises(UnknownNameError, match="hovering"):
             drones.wait_all("hoovering")
-        with pytest.raises(ZeroDivisionError):  # a user's own fault is no drone's
+        with pytest.raises(ZeroDivisionError):  # an error in the user's code is not attributed to a drone
             drones.wait_all(lambda feedback: bool(1 / 0))
 
 
-def test_all_must_be_as_wanted_at_the_same_time(field: Field) -> None:
+def test_all_must_fulfil_the_condition_at_the_same_time(field: Field) -> None:
     looks: list[str] = []
 
     def turns(feedback: skyloop.Feedback) -> bool:
         looks.append(feedback.state)
-        return len(looks) != 4  # the first look again after all had been as wanted once
+        return len(looks) != 4  # false on the first look after all had fulfilled it once
 
     with swarming(field) as drones:
         assert set(drones.wait_all(turns, 5.0)) == set(NAMES)
         assert len(looks) > 6
 
 
-def test_one_that_is_closed_while_all_are_waited_for_has_failed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drone_closed_while_all_are_awaited_has_failed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     with swarming(field) as drones:
         bravo = drones["bravo"]
         read = bravo.feedback
 
         def feedback() -> skyloop.Feedback:
-            bravo.close()  # by another thread, when it was as wanted already
+            bravo.close()  # by another thread, when it already fulfilled the condition
             return read()
 
         monkeypatch.setattr(bravo, "feedback", feedback)
@@ -237,7 +237,7 @@ def test_one_that_is_closed_while_all_are_waited_for_has_failed(field: Field, mo
         assert isinstance(drones.errors["bravo"], ClosedError)
 
 
-def test_one_that_is_taken_over_comes_back_by_itself(field: Field) -> None:
+def test_a_drone_that_is_taken_over_rejoins_automatically(field: Field) -> None:
     with field.swarm() as drones:
         drones.takeoff()
         boss = field.connect("bravo", app="boss", priority=0)
@@ -251,7 +251,7 @@ def test_one_that_is_taken_over_comes_back_by_itself(field: Field) -> None:
         assert drones.errors == {}
 
 
-def test_an_exception_in_the_block_lands_all_and_is_told_what_else_failed(field: Field) -> None:
+def test_an_exception_in_the_block_lands_all_and_reports_other_failures(field: Field) -> None:
     field.broken("alpha")
 
     def fly() -> None:
@@ -267,7 +267,9 @@ def test_an_exception_in_the_block_lands_all_and_is_told_what_else_failed(field:
 
 
 @pytest.mark.slow
-def test_one_that_can_not_land_does_not_keep_the_others_from_it(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drone_that_can_not_land_does_not_stop_the_others_from_landing(
+    field: Field, monkeypatch: pytest.MonkeyPatch
+) -> None:
     land = Drone.land
 
     def briefly(self: Drone, *, wait: bool = True, timeout_s: float = 20.0) -> None:
@@ -284,7 +286,7 @@ def test_one_that_can_not_land_does_not_keep_the_others_from_it(field: Field, mo
     assert Land() in field.vehicles["alpha"].applied
 
 
-def test_set_points_leave_at_one_tick_and_the_spread_is_measured(field: Field) -> None:
+def test_set_points_are_sent_at_one_tick_and_the_spread_is_measured(field: Field) -> None:
     with field.swarm() as drones:
         assert drones.spread is None
         drones.takeoff()
@@ -302,7 +304,7 @@ def test_set_points_leave_at_one_tick_and_the_spread_is_measured(field: Field) -
         wait_until(lambda: all(last[name] in field.vehicles[name].applied for name in NAMES), "the last")
 
 
-def test_nothing_is_sent_to_any_if_one_command_is_wrong(field: Field) -> None:
+def test_nothing_is_sent_if_one_command_is_wrong(field: Field) -> None:
     with field.swarm() as drones:
         drones.takeoff()
         with pytest.raises(UsageError, match="NaN"):
@@ -316,7 +318,7 @@ def test_nothing_is_sent_to_any_if_one_command_is_wrong(field: Field) -> None:
         assert Velocity(0.7) not in field.vehicles["alpha"].applied
 
 
-def test_the_emergency_stop_reaches_those_set_aside_too(field: Field) -> None:
+def test_the_emergency_stop_also_reaches_drones_set_aside(field: Field) -> None:
     field.broken("bravo")
     with swarming(field) as drones:
         drones.takeoff()
@@ -332,7 +334,7 @@ def test_the_emergency_stop_reaches_those_set_aside_too(field: Field) -> None:
             drones.emergency_stop()
 
 
-def test_a_beat_with_absolute_deadlines(field: Field) -> None:
+def test_rate_keeps_absolute_deadlines(field: Field) -> None:
     with field.swarm() as drones:
         ticks = list(drones.ticks(100.0, seconds=0.1))
         assert [tick.number for tick in ticks] == list(range(len(ticks)))
@@ -347,8 +349,8 @@ def test_a_beat_with_absolute_deadlines(field: Field) -> None:
 
 
 @pytest.mark.parametrize("end", [None, KeyboardInterrupt, ValueError, SystemExit])
-def test_when_a_loop_ends_what_it_flew_hovers_at_once(field: Field, end: type[BaseException] | None) -> None:
-    """Its last velocity went on for ``stall_s``: set-points that nobody stood behind any more."""
+def test_when_a_loop_ends_the_drones_it_flew_hover_at_once(field: Field, end: type[BaseException] | None) -> None:
+    """The last velocity continued for ``stall_s``: set-points that no loop commanded any longer."""
     with Swarm({name: field.connect(name, stall_s=math.inf) for name in NAMES}) as drones:
         drones.takeoff()
         drones["bravo"].land(wait=False)
@@ -361,11 +363,11 @@ def test_when_a_loop_ends_what_it_flew_hovers_at_once(field: Field, end: type[Ba
                     raise end
         commands = {name: drone._commands for name, drone in drones.items()}
         assert type(commands["alpha"].newest) is type(commands["charlie"].newest) is Hover
-        assert type(commands["bravo"].newest) is not Hover, "it was not flown by the loop"
+        assert type(commands["bravo"].newest) is not Hover, "the loop did not fly it"
         wait_until(lambda: type(field.vehicles["alpha"].applied[-1]) is Hover, "it hovers")
 
 
-def test_a_function_for_each_on_threads_of_their_own(field: Field) -> None:
+def test_a_function_for_each_runs_on_separate_threads(field: Field) -> None:
     with swarming(field, on_error="raise") as drones:
         assert drones.each(lambda drone: drone.capabilities.vehicle) == dict.fromkeys(NAMES, "fake")
 
@@ -379,7 +381,7 @@ def test_a_function_for_each_on_threads_of_their_own(field: Field) -> None:
             drones.each(lambda drone: 1 / 0)
 
 
-def test_what_makes_no_swarm(field: Field) -> None:
+def test_invalid_swarms(field: Field) -> None:
     with pytest.raises(UsageError, match="at least one"):
         Swarm({})
     with pytest.raises(UsageError, match="on_error is 'panic'"), field.connect("alpha") as drone:
@@ -400,13 +402,13 @@ CHOICES: list[tuple[tuple[str | Mapping[str, str], ...], dict[str, str]]] = [
 
 
 @pytest.mark.parametrize(("targets", "chosen"), CHOICES, ids=str)
-def test_names_patterns_addresses_and_names_of_ones_own(
+def test_names_patterns_addresses_and_own_names(
     targets: tuple[str | Mapping[str, str], ...], chosen: dict[str, str]
 ) -> None:
     assert choose(targets, lambda: RUNNING) == chosen
 
 
-def test_what_can_not_be_chosen() -> None:
+def test_invalid_selections() -> None:
     with pytest.raises(UsageError, match="'drone1' is named twice"):
         choose(["drone*", "drone1"], lambda: RUNNING)
     with pytest.raises(UnknownNameError, match="no running proxy named 'dron_\\*'"):
@@ -418,8 +420,8 @@ def test_what_can_not_be_chosen() -> None:
             choose([wrong], lambda: RUNNING)  # type: ignore[list-item]
 
 
-def test_where_there_is_no_thread_for_all_what_is_left_is_done_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The end of a swarm raised "can't start new thread", and some were not landed."""
+def test_without_threads_the_rest_runs_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The end of a swarm raised "can't start new thread", and some drones were not landed."""
     begin, begun = threading.Thread.start, list[str]()
 
     def start(thread: threading.Thread) -> None:
@@ -431,11 +433,11 @@ def test_where_there_is_no_thread_for_all_what_is_left_is_done_in_turn(monkeypat
     monkeypatch.setattr(threading.Thread, "start", start)
     results, errors = in_parallel({"a": lambda: 1, "b": lambda: 2, "c": lambda: 3})
     assert (results, errors) == ({"a": 1, "b": 2, "c": 3}, {})
-    assert not cancelled.get()(), "the caller's own"
+    assert not cancelled.get()(), "the caller's own cancellation"
 
 
-def test_an_interrupt_ends_what_is_done_in_turn_for_want_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C in the first take-off: it was kept for later, and the next drone took off."""
+def test_an_interrupt_ends_the_work_done_in_turn_without_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the first take-off was held back, and the next drone took off."""
 
     def none(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
@@ -450,7 +452,7 @@ def test_an_interrupt_ends_what_is_done_in_turn_for_want_of_threads(monkeypatch:
     assert begun == []
 
 
-def test_what_is_done_in_parallel_ends_whatever_one_of_them_does() -> None:
+def test_parallel_work_ends_whatever_one_of_them_does() -> None:
     results, errors = in_parallel({"a": lambda: 1, "b": lambda: [].pop if False else 2})
     assert (results, errors) == ({"a": 1, "b": 2}, {})
 
@@ -468,7 +470,7 @@ def test_connecting_reports_all_that_failed_and_leaves_the_others(
         skyloop.swarm("alpha", "delta", "echo")
     assert list(raised.value.errors) == ["delta", "echo"]
     assert "connecting failed for 2 of 3 drones" in str(raised.value)
-    with field.connect("alpha") as drone:  # nobody holds it any more
+    with field.connect("alpha") as drone:  # it is no longer held
         assert drone.authority.state == "held"
     with skyloop.swarm("alpha", "delta", missing="skip") as drones:
         assert drones.names == ("alpha",)
@@ -477,7 +479,7 @@ def test_connecting_reports_all_that_failed_and_leaves_the_others(
         skyloop.swarm("delta", missing="skip")
 
 
-def test_two_swarms_share_no_drone(field: Field) -> None:
+def test_two_swarms_do_not_share_a_drone(field: Field) -> None:
     with field.swarm() as drones, ExitStack() as stack:
         with pytest.raises(AuthorityError):
             stack.enter_context(field.connect("alpha", app="other"))

@@ -1,4 +1,4 @@
-"""Being a worker: joining, staying one, and what a share is worth; over a real proxy in this process."""
+"""Workers: joining, staying a member, and their shares, over a real proxy in this process."""
 
 from __future__ import annotations
 
@@ -46,17 +46,17 @@ def test_shares_follow_the_workers(node: Node, drone: Drone) -> None:
     drone.wait(lambda _: part(one) == (0, 1), WAIT_S)
 
 
-def test_a_worker_that_is_not_ready_has_no_part(node: Node, drone: Drone) -> None:
+def test_a_worker_that_is_not_ready_has_no_share(node: Node, drone: Drone) -> None:
     one = join_processor(drone, "detector", code="Detector 1")
     able = threading.Event()
     one.ready = able.is_set
     one.renew()
     drone.wait(lambda _: part(one) == (0, 0), WAIT_S)
     able.set()
-    drone.wait(lambda _: part(one) == (0, 1), WAIT_S)  # by itself, at the next renewal
+    drone.wait(lambda _: part(one) == (0, 1), WAIT_S)  # automatically, at the next renewal
 
 
-def test_what_is_found_is_published(node: Node, drone: Drone) -> None:
+def test_results_are_published(node: Node, drone: Drone) -> None:
     got: list[Result] = []
     with observer(node, "eye") as eye:
         eye.on_result(got.append, "detector")
@@ -104,11 +104,11 @@ def test_a_worker_may_end_before_its_drone(drone: Drone) -> None:
     assert part(one) is None
 
 
-def test_a_name_taken_while_the_proxy_was_away_is_told(node: Node, drone: Drone) -> None:
+def test_a_name_taken_while_the_proxy_was_away_is_reported(node: Node, drone: Drone) -> None:
     one = join_processor(drone, "detector", code="Detector 1")
     with observer(node, "two") as other:
         join_processor(other, "detector", code="Detector 1")
-        one.code = "Detector 2"  # as when this one comes back after that one
+        one.code = "Detector 2"  # as when this worker comes back after the other one
         one.renew()
         drone.wait(lambda _: one.refused is not None, WAIT_S)
         assert part(one) is None

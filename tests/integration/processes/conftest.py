@@ -1,4 +1,4 @@
-"""Real proxies and applications as processes, in a directory of sockets of their own."""
+"""Real proxies and applications as separate processes, in a private directory of sockets."""
 
 from tests.support.processes import proxy, sockets, start
 

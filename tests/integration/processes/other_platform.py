@@ -1,4 +1,4 @@
-"""Runs the `skyloop` command as on another platform: ``python -m`` this module ``win32 list``.
+"""Runs the ``skyloop`` command as on another platform: ``python -m`` this module ``win32 list``.
 
 What Skyloop imports from others is imported first, then ``sys.platform`` is changed and the parts of Python are
 withheld that the other platform lacks. It shows what Skyloop itself needs, and nothing of the others' libraries there.
@@ -28,7 +28,7 @@ MISSING_NAMES = {
         "setsid",
     ),
 }
-#: They look at the platform when they are imported.
+#: Modules that check the platform when they are imported.
 LIBRARIES = (
     "numpy", "cv2", "zenoh", "msgspec", "platformdirs", "typer", "rich.console", "rich.live", "pydantic.fields",
     "uvicorn.main", "starlette.applications", "websockets.asyncio.server", "cryptography", "urllib.request",
@@ -43,7 +43,7 @@ def pretend(platform: str) -> None:
     for name in LIBRARIES:
         try:
             importlib.import_module(name)
-        except ImportError:  # of an extra that is not installed
+        except ImportError:  # it belongs to an extra that is not installed
             continue
     for name in MISSING_MODULES[platform]:
         sys.modules[name] = None  # type: ignore[assignment]  # an import of it fails
@@ -54,7 +54,7 @@ def pretend(platform: str) -> None:
 
 
 def fly(name: str, place: str) -> None:
-    """Import all that the package offers, and fly a drone of the network."""
+    """Import everything that the package offers, and fly a drone on the network."""
     import skyloop
 
     for offered in dir(skyloop):

@@ -1,4 +1,4 @@
-"""Applications that the tests start as processes of their own: ``python pilots.py WHAT NAME …``."""
+"""Applications that the tests start as separate processes: ``python pilots.py WHAT NAME …``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import skyloop
 
 
 def fly(name: str, priority: str = "16") -> None:
-    """Take off and fly forward, commanded afresh ten times a second, until killed."""
+    """Take off and fly forward, sending a new command ten times a second, until killed."""
     with skyloop.connect(name, name="doomed", authority=skyloop.Authority(priority=int(priority))) as drone:
         drone.takeoff()
         print("flying", flush=True)
@@ -19,7 +19,7 @@ def fly(name: str, priority: str = "16") -> None:
 
 
 def observe(name: str) -> None:
-    """Look at everything, and say so."""
+    """Read everything an observer can read, and print that it works."""
     with skyloop.connect(name, name="watcher", access="observe") as drone:
         if drone.capabilities.cameras:
             drone.next_frame(timeout_s=30.0)

@@ -1,4 +1,4 @@
-"""What the workers of ``test_processors.py`` run."""
+"""The processors that the workers of ``test_processors.py`` run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ if TYPE_CHECKING:
 
 
 class Marks:
-    """Says which process looked at the frame."""
+    """Reports which process handled the frame."""
 
     def process(self, frame: Frame) -> dict[str, int]:
         return {"pid": os.getpid(), "mean": int(frame.mean())}
 
 
 class Others(Marks):
-    """The same under another name: other code."""
+    """The same processor under another name, so its code counts as different."""

@@ -1,4 +1,4 @@
-"""An AR.Drone in processes of their own: emulated firmware, proxy and pilot; and what goes wrong between them."""
+"""An AR.Drone across processes (emulated firmware, proxy and pilot), and the failures between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Firmware = Callable[..., tuple[Process, str]]
 
 @pytest.fixture
 def firmware(start: Callable[..., Process]) -> Firmware:
-    """Starts an emulated AR.Drone on free ports, or where another was; gives the address to fly it by."""
+    """Start an emulated AR.Drone on free ports, or on those of an earlier one; returns the address to fly it by."""
 
     def begin(version: int = 2, *options: str) -> tuple[Process, str]:
         arguments = ["sim", "--firmware", f"ardrone{version}", "--port-base", "0", *options]
@@ -42,12 +42,12 @@ def firmware(start: Callable[..., Process]) -> Firmware:
 
 
 def ends_in_view(drone: skyloop.Drone, follower: FollowMarker, seconds: float) -> None:
-    """Find the marker, follow it for so long, and have had it in view nearly always."""
+    """Find the marker, follow it for this long, and check that it was in view nearly always."""
     follower.run(seconds=40.0, until=lambda: follower.score.share_in_view is not None)
     follower.run(seconds=seconds)
     share = follower.score.share_in_view
     assert share is not None, "the marker was never seen"
-    assert share > 0.5, "it is 1 unless the machine is crowded"
+    assert share > 0.5, "the share is 1 unless the machine is overloaded"
     assert drone.feedback().state is FlightState.FLYING
 
 
@@ -56,7 +56,7 @@ def test_the_marker_follower_flies_it_unchanged_with_and_without_loss(
     firmware: Firmware, proxy: Callable[..., Process], version: int, lost: float
 ) -> None:
     _, address = firmware(version, "--lose", f"{lost}", "--fault-seed", "3")
-    if version == 1:  # nothing is known of its camera, so the address says what the emulated one is like
+    if version == 1:  # its camera is unknown, so the address describes the emulated one
         address += f"&fx={FRONT_1.fx}&cx={FRONT_1.cx}&cy={FRONT_1.cy}"
     proxy(address)
     with skyloop.connect("alpha") as drone:

@@ -1,4 +1,4 @@
-"""Consumers that are slow, stopped, many, or gone."""
+"""Consumers that are slow, stopped, numerous, or gone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FPS = 30
 def test_a_slow_processor_gets_new_frames_only_and_the_fast_one_gets_all(proxy: Callable[..., Process]) -> None:
     proxy(f"sim://?world=empty&cameras=front&fps={FPS}&latency=0")
     with skyloop.connect("alpha", access="observe") as drone:
-        behind: list[int] = []  # frames that had come since the one that the slow processor is given
+        behind: list[int] = []  # frames that had arrived after the one that the slow processor is given
         seen: list[int] = []
 
         def slow(frame: skyloop.Frame) -> None:
@@ -38,11 +38,11 @@ def test_a_slow_processor_gets_new_frames_only_and_the_fast_one_gets_all(proxy: 
         drops = slow_one.dropped
         assert drops > 1.5 * FPS
         assert slow_one.delivered + drops == pytest.approx(fast_one.delivered + fast_one.dropped, abs=2)
-        assert fast_one.dropped <= 0.05 * len(seen)  # none, on a machine that has the time
+        assert fast_one.dropped <= 0.05 * len(seen)  # none, on a machine with enough processor time
         assert sorted(behind)[len(behind) * 9 // 10] <= 2
 
 
-def test_a_stopped_observer_delays_nobody_and_is_served_again(
+def test_a_stopped_observer_delays_no_one_and_is_served_again(
     proxy: Callable[..., Process], start: Callable[..., Process]
 ) -> None:
     proxy("sim://?world=empty&cameras=front&fps=30")

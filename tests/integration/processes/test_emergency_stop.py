@@ -1,4 +1,4 @@
-"""An emergency stop, from the call to the motors: emulated firmware, proxy and pilot in processes of their own."""
+"""An emergency stop from the call to the motors: emulated firmware, proxy and pilot in separate processes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_stop_with_sticks_held_is_shown_reset_and_flown_again(
             hand.join()
         assert drone.reset_emergency()
         drone.wait("landed", 8.0)
-        # It has fallen by then: while it still falls a take-off is accepted, and does not lift it.
+        # It has fallen by then: a take-off during the fall is accepted but does not lift it.
         drone.wait(lambda feedback: max(map(abs, feedback.velocity_m_s or (1.0,))) < 0.1, 10.0)
         drone.takeoff(timeout_s=30.0)
         assert drone.feedback().state in (FlightState.HOVERING, FlightState.FLYING)

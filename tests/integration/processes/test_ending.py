@@ -1,4 +1,4 @@
-"""A process with several vehicles is told to end while one of them flies and another one stands."""
+"""A process with several vehicles is asked to end while one of them flies and another stands on the ground."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ FLEET = "".join(f'[[vehicle]]\nname = "{name}"\naddress = "sim://?world=empty&ca
 
 
 @pytest.mark.parametrize("command", ["sim", "host"])
-def test_what_stands_stays_on_the_ground_while_another_one_lands(
+def test_a_vehicle_on_the_ground_stays_there_while_another_one_lands(
     start: Callable[..., Process], tmp_path: Path, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else it would be left in the air, without a proxy, when the process ends."""
+    """If it took off then, it would be left in the air without a proxy when the process ends."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     if command == "sim":
         process = start("-m", "skyloop", "sim", "--drones", "2", "--world", "empty", "--option", "cameras=none")

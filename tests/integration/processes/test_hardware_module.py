@@ -1,4 +1,4 @@
-"""The tests that fly any named vehicle pass when they are pointed at an emulated one."""
+"""The tests that fly any named vehicle pass when they are given an emulated one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skyloop host`` as a process: its commands, its end, its being killed in flight, and what its vehicles do then."""
+"""``skyloop host`` as a process: its commands, shutdown, death in flight, and what its vehicles do then."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_sigterm_lands_all_and_ends(processes: list[Process], fleet: Path) -> No
 
 
 def test_a_killed_host_is_back_with_all_its_vehicles(processes: list[Process], fleet: Path) -> None:
-    """Simulated vehicles end with their process; a program that runs on finds all again within 5 s."""
+    """Simulated vehicles end with their process; a program that keeps running finds all of them again within 5 s."""
     names = [f"v{number}" for number in range(8)]
     text = vehicles(*names[:-1]) + vehicles(names[-1], process='"own"')
     first = host(processes, fleet, text)
@@ -140,7 +140,7 @@ def _is_zombie(pid: int) -> bool:
 
 
 def test_a_vehicle_of_another_process_flies_on_without_its_host(processes: list[Process], fleet: Path) -> None:
-    """Its own firmware decides what it does without a ground station; the host that is back finds it in the air."""
+    """Its own firmware decides what happens without a ground station; the restarted host finds it in the air."""
     board = Process("-m", "skyloop", "sim", "--firmware", "arducopter", "--port-base", "0")
     processes.append(board)
     board.until("ready")
@@ -159,11 +159,11 @@ def test_a_vehicle_of_another_process_flies_on_without_its_host(processes: list[
         eventually(lambda: drone.link.application is LinkState.UP, "it is up again")
         eventually(lambda: drone.link.vehicle is LinkState.UP, "the firmware answers again")
         eventually(lambda: drone.authority.state == "held", "its pilot has it again")
-        assert drone.feedback().state.airborne, "nobody landed it, and it has not fallen"
+        assert drone.feedback().state.airborne, "it was landed, or it fell"
         drone.land(timeout_s=60.0)
 
 
-def test_a_process_of_its_own_that_dies_is_started_again(processes: list[Process], fleet: Path) -> None:
+def test_a_separate_process_that_dies_is_started_again(processes: list[Process], fleet: Path) -> None:
     process = host(processes, fleet, vehicles("alpha") + vehicles("own", process='"own"'))
     before = rows()["own"]
     assert before.pid not in (None, process.pid)

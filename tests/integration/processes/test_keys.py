@@ -1,4 +1,4 @@
-"""A lab from the command line: a proxy with keys, who may find, see and fly it, and what it says of its keys."""
+"""A lab from the command line: a proxy with keys, who may find, see and fly it, and what it reports about its keys."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def lab(tmp_path: Path) -> Lab:
 
 @pytest.fixture
 def place(start: Callable[..., Process], lab: Lab, sockets: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Where a proxy with keys serves; it can't be reached by its socket from here."""
+    """The address of a proxy with keys that can't be reached by its socket from here."""
     place = f"{LOCAL}:{free_port(LOCAL)}"
     with monkeypatch.context() as elsewhere:
         elsewhere.setenv("SKYLOOP_RUNTIME_DIR", str(sockets.parent / "elsewhere"))
@@ -51,14 +51,14 @@ def place(start: Callable[..., Process], lab: Lab, sockets: Path, monkeypatch: p
 
 
 def skyloop_list(place: str, keys: Path | None) -> tuple[list[str], str]:
-    """Which proxies ``skyloop list`` shows, and what it says besides."""
+    """The proxies that ``skyloop list`` shows, and its other output."""
     words = [sys.executable, "-m", "skyloop", "list", "--json", "--network", place]
     words += [] if keys is None else ["--keys", str(keys)]
     done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60)
     return [row["name"] for row in json.loads(done.stdout)], done.stderr
 
 
-def test_who_may_do_what(place: str, lab: Lab) -> None:
+def test_permissions(place: str, lab: Lab) -> None:
     with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("jane"))) as jane:
         jane.takeoff()
         jane.wait("hovering")
@@ -75,12 +75,12 @@ def test_who_may_do_what(place: str, lab: Lab) -> None:
 def test_the_list_shows_what_a_key_can_find_and_what_ends(place: str, lab: Lab) -> None:
     eventually(lambda: skyloop_list(place, lab.folder("jane")) == (["alpha"], ""), "the list of a pilot", 30.0)
     found, said = skyloop_list(place, lab.folder("olga"))
-    assert found in (["alpha"], []), "an empty one on a crowded machine: it looks for a second"
+    assert found in (["alpha"], []), "it may be empty on a busy machine: the search lasts one second"
     assert "the key of olga expires in 5 days" in said
     assert skyloop_list(place, None)[0] == []
 
 
-def test_a_proxy_tells_that_its_roster_has_changed(place: str, lab: Lab) -> None:
+def test_a_proxy_reports_that_its_roster_has_changed(place: str, lab: Lab) -> None:
     with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("olga")), access="observe") as olga:
         lab.revoke("bob")
 

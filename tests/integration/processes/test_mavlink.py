@@ -1,4 +1,4 @@
-"""A MAVLink vehicle in processes of their own: emulated autopilot, proxy and pilot; and what goes wrong in between."""
+"""A MAVLink vehicle across processes (emulated autopilot, proxy and pilot), and the failures between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Firmware = Callable[..., tuple[Process, str]]
 
 @pytest.fixture
 def firmware(start: Callable[..., Process]) -> Firmware:
-    """Starts an emulated autopilot on free ports; gives the address to fly it by."""
+    """Start an emulated autopilot on free ports; returns the address to fly it by."""
 
     def begin(kind: str, *options: str) -> tuple[Process, str]:
         process = start("-m", "skyloop", "sim", "--firmware", kind, "--port-base", "0", *options)
@@ -90,7 +90,7 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_autopilot_that_goes_silent_in_flight_is_found_again_and_flies_nothing_old(
+def test_an_autopilot_that_goes_silent_in_flight_is_found_again_and_executes_no_old_command(
     firmware: Firmware, proxy: Callable[..., Process], kind: str
 ) -> None:
     process, address = firmware(kind, "--world", "empty", "--lose", "0.1")

@@ -1,4 +1,4 @@
-"""``--metrics``: a process prints where its metrics are, and serves them until it ends."""
+"""``--metrics``: a process prints the address of its metrics, and serves them until it ends."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_router(start: Callable[..., Process]) -> None:
     assert process.wait() == 0
 
 
-def test_a_place_that_is_none_is_told_before_anything_starts() -> None:
+def test_an_invalid_address_is_refused_before_anything_starts() -> None:
     said = skyloop_command("proxy", "sim://", "--metrics", "nowhere", code=2)
     assert "'nowhere' is no place for metrics" in said
     assert "ready" not in said

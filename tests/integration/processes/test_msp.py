@@ -1,4 +1,4 @@
-"""Betaflight in processes of their own: emulated firmware, proxy and pilot; and what goes wrong between them."""
+"""Betaflight across processes (emulated firmware, proxy and pilot), and the failures between them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
 
 @pytest.fixture
 def firmware(start: Callable[..., Process]) -> Callable[..., tuple[Process, str]]:
-    """Starts an emulated Betaflight; with its address."""
+    """Start an emulated Betaflight; returns it with its address."""
 
     def begin(port: str = "0") -> tuple[Process, str]:
         process = start("-m", "skyloop", "sim", "--firmware", "betaflight", "--world", "empty", "--port-base", port)
@@ -44,7 +44,7 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
         observer.wait(lambda feedback: (feedback.native or {}).get("armed") is False, timeout_s=20.0)
 
 
-def test_firmware_that_restarts_in_flight_is_found_again_and_flown_again(
+def test_firmware_that_restarts_in_flight_is_found_again_and_can_be_flown(
     firmware: Callable[..., tuple[Process, str]], proxy: Callable[..., Process]
 ) -> None:
     first, address = firmware()

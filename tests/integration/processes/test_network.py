@@ -1,4 +1,4 @@
-"""Proxies and applications that know each other only over the network: one runtime directory a host."""
+"""Proxies and applications that reach each other only over the network: each host has its own runtime directory."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.processes import Process, eventually
 
 pytestmark = pytest.mark.process
 LOCAL = "127.0.0.1"
-#: Within which the tests want to see what the network promises within a second: this machine may be busy.
+#: The network promises this within a second; the tests allow more because the machine may be busy.
 SOON_S = 3.0
 
 
@@ -35,7 +35,7 @@ def place() -> str:
 def far(
     start: Callable[..., Process], place: str, sockets: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Process]:
-    """Starts a proxy that this process can only reach over the network."""
+    """Start a proxy that this process can only reach over the network."""
     number = iter(range(100))
 
     def begin(*options: str, uri: str = "sim://?world=empty&cameras=front", until: str = "ready") -> Process:
@@ -50,7 +50,7 @@ def far(
 
 
 def internet_sockets(pid: int) -> list[str]:
-    """What a process has open to any network, this host's own included."""
+    """The sockets that a process has open to any network, including this host's own."""
     inodes = {str(entry.readlink()) for entry in Path(f"/proc/{pid}/fd").iterdir()}
     found = []
     for table in ("tcp", "tcp6", "udp", "udp6", "raw", "raw6"):
@@ -60,7 +60,7 @@ def internet_sockets(pid: int) -> list[str]:
     return found
 
 
-def test_without_being_asked_nothing_leaves_the_host(proxy: Callable[..., Process]) -> None:
+def test_by_default_nothing_leaves_the_host(proxy: Callable[..., Process]) -> None:
     alpha = proxy()
     with skyloop.connect("alpha", access="observe") as drone:
         assert drone.link.application is LinkState.UP
@@ -78,7 +78,7 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert (row.vehicle, row.state, row.owner, row.problem) == ("sim", "landed", None, "")
     with skyloop.connect("alpha", network=place) as drone:
         assert f"(pid {alpha.pid})" in drone._connection._session.address  # type: ignore[union-attr]
-        assert drone._reach is None, "a process that was not told of the network does not find it"
+        assert drone._reach is None, "a process without the network option does not find it"
         drone.takeoff()
         drone.velocity(forward=0.3)
         drone.wait("flying")
@@ -88,7 +88,7 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert alpha.wait() == 0
 
 
-def test_a_killed_proxy_is_told_and_found_again_with_everything_as_it_was(
+def test_a_killed_proxy_is_reported_and_found_again_with_its_state_restored(
     far: Callable[..., Process], place: str
 ) -> None:
     first = far()
@@ -99,7 +99,7 @@ def test_a_killed_proxy_is_told_and_found_again_with_everything_as_it_was(
         first.signal(signal.SIGKILL)
         first.wait()
         eventually(lambda: drone.link.application is LinkState.LOST, "it is told of the loss", SOON_S)
-        assert drone.velocity(forward=0.3) is False  # nothing to do, and nothing raised
+        assert drone.velocity(forward=0.3) is False  # no vehicle to command, and no exception
         frames.clear()
         far()
         eventually(lambda: drone.link.application is LinkState.UP, "it is up again", SOON_S)
@@ -118,7 +118,7 @@ drone.wait(lambda feedback: False, 100)
 
 @pytest.mark.daily
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_dead_or_stopped_pilot_is_told_and_the_vehicle_fails_safe(
+def test_a_dead_or_stopped_pilot_is_reported_and_the_vehicle_fails_safe(
     far: Callable[..., Process], start: Callable[..., Process], place: str, how: signal.Signals
 ) -> None:
     far()
@@ -136,9 +136,7 @@ def test_a_dead_or_stopped_pilot_is_told_and_the_vehicle_fails_safe(
         drone.wait("landed", 20.0)
 
 
-def test_a_name_that_is_taken_on_the_network_is_refused_with_who_has_it(
-    far: Callable[..., Process], place: str
-) -> None:
+def test_a_name_already_used_on_the_network_is_refused_with_its_owner(far: Callable[..., Process], place: str) -> None:
     alpha = far()
     second = far("--network", "--no-multicast", "--connect", place, until="choose another")
     assert second.wait() == 2
@@ -162,7 +160,7 @@ def test_an_application_on_the_network_ends_with_its_script_and_on_ctrl_c(
     assert waiting.wait(10.0) in (1, 130, -signal.SIGINT)
 
 
-def test_a_stopped_proxy_is_lost_and_recovers_when_it_goes_on(far: Callable[..., Process], place: str) -> None:
+def test_a_stopped_proxy_is_lost_and_recovers_when_it_continues(far: Callable[..., Process], place: str) -> None:
     alpha = far()
     with skyloop.connect("alpha", network=place, access="observe") as drone:
         alpha.signal(signal.SIGSTOP)
@@ -171,7 +169,7 @@ def test_a_stopped_proxy_is_lost_and_recovers_when_it_goes_on(far: Callable[...,
         eventually(lambda: drone.link.application is LinkState.UP, "up again", SOON_S)
 
 
-def test_options_of_the_network_need_the_network(far: Callable[..., Process]) -> None:
+def test_network_options_need_the_network(far: Callable[..., Process]) -> None:
     wrong = far("--listen", "127.0.0.1:0", until="--listen is for the network: give --network multicast as well")
     assert wrong.wait() == 2
 
@@ -188,7 +186,7 @@ def test_multicast_finds_a_proxy_on_this_host(far: Callable[..., Process]) -> No
         assert drone.link.application is LinkState.UP
 
 
-def test_a_router_joins_those_who_know_only_it(
+def test_a_router_joins_peers_that_know_only_it(
     far: Callable[..., Process], start: Callable[..., Process], place: str
 ) -> None:
     router = start("-m", "skyloop", "router", "--no-multicast", "--listen", place)

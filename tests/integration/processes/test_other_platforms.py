@@ -1,4 +1,4 @@
-"""What works where there is no local transport: programs and the page reach drones of the network (docs/platforms.md).
+"""Without a local transport, programs and the page reach drones on the network (docs/platforms.md).
 
 As on Windows, which lacks more than macOS does; ``other_platform.py`` says what that shows.
 """
@@ -22,7 +22,7 @@ LOCAL = "127.0.0.1"
 TOKEN = "a-token-of-this-test-alone-0123456789"
 
 
-def test_programs_and_the_page_reach_drones_of_the_network(start: Callable[..., Process], tmp_path: Path) -> None:
+def test_programs_and_the_page_reach_drones_on_the_network(start: Callable[..., Process], tmp_path: Path) -> None:
     place = f"{LOCAL}:{free_port(LOCAL)}"
     there = ("-m", "tests.integration.processes.other_platform", "win32")
     uri = "sim://?world=empty&cameras=front&speed=3"
@@ -35,7 +35,7 @@ def test_programs_and_the_page_reach_drones_of_the_network(start: Callable[..., 
 
     refused = start(*there, "cockpit", "--network", place)
     refused.until("--token-file FILE", 60)
-    assert refused.wait() == 2, "who connects is not known there, so nobody is let in without a token"
+    assert refused.wait() == 2, "without peer credentials no one is let in without a token"
 
     tokens = tmp_path / "tokens"
     tokens.write_text(f"observer {TOKEN} olga\n")

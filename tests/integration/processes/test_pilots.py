@@ -1,4 +1,4 @@
-"""A pilot that dies, and pilots that share a drone."""
+"""Pilots that die, and pilots that share a drone."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
         bob.land()
 
 
-def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_somebody_asks(
+def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_another_asks(
     proxy: Callable[..., Process], start: Callable[..., Process]
 ) -> None:
     proxy()
@@ -126,7 +126,7 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
         with skyloop.connect("alpha", name="alice", authority=lower, on_exit="hover") as alice:
             assert alice.authority.state == "held"
             observer.wait(lambda feedback: feedback.owner == "alice", timeout_s=30.0)
-            pilot.signal(signal.SIGCONT)  # it asks for a new lease by itself, with its higher priority
+            pilot.signal(signal.SIGCONT)  # it requests a new lease automatically, with its higher priority
             observer.wait(lambda feedback: feedback.owner == "doomed", timeout_s=30.0)
             eventually(lambda: alice.authority.holder == "doomed", "alice knows")
 

@@ -1,4 +1,4 @@
-"""Workers of a processor as processes of their own: killed, stopped, and left alone when the proxy dies."""
+"""Processor workers as separate processes: killed, stopped, and left running when the proxy dies."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ pytestmark = pytest.mark.process
 
 PROCESSOR = f"{Path(__file__).with_name('processor.py')}:Marks"
 FPS = 30
-WITHIN_S = 1.0  # in which the share of a dead worker is with the others
+WITHIN_S = 1.0  # within which the other workers have taken over a dead worker's share
 
 
 class Collected:
-    """All results, as they come."""
+    """All results, in order of arrival."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -34,7 +34,7 @@ class Collected:
             self._results.append(result)
 
     def after(self, captured_ns: int) -> list[Result]:
-        """Of frames captured later than that."""
+        """Results for frames captured later than that."""
         with self._lock:
             return [result for result in self._results if result.captured_ns > captured_ns]
 
@@ -54,7 +54,7 @@ def work(start: Callable[..., Process], count: int) -> list[Process]:
 
 
 def whole_since(found: Collected, begin_ns: int, length: int = 10) -> int | None:
-    """Capture of the first frame from which on so many followed one another, each with a result; None: not yet."""
+    """Capture time of the first frame of this many consecutive ones that each have a result; None: not yet."""
     run: list[Result] = []
     for result in sorted(found.after(begin_ns), key=lambda one: one.seq):
         if run and result.seq != run[-1].seq + 1:
@@ -66,7 +66,7 @@ def whole_since(found: Collected, begin_ns: int, length: int = 10) -> int | None
 
 
 def until_shared(found: Collected, workers: list[Process]) -> None:
-    """Wait until each has its share."""
+    """Wait until each worker has its share."""
     for worker in workers:
         worker.until("marks front  part")
     newest_ns = max((result.captured_ns for result in found.after(0)), default=0)
@@ -76,7 +76,7 @@ def until_shared(found: Collected, workers: list[Process]) -> None:
 @pytest.mark.parametrize(
     ("number", "limit_s"), [(signal.SIGKILL, WITHIN_S), (signal.SIGSTOP, 2.5)], ids=["killed", "stopped"]
 )
-def test_a_worker_is_gone_and_the_others_take_its_share(
+def test_a_dead_workers_share_goes_to_the_others(
     proxy: Callable[..., Process], start: Callable[..., Process], number: signal.Signals, limit_s: float
 ) -> None:
     proxy(f"sim://?world=empty&cameras=front&fps={FPS}")

@@ -1,4 +1,4 @@
-"""Programs that end in flight without having landed: killed over their own proxy, or at the end of their script."""
+"""Programs that end in flight without landing: killed with their private proxy, or at the end of their script."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_program_that_is_killed_over_its_own_proxy_leaves_a_drone_that_lands(
 def test_a_script_that_ends_in_flight_leaves_a_drone_that_lands(
     start: Callable[..., Process], proxy: Callable[..., Process], program: str, last: str
 ) -> None:
-    """Its thread is a daemon and commands on; the end of the interpreter ends it, or what it registered lands."""
+    """Its daemon thread keeps commanding; either the end of the interpreter stops it, or the exit handler lands."""
     proxy()
     with skyloop.connect("alpha", access="observe") as observer:
         owners: list[str] = []
@@ -71,8 +71,8 @@ def test_a_script_that_ends_in_flight_leaves_a_drone_that_lands(
         assert (last == "program") is (owners[0] == "program")
 
 
-def test_a_take_off_raises_no_refusal_of_what_a_callback_commands() -> None:
-    """A callback that flies is registered before the take-off: its velocities are refused on the ground, not that."""
+def test_a_take_off_does_not_raise_refusals_of_a_callbacks_commands() -> None:
+    """A callback that flies is registered before take-off: on the ground only its velocities are refused."""
     refused: list[str] = []
     with skyloop.connect(SIM, name="program") as drone:
         drone.on_event(lambda event: refused.append(event.text) if "velocity refused" in event.text else None)

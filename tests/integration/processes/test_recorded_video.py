@@ -1,4 +1,4 @@
-"""Eight seconds that a real AR.Drone 2 recorded, through proxy, transport, a processor and a controller."""
+"""Eight seconds recorded by a real AR.Drone 2, sent through proxy, transport, a processor and a controller."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
         eventually(lambda: len(processed) + processor.dropped >= FRAMES, "the processor is through as well", 30.0)
     assert processed == sorted(processed)
     assert controller.seen == sorted(controller.seen)
-    # Both keep up with 30 frames a second, unless the machine takes their turn away for longer than a frame lasts.
+    # Both keep up with 30 frames a second unless the machine suspends them for longer than a frame.
     assert processor.dropped <= FRAMES // 50
     assert len(controller.seen) >= FRAMES - FRAMES // 50
-    assert len(set(controller.brightness)) > FRAMES // 2  # they are not always the same picture
+    assert len(set(controller.brightness)) > FRAMES // 2  # the pictures differ
 
 
-def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path: Path) -> None:
+def test_its_h264_reaches_a_recorder_in_another_process_unchanged(tmp_path: Path) -> None:
     pytest.importorskip("av", reason="reading recorded video needs PyAV: skyloop install video")
     path = tmp_path / "flight.mcap"
     with (
@@ -71,6 +71,6 @@ def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path:
     sent = [frame.payload for frame in PaveParser().feed(stream().read_bytes())]
     places = [sent.index(picture.compressed) for picture in pictures]
     assert places == sorted(set(places))
-    if not recorder.dropped and not recorder.missed:  # a busy machine may leave some out, and says so
+    if not recorder.dropped and not recorder.missed:  # a busy machine may drop some, and reports it
         assert places == list(range(FRAMES))
     assert len(places) >= FRAMES // 4

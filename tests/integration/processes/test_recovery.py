@@ -1,4 +1,4 @@
-"""Links that heal: proxies that are killed, stopped and started again."""
+"""Links that recover: proxies that are killed, stopped and started again."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.process
 
 
 @pytest.mark.daily
-def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as_it_was(
+def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_its_state_restored(
     proxy: Callable[..., Process],
 ) -> None:
     first = proxy("sim://?world=empty&cameras=front")
@@ -32,7 +32,7 @@ def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as
         first.signal(signal.SIGKILL)
         first.wait()
         eventually(lambda: any(s.application is LinkState.LOST for _, s in told), "it is told of the loss")
-        assert drone.velocity(forward=0.3) is False  # nothing to do, and nothing raised
+        assert drone.velocity(forward=0.3) is False  # no vehicle to command, and no exception
         frames.clear()
         proxy("sim://?world=empty&cameras=front")
         ready = time.monotonic()
@@ -48,7 +48,7 @@ def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as
         drone.land()
 
 
-def test_a_stopped_proxy_is_told_as_lost_and_recovers_when_it_goes_on(proxy: Callable[..., Process]) -> None:
+def test_a_stopped_proxy_is_reported_lost_and_recovers_when_it_continues(proxy: Callable[..., Process]) -> None:
     process = proxy()
     with skyloop.connect("alpha") as drone:
         process.signal(signal.SIGSTOP)
@@ -58,7 +58,7 @@ def test_a_stopped_proxy_is_told_as_lost_and_recovers_when_it_goes_on(proxy: Cal
         eventually(lambda: drone.authority.state == "held", "the authority is back")
 
 
-def test_a_lost_vehicle_is_told_and_only_fresh_commands_fly_it_again(proxy: Callable[..., Process]) -> None:
+def test_a_lost_vehicle_is_reported_and_only_new_commands_fly_it_again(proxy: Callable[..., Process]) -> None:
     proxy("sim://?world=empty&cameras=none")
     with skyloop.connect("alpha") as drone:
         drone.takeoff()

@@ -1,4 +1,4 @@
-"""Bad input over a real connection: refused with a clear error or an event, and the flight goes on."""
+"""Bad input over a real connection: refused with a clear error or an event, while the flight continues."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.processes import Process, eventually
 pytestmark = pytest.mark.process
 
 
-def test_bad_values_are_refused_where_they_are_given(proxy: Callable[..., Process]) -> None:
+def test_bad_values_are_refused_at_the_call(proxy: Callable[..., Process]) -> None:
     proxy()
     with skyloop.connect("alpha") as drone:
         drone.takeoff()
@@ -29,14 +29,14 @@ def test_bad_values_are_refused_where_they_are_given(proxy: Callable[..., Proces
         for bad_tilt in (99.0, -1.0, math.nan, "steep", True):
             with pytest.raises((ParameterError, UsageError), match=r"limits\.tilt"):
                 drone.config["limits.tilt"] = bad_tilt
-        drone.velocity(forward=1000.0)  # clamped, and told
+        drone.velocity(forward=1000.0)  # clamped, with an event
         eventually(lambda: any(e.kind is EventKind.COMMAND_CLAMPED for e in drone.recent_events()), "the clamp is told")
         drone.hover()
         assert drone.feedback().state.airborne
         drone.land()
 
 
-def test_wrong_names_are_answered_with_the_nearest_right_one(proxy: Callable[..., Process]) -> None:
+def test_wrong_names_are_answered_with_the_closest_valid_one(proxy: Callable[..., Process]) -> None:
     proxy(name="charlie")
     with pytest.raises(UnknownNameError, match="did you mean 'charlie'"):
         skyloop.connect("charly")
@@ -80,7 +80,7 @@ class Deaf:
 
 
 def attack(hostile: list[bytes], first: int) -> int:
-    """Send from the given one on until the proxy ends the connection; returns how far it came."""
+    """Send from this index on until the proxy ends the connection; returns how far it got."""
     deaf = Deaf()
     end = dial("alpha")(deaf)
     try:

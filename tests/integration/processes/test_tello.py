@@ -1,4 +1,4 @@
-"""A Tello in processes of their own: emulated firmware, proxy and pilot; and what goes wrong between them."""
+"""A Tello across processes (emulated firmware, proxy and pilot), and the failures between them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ Firmware = Callable[..., Process]
 
 @pytest.fixture
 def addresses() -> Addresses:
-    """Where the drone is and where it is flown from, for this test alone."""
+    """The drone's address and the pilot's address, private to this test."""
     return Addresses.free()
 
 
 @pytest.fixture
 def firmware(start: Callable[..., Process], addresses: Addresses) -> Firmware:
-    """Starts an emulated Tello."""
+    """Start an emulated Tello."""
 
     def begin(*options: str) -> Process:
         process = start("-m", "skyloop", "sim", "--firmware", "tello", "--bind", addresses.drone, *options)
@@ -41,7 +41,7 @@ def firmware(start: Callable[..., Process], addresses: Addresses) -> Firmware:
 
 
 def found(follower: FollowMarker, seconds: float) -> float:
-    """Find the marker and follow it for so long; the share of pictures that showed it since."""
+    """Find the marker and follow it for this long; returns the share of later pictures that showed it."""
     follower.run(seconds=60.0, until=lambda: follower.score.share_in_view is not None)
     follower.run(seconds=seconds)
     share = follower.score.share_in_view
@@ -66,7 +66,7 @@ def test_the_marker_follower_flies_it_unchanged(
 def test_it_finds_and_follows_the_marker_with_a_tenth_of_the_datagrams_lost(
     firmware: Firmware, proxy: Callable[..., Process], addresses: Addresses
 ) -> None:
-    """Pictures come in bursts then, from each key picture that came whole: it takes longer, and stays near."""
+    """Pictures then arrive in bursts, each starting with an intact key picture: it takes longer, and stays near."""
     firmware("--lose", "0.1", "--fault-seed", "3")
     proxy(addresses.uri())
     with skyloop.connect("alpha") as drone:
@@ -97,7 +97,7 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
         observer.wait("landed", timeout_s=30.0)
 
 
-def test_a_proxy_that_follows_one_that_was_killed_finds_it_in_the_air(
+def test_a_proxy_that_replaces_a_killed_one_finds_it_in_the_air(
     firmware: Firmware, proxy: Callable[..., Process], start: Callable[..., Process], addresses: Addresses
 ) -> None:
     firmware("--world", "empty")
@@ -107,7 +107,7 @@ def test_a_proxy_that_follows_one_that_was_killed_finds_it_in_the_air(
         drone.wait("hovering", timeout_s=30.0)
         first.signal(signal.SIGKILL)
         first.wait()
-        drone.close()  # the block's end might wait for a proxy that lands it, for longer than a Tello stays up unheard
+        drone.close()  # the block's end could wait for a landing proxy longer than a Tello stays up without commands
     proxy(addresses.uri(video=0), "beta")
     with skyloop.connect("beta", access="observe") as observer:
         observer.wait("hovering", timeout_s=30.0)

@@ -1,4 +1,4 @@
-"""An emulated AR.Drone 2 with the drone's own ports, for programs in which they can't be chosen."""
+"""An emulated AR.Drone 2 on the drone's own ports, for programs whose ports can't be chosen."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PATIENCE_S = 90.0
 
 @dataclass
 class Emulated:
-    """The drone, where it listens, and where it really is."""
+    """The drone, its addresses, and its true position."""
 
     host: SimHost
     address: str
@@ -36,7 +36,7 @@ class Emulated:
         return float(x), float(y), float(z)
 
     def flown(self, command: list[str], **environment: str) -> tuple[dict[str, Any], float]:
-        """Let a program fly. What it says it saw; how far from its start the drone really is when it has landed [m]."""
+        """Let a program fly. Returns its report, and the drone's true distance from its start after landing [m]."""
         start = self.position_m()
         done = subprocess.run(
             [*command, self.address],
@@ -54,7 +54,7 @@ class Emulated:
 
 
 def absent(reason: str) -> NoReturn:
-    """Skips, or fails where somebody has promised that all is there."""
+    """Skip the test, or fail it where the environment promises that everything is installed."""
     if os.environ.get("SKYLOOP_THIRD_PARTY") == "required":
         pytest.fail(reason)
     pytest.skip(reason)
@@ -71,7 +71,7 @@ def node_modules(package: str, version: str) -> Path:
 
 
 def private_address() -> str:
-    """One in 127.0.0.0/8 that no other run of the tests has."""
+    """An address in 127.0.0.0/8 that no other test run uses."""
     pid = os.getpid()
     return f"127.77.{pid >> 8 & 0xFF}.{pid & 0xFF}"
 

@@ -1,4 +1,4 @@
-"""Flies a Tello with djitellopy, by nobody's advice but its documentation: ``fly_djitellopy.py steady|lossy ADDRESS``.
+"""Flies a Tello with djitellopy, following only its documentation: ``fly_djitellopy.py steady|lossy ADDRESS``.
 
 Prints one line of JSON: what it saw.
 """
@@ -14,22 +14,22 @@ from typing import Any
 from djitellopy import Tello
 
 Tello.LOGGER.setLevel(logging.WARNING)
-Tello.FRAME_GRAB_TIMEOUT = 40  # an emulated drone on a busy machine takes its time for the first picture
+Tello.FRAME_GRAB_TIMEOUT = 40  # an emulated drone on a busy machine is slow to show its first picture
 
 
 def pictures(tello: Any) -> dict[str, Any]:
-    """What the camera shows, once something comes."""
+    """Measure the camera's pictures, once there are any."""
     tello.streamon()
     reader = tello.get_frame_read()
     end = time.monotonic() + 20
-    while reader.frame.shape[:2] == (300, 400) and time.monotonic() < end:  # its own placeholder
+    while reader.frame.shape[:2] == (300, 400) and time.monotonic() < end:  # djitellopy's own placeholder
         time.sleep(0.05)
     frame = reader.frame
     return {"size": list(frame.shape), "contrast": float(frame.std())}
 
 
 def steady(tello: Any) -> dict[str, Any]:
-    """Everything answered: moves, turns, questions, and sticks for a while."""
+    """Everything is answered: moves, turns, queries, and sticks for a while."""
     seen: dict[str, Any] = {"sdk": tello.query_sdk_version(), "battery": tello.query_battery()}
     seen["on_ground_cm"] = tello.get_distance_tof()
     seen |= pictures(tello)
@@ -53,7 +53,7 @@ def steady(tello: Any) -> dict[str, Any]:
 
 
 def lossy(tello: Any) -> dict[str, Any]:
-    """With datagrams lost it can't wait for answers: it looks at the state, and says things again."""
+    """With datagrams lost it can't wait for answers: it checks the state, and repeats commands."""
     highest = 0
     for _ in range(40):
         tello.send_command_without_return("takeoff")

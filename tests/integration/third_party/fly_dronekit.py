@@ -1,7 +1,7 @@
-"""Flies an ArduCopter with dronekit2 alone, nothing of Skyloop: ``python fly_dronekit.py ADDRESS``.
+"""Flies an ArduCopter with dronekit2 alone, without Skyloop: ``python fly_dronekit.py ADDRESS``.
 
-As DroneKit's own first example does: waits until it is armable, takes off, goes somewhere, comes home. Writes what it
-saw as one line of JSON. Runs with the Python of an environment that has dronekit2 3.0.0.
+Follows DroneKit's first example: waits until it is armable, takes off, flies somewhere, returns. Writes its
+observations as one line of JSON. Runs with the Python of an environment that has dronekit2 3.0.0.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def until(done: Callable[[], object], what: str) -> None:
     deadline = time.monotonic() + PATIENCE_S
     while not done():
         if time.monotonic() > deadline:
-            raise SystemExit(f"waited {PATIENCE_S} s in vain: {what}")
+            raise SystemExit(f"waited {PATIENCE_S} s without success: {what}")
         time.sleep(0.1)
 
 

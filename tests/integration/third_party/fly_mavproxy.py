@@ -1,8 +1,7 @@
-"""Flies a MAVLink vehicle with MAVProxy alone, nothing of Skyloop: ``python fly_mavproxy.py arducopter|px4 MASTER``.
+"""Flies a MAVLink vehicle with MAVProxy alone, without Skyloop: ``python fly_mavproxy.py arducopter|px4 MASTER``.
 
-Types what a person would type; for a PX4 its ``mode`` command fails with an error of its own, so that modes are set by
-``long``. Writes what MAVProxy said as one line of JSON. Runs with the Python of an environment
-that has MAVProxy 1.8.75.
+Types what a person would type; MAVProxy's own ``mode`` command fails for a PX4, so modes are set by ``long``. Writes
+MAVProxy's output as one line of JSON. Runs with the Python of an environment that has MAVProxy 1.8.75.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ PATIENCE_S = 60.0
 
 
 class Terminal:
-    """MAVProxy with a keyboard."""
+    """MAVProxy with a simulated keyboard."""
 
     def __init__(self, master: str) -> None:
         program = Path(sys.executable).with_name("mavproxy.py")
@@ -52,11 +51,11 @@ class Terminal:
         self._process.stdin.flush()
 
     def until(self, words: str, typed: str = "", pace_s: float = 1.0) -> None:
-        """Read until it says this, and type a line again and again meanwhile."""
+        """Read until these words appear, typing a line repeatedly meanwhile."""
         deadline, begun, due = time.monotonic() + PATIENCE_S, len(self.text), 0.0
         while words not in self.text[begun:]:
             if time.monotonic() > deadline:
-                raise SystemExit(f"waited {PATIENCE_S} s in vain for {words!r}: {self.text[-3000:]}")
+                raise SystemExit(f"waited {PATIENCE_S} s without success for {words!r}: {self.text[-3000:]}")
             if typed and time.monotonic() >= due:
                 due = time.monotonic() + pace_s
                 self.type(typed)
@@ -81,7 +80,7 @@ def main(kind: str, master: str) -> None:
             terminal.until("GUIDED>", "mode GUIDED")
             terminal.until("Arming motors", "arm throttle")
             terminal.type("takeoff 2.5")
-            time.sleep(6.0)  # it does not say when it is up
+            time.sleep(6.0)  # it does not say when it is ready
             terminal.for_a_while("velocity 1 0 0", 3.0)
             terminal.until("LAND>", "mode LAND")
         else:

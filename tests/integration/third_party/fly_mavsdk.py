@@ -1,6 +1,6 @@
-"""Flies a MAVLink vehicle with MAVSDK alone, nothing of Skyloop: ``python fly_mavsdk.py URL``.
+"""Flies a MAVLink vehicle with MAVSDK alone, without Skyloop: ``python fly_mavsdk.py URL``.
 
-Writes what it saw as one line of JSON. Runs with the Python of an environment that has mavsdk 4.1.0.
+Writes its observations as one line of JSON. Runs with the Python of an environment that has mavsdk 4.1.0.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def until(done: Callable[[], Any], what: str, say: Callable[[], object] = lambda
         if found:
             return found
         if time.monotonic() > deadline:
-            raise SystemExit(f"waited {PATIENCE_S} s in vain: {what[:500]}")
+            raise SystemExit(f"waited {PATIENCE_S} s without success: {what[:500]}")
         time.sleep(0.1)
 
 
@@ -50,7 +50,7 @@ def main(url: str) -> None:
     action.takeoff()
     until(lambda: telemetry.position().relative_altitude_m > HEIGHT_M - 0.5, "its altitude")
     high = telemetry.position().relative_altitude_m
-    time.sleep(2.0)  # the end of the take-off, which MAVSDK does not tell
+    time.sleep(2.0)  # the end of the take-off, which MAVSDK does not report
 
     def forward() -> None:
         offboard.set_velocity_body(VelocityBodyYawspeed(1.0, 0.0, 0.0, 0.0))

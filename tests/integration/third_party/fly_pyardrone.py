@@ -1,6 +1,6 @@
-"""Flies an AR.Drone with pyardrone alone, nothing of Skyloop: ``python fly_pyardrone.py HOST``.
+"""Flies an AR.Drone with pyardrone alone, without Skyloop: ``python fly_pyardrone.py HOST``.
 
-Writes what it saw as one line of JSON. Runs with the Python of an environment that has pyardrone 0.6.1 and OpenCV.
+Writes its observations as one line of JSON. Runs with the Python of an environment that has pyardrone 0.6.1 and OpenCV.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ REPEAT_S = 0.03
 
 
 class Saw:
-    """What the drone told and showed."""
+    """The data and pictures received from the drone."""
 
     def __init__(self, drone: Any) -> None:
         self.drone = drone
@@ -55,11 +55,11 @@ class Saw:
 
 
 def repeat_until(send: Callable[[], object], done: Callable[[], bool], what: str) -> None:
-    """As the drone wants it: the same command again and again, until navdata shows its effect."""
+    """Repeat a command, as the drone requires, until navdata shows its effect."""
     deadline = time.monotonic() + PATIENCE_S
     while not done():
         if time.monotonic() > deadline:
-            raise SystemExit(f"waited {PATIENCE_S} s in vain: {what}")
+            raise SystemExit(f"waited {PATIENCE_S} s without success: {what}")
         send()
         time.sleep(REPEAT_S)
 
@@ -110,4 +110,4 @@ def main(host: str) -> None:
 if __name__ == "__main__":
     main(sys.argv[1])
     sys.stdout.flush()
-    os._exit(0)  # its threads may be in OpenCV still, which the interpreter's own way out does not survive
+    os._exit(0)  # its threads may still be in OpenCV, which crashes on the interpreter's normal exit

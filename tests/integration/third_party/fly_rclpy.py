@@ -2,8 +2,8 @@
 
     python fly_rclpy.py /alpha 30
 
-Asks for the authority, takes off, turns until it sees marker 7, follows it at 1.5 m for so many seconds, lands, and
-prints how it went as JSON.
+Asks for the authority, takes off, turns until it sees marker 7, follows it at 1.5 m for this many seconds, lands, and
+prints the outcome as JSON.
 """
 
 import json
@@ -78,7 +78,7 @@ class Follower(Node):  # type: ignore[misc]  # rclpy has no types here
     def call(self, name: str) -> None:
         client = self.create_client(Trigger, name)
         if not client.wait_for_service(15.0):
-            raise TimeoutError(f"nobody offers {name}")
+            raise TimeoutError(f"no node offers {name}")
         future = client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(self, future, timeout_sec=30.0)
         if future.result() is None or not future.result().success:

@@ -1,4 +1,4 @@
-"""Two network namespaces with a cable between them: for programs whose ports and addresses can't be chosen."""
+"""Two network namespaces joined by a cable, for programs whose ports and addresses can't be chosen."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 @dataclass(frozen=True)
 class Cable:
-    """What runs on either end is started by these words before it."""
+    """The command prefixes that start a program at either end."""
 
     drone: tuple[str, ...]
     pilot: tuple[str, ...]
@@ -22,7 +22,7 @@ class Cable:
 
 @contextmanager
 def cable(drone_address: str, pilot_address: str) -> Iterator[Cable]:
-    """Skips where they can't be had: without root's rights, or ``ip`` of iproute2."""
+    """Skips where namespaces aren't available: without root's rights, or without iproute2's ``ip``."""
     if os.geteuid() != 0 or shutil.which("ip") is None:
         pytest.skip("network namespaces need root and the program ip")
     ends = {"drone": drone_address, "pilot": pilot_address}

@@ -1,4 +1,4 @@
-"""Writes what a bridge publishes into a bag with rosbags, as it comes, and reads it back.
+"""Writes a bridge's messages into a bag with rosbags as they arrive, and reads it back.
 
     python ros2_bag.py /alpha FOLDER
 
@@ -23,7 +23,7 @@ from skyloop.ros.names import tf_message_type
 from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME
 
 LASTING = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-TOPICS = {  # type, and how many are waited for
+TOPICS = {  # type, and the number of messages to wait for
     "front/image_raw": (Image, qos_profile_sensor_data, 10),
     "front/image_raw/compressed": (CompressedImage, qos_profile_sensor_data, 10),
     "front/camera_info": (CameraInfo, qos_profile_sensor_data, 10),

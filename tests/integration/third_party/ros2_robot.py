@@ -1,4 +1,4 @@
-"""A small robot of ROS 2 that flies: a point with odometry, a camera, cmd_vel, take-off and landing. Knows no Skyloop.
+"""A small flying ROS 2 robot: a point with odometry, a camera, cmd_vel, take-off and landing. Does not know Skyloop.
 
     python ros2_robot.py /robot
 
@@ -25,7 +25,7 @@ class Robot(Node):  # type: ignore[misc]  # rclpy has no types here
     def __init__(self, namespace: str) -> None:
         super().__init__("robot", namespace=namespace)
         self.x = self.y = self.z = self.yaw = 0.0
-        self.goal: float | None = None  # height that a take-off or landing leads to
+        self.goal: float | None = None  # height at which the current take-off or landing ends
         self.twist, self.told_s, self.steps = Twist(), 0.0, 0
         quality = qos_profile_sensor_data
         self.odom = self.create_publisher(Odometry, "odom", quality)

@@ -1,9 +1,9 @@
-"""Runs the public driver suite on a robot of ROS 2, in the environment that has rclpy and no pytest.
+"""Runs the public driver suite on a ROS 2 robot, in the environment that has rclpy and no pytest.
 
     python ros2_suite.py ADDRESS PID
 
-PID is the robot's process, which is stopped and continued as the vehicle that disappears and appears. Prints what
-became of each test as JSON: "" for passed, "skipped: …", or what failed.
+PID is the robot's process, which is stopped and continued as the vehicle that disappears and appears. Prints the
+outcome of each test as JSON: "" for passed, "skipped: …", or what failed.
 """
 
 import json
@@ -36,7 +36,7 @@ def main() -> None:
             outcomes[name] = ""
         except unittest.SkipTest as skipped:
             outcomes[name] = f"skipped: {skipped}"
-        except Exception:  # noqa: BLE001  whatever failed is told
+        except Exception:  # noqa: BLE001  any failure is reported
             outcomes[name] = traceback.format_exc()
     print(json.dumps(outcomes))
 

@@ -1,4 +1,4 @@
-"""djitellopy 2.5.0, a Python program that we did not write, flies the emulated Tello.
+"""djitellopy 2.5.0, an independent Python program, flies the emulated Tello.
 
 It binds the drone's own port 8889 on its side, and 8890 and 11111, on all addresses: so each end has a network of its
 own. It waits 7 s for an answer, takes whatever comes for it, and asks again.
@@ -33,7 +33,7 @@ Fly = Callable[..., dict[str, Any]]
 
 @pytest.fixture
 def python() -> str:
-    """Of the environment that has djitellopy: SKYLOOP_DJITELLOPY_PYTHON, or where scripts/third-party.sh puts it."""
+    """The interpreter of the environment with djitellopy: SKYLOOP_DJITELLOPY_PYTHON, or scripts/third-party.sh's."""
     python = os.environ.get("SKYLOOP_DJITELLOPY_PYTHON", str(INSTALLED / "djitellopy" / "bin" / "python"))
     asked = [python, "-c", "import djitellopy, importlib.metadata as m; print(m.version('djitellopy'))"]
     try:
@@ -52,7 +52,7 @@ def between() -> Iterator[Cable]:
 
 @pytest.fixture
 def fly(python: str, between: Cable) -> Iterator[Fly]:
-    """Starts the drone, lets djitellopy fly it, and gives what it says it saw."""
+    """Start the drone, let djitellopy fly it, and return its report."""
     running: list[subprocess.Popen[bytes]] = []
 
     def begin(how: str, *options: str) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def fly(python: str, between: Cable) -> Iterator[Fly]:
 
     yield begin
     for drone in running:
-        drone.kill()  # "ip netns exec" has become it
+        drone.kill()  # the process started by "ip netns exec" has been replaced by it
         drone.wait(10)
         if drone.stdout is not None:
             drone.stdout.close()
@@ -101,7 +101,7 @@ def test_it_takes_off_moves_sees_and_lands(fly: Fly) -> None:
     assert seen["fastest_dm_s"] >= 2
     assert seen["motor_s"] >= 5
     assert seen["size"] == [720, 960, 3]
-    assert seen["contrast"] > 10  # a room, and no grey
+    assert seen["contrast"] > 10  # a room, not plain grey
 
 
 def test_it_flies_with_a_tenth_of_the_datagrams_lost(fly: Fly) -> None:

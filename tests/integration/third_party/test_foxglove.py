@@ -1,4 +1,4 @@
-"""npm's @foxglove/ws-protocol 0.8.0 and protobufjs, which are not ours, read what ``skyloop view --foxglove`` serves.
+"""npm's @foxglove/ws-protocol 0.8.0 and protobufjs, both independent, read what ``skyloop view --foxglove`` serves.
 
 While a simulated drone flies, every topic is decoded by the schema that the server sends for it.
 """
@@ -90,7 +90,7 @@ def test_every_topic_is_decoded_while_a_drone_flies(modules: Path, proxy: Proces
 
 
 def flown_and_seen(modules: Path, url: str) -> dict[str, Any]:
-    """Fly, draw and log until the viewer has seen everything; return what it saw."""
+    """Fly, draw and log until the viewer has seen everything; return the viewer's report."""
     order = {
         "url": url,
         "wanted": sorted(TOPICS),
@@ -107,7 +107,7 @@ def flown_and_seen(modules: Path, url: str) -> dict[str, Any]:
                 if viewer.poll() is not None:
                     break
                 drone.velocity(yaw_rate=0.3)
-                drone.config["alarms.battery_critical"] = threshold  # is an event
+                drone.config["alarms.battery_critical"] = threshold  # it causes an event
                 frame = drone.next_frame(timeout_s=10.0)
                 drone.annotate(frame, [Polyline(((1.0, 1.0), (5.0, 5.0)))], source="tracker")
                 worker.publish(frame, {"score": 0.5})

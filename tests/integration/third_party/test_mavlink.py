@@ -30,7 +30,7 @@ def firmware(request: pytest.FixtureRequest) -> Iterator[MavlinkFirmware]:
 
 
 def python_of(name: str, version: str) -> str:
-    """Of the environment that has this program: SKYLOOP_<NAME>_PYTHON, or where scripts/third-party.sh puts it."""
+    """The interpreter of the environment with this program: SKYLOOP_<NAME>_PYTHON, or scripts/third-party.sh's."""
     python = os.environ.get(f"SKYLOOP_{name.upper()}_PYTHON", str(INSTALLED / name / "bin" / "python"))
     asked = [python, "-c", f"from importlib.metadata import version; print(version({name!r}))"]
     try:
@@ -42,7 +42,7 @@ def python_of(name: str, version: str) -> str:
 
 
 def flown(firmware: MavlinkFirmware, folder: Path, *command: str) -> dict[str, Any]:
-    """Let a program fly; what it says it saw. The vehicle went about three metres, stands and is disarmed."""
+    """Let a program fly; returns its report. The vehicle flew about three metres, stands and is disarmed."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S + 60, cwd=folder, check=False)
     assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
     east, north, up = firmware.host.simulation.truth(0).position_m
@@ -70,7 +70,7 @@ def test_mavproxy_takes_off_flies_by_velocity_and_lands(firmware: MavlinkFirmwar
 
 
 @pytest.mark.parametrize("firmware", [Kind.ARDUCOPTER], indirect=True)
-def test_dronekit_waits_until_it_is_armable_takes_off_goes_somewhere_and_comes_home(
+def test_dronekit_waits_until_it_is_armable_takes_off_flies_somewhere_and_returns(
     firmware: MavlinkFirmware, tmp_path: Path
 ) -> None:
     python, tcp = python_of("dronekit2", "3.0.0"), firmware.settings.ports.tcp
@@ -80,7 +80,7 @@ def test_dronekit_waits_until_it_is_armable_takes_off_goes_somewhere_and_comes_h
     seen: dict[str, Any] = json.loads([line for line in done.stdout.splitlines() if line.startswith("{")][-1])
     assert seen["high_m"] > 2.3
     assert seen["there_m"] < 0.6
-    assert seen["fastest_m_s"] < 1.8, "slower, by its own command"
+    assert seen["fastest_m_s"] < 1.8, "its own command slows it down"
     assert seen["highest_m"] == pytest.approx(5.0, abs=0.5), "RTL_ALT"
     assert seen["home_m"] < 0.1
     assert not firmware.autopilot.armed

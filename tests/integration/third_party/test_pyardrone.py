@@ -1,4 +1,4 @@
-"""pyardrone 0.6.1, a Python program that we did not write, flies the emulated AR.Drone 2.
+"""pyardrone 0.6.1, an independent Python program, flies the emulated AR.Drone 2.
 
 Its quirks: it takes navdata only from the very address and port that it asked, repeats REF only as often as its user
 does, lets its navdata thread die of an option 27 of any size but 12 bytes (so it flies in the demo mode, which has
@@ -42,5 +42,5 @@ def test_it_takes_off_moves_sees_and_lands(python: str, drone: Emulated) -> None
     assert seen["fastest_mm_s"] > 200
     assert seen["pictures"] >= 10
     assert seen["sizes"] == [[360, 640, 3]]
-    assert seen["contrast"] > 10  # a room, not the grey of a decoder that was never told what to show
+    assert seen["contrast"] > 10  # a room, not the grey of a decoder without parameter sets
     assert moved_m > 0.5

@@ -1,4 +1,4 @@
-"""ROS 2 by its wheels: programs that know nothing of Skyloop fly its drones, and its programs fly a robot of ROS 2.
+"""ROS 2 from its wheels: programs without Skyloop fly its drones, and Skyloop's programs fly a ROS 2 robot.
 
 ``SKYLOOP_ROS_PYTHON`` is an interpreter with rclpy and Skyloop. The program that flies runs with
 ``SKYLOOP_ROS_PROGRAM_PYTHON``, in an environment without Skyloop, if that is set. Everything stays on loopback, in a
@@ -30,20 +30,20 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
 
 @pytest.fixture
 def sockets() -> Iterator[Path]:
-    """A directory with a short path, as those of sockets must be."""
+    """A directory with a short path, as socket paths require."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
         yield Path(folder) / "run"
 
 
 @pytest.fixture
 def python(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, sockets: Path) -> str:
-    """The interpreter, with an environment in which ROS 2 stays on loopback, in a domain of this process alone."""
+    """The interpreter, with an environment that keeps ROS 2 on loopback, in a domain of this process alone."""
     python = os.environ.get("SKYLOOP_ROS_PYTHON")
     if not python:
         absent("SKYLOOP_ROS_PYTHON names no interpreter with rclpy and Skyloop: scripts/third-party.sh makes one")
     profile = tmp_path / "loopback.xml"
     profile.write_text(LOOPBACK_PROFILE)
-    for variable in (PROFILES_VARIABLE, OLD_PROFILES_VARIABLE):  # whichever version of Fast DDS it is
+    for variable in (PROFILES_VARIABLE, OLD_PROFILES_VARIABLE):  # whichever version of Fast DDS is installed
         monkeypatch.setenv(variable, str(profile))
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(sockets))
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
@@ -86,7 +86,7 @@ def outcome(child: subprocess.Popen[str], timeout_s: float) -> Any:
     return json.loads(out.splitlines()[-1])
 
 
-def test_a_program_of_ros_follows_the_marker_and_a_bag_reads_back(start: Any, python: str, tmp_path: Path) -> None:
+def test_a_ros_program_follows_the_marker_and_a_bag_reads_back(start: Any, python: str, tmp_path: Path) -> None:
     start("-m", "skyloop", "proxy", "sim://?world=room&seed=0", "--name", "alpha", ready="ready alpha")
     start("-m", "skyloop", "ros", "--drone", "alpha", "--map", "map", ready="ready /alpha")
     program = os.environ.get("SKYLOOP_ROS_PROGRAM_PYTHON", python)
@@ -112,7 +112,7 @@ def test_a_program_of_ros_follows_the_marker_and_a_bag_reads_back(start: Any, py
         assert topic == "/tf_static" or 0.0 < read["age_s"] < 2.0, (topic, read)
 
 
-def test_a_robot_of_ros_passes_the_driver_suite(start: Any) -> None:
+def test_a_ros_robot_passes_the_driver_suite(start: Any) -> None:
     robot = start(str(HERE / "ros2_robot.py"), "/robot", ready="ready")
     address = "ros2://robot?takeoff=takeoff&land=land&width=320&height=240&fps=15"
     outcomes = outcome(start(str(HERE / "ros2_suite.py"), address, str(robot.pid)), 120)
@@ -120,8 +120,8 @@ def test_a_robot_of_ros_passes_the_driver_suite(start: Any) -> None:
     assert not failed, "\n".join(failed.values())
     skipped = {name for name, text in outcomes.items() if text.startswith("skipped")}
     assert skipped <= {
-        "test_emergency_stop_and_reset",  # it has none
-        "test_pictures_as_they_come",  # no encoded stream
+        "test_emergency_stop_and_reset",  # the robot has none
+        "test_pictures_as_they_come",  # it has no encoded stream
         "test_parameters_round_trip",
     }
     assert outcomes["test_flight"] == ""
