@@ -30,7 +30,7 @@ def test_properties_are_tested_with_the_same_examples() -> None:
 
 @pytest.mark.process
 def test_exploring_looks_for_others(tmp_path: Path) -> None:
-    """With the tests' own settings, in a folder of its own."""
+    """With the tests' own settings, in a separate folder."""
     (tmp_path / "conftest.py").write_bytes((Path(__file__).parents[1] / "conftest.py").read_bytes())
     (tmp_path / "test_it.py").write_text(SEES)
 

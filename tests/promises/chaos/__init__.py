@@ -1,7 +1,7 @@
 """Chaos: drones flown at 32 Hz while what surrounds them is killed, stopped, starved and flooded, and their links fail.
 
 ``make chaos`` runs it; ``python -m tests.promises.chaos --help`` says how. Every *lane* is one vehicle, its proxy and
-its pilot, in processes of their own. Each of them writes what it did to a *journal* (``journal.py``), and ``judge.py``
+its pilot, in separate processes. Each of them writes what it did to a *journal* (``journal.py``), and ``judge.py``
 derives from the journals alone which commands were executed too late, which flights were not requested, which
 failsafes were needless, and which never came. Control lanes fly without faults: their needless failsafes are caused by
 the machine.

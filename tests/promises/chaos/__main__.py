@@ -1,4 +1,4 @@
-"""``python -m tests.promises.chaos``: flies, makes trouble, and tells what became of the promises."""
+"""``python -m tests.promises.chaos``: flies, makes trouble, and reports which promises were kept."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from tests.promises.chaos.processes import Resources
 EPILOG = "Example: python -m tests.promises.chaos --seconds 180 --seed 7; ends with 1 if a promise broke."
 CALM_S = 5.0  #: before the first fault and after the last
 DISK = "8m"
-#: The lane beside each that has no faults: what happens to it as well is the machine's doing.
+#: A lane beside each of the others, without faults: faults that appear there too are caused by the machine.
 CONTROLS = {
     "local": "local-control",
     "network": "network-control",
     "mavlink": "mavlink-control",
     "page": "page-control",
 }
-#: A proxy that went through all this may hold so much more than before. What waited at once in a flood (some 25 MB over
-#: the network) the allocator keeps for the next: an hour of floods was seen to leave less, three minutes 26 MB.
+#: How much more a proxy may hold after all this. The allocator keeps the memory that a flood needed at once (some 25 MB
+#: over the network) for the next one: after an hour of floods it was less than that, after three minutes 26 MB.
 MORE_DESCRIPTORS, MORE_THREADS, MORE_MB = 8, 3, 48.0
 
 
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _lane(name: str, folder: Path) -> Lane:
-    """The kind is the beginning of its name."""
+    """Make the lane whose kind is the beginning of its name."""
     if name.startswith("page"):
         return PageLane(name, folder)
     if name.startswith("mavlink"):
@@ -69,7 +69,7 @@ def _lane(name: str, folder: Path) -> Lane:
 
 
 def _begun(names: Sequence[str], folder: Path, stack: ExitStack) -> list[Lane]:
-    """Lanes that start side by side, and are closed with the stack."""
+    """Lanes that start in parallel, and are closed with the stack."""
 
     def begin(name: str) -> Lane:
         lane = _lane(name, folder)
@@ -205,7 +205,7 @@ def _spread(spans_s: Sequence[float]) -> str:
 
 @contextmanager
 def _small_disk(folder: Path) -> Iterator[bool]:
-    """A disk that is soon full, for recordings and audit trails; whether it could be mounted, else it is a folder."""
+    """A small disk for recordings and audit trails; yields whether it could be mounted (else it is a folder)."""
     disk = folder / "disk"
     disk.mkdir()
     (folder / "elsewhere").mkdir(mode=0o700)

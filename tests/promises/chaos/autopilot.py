@@ -93,7 +93,7 @@ class JournalledAutopilot:
 
     def _on_send(self, send: Callable[[Message], None], message: Message) -> None:
         if self._second_battery and message.get_type() == "SYS_STATUS":
-            message.battery_remaining = -1  # which of the two is for the receiver to find out
+            message.battery_remaining = -1  # the receiver has to find out which of the two it is
         send(message)
 
     def _journal_set_point(self, message: Message) -> None:

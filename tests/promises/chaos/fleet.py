@@ -31,7 +31,7 @@ def main() -> None:
     def failsafe(driver: MavlinkDriver, action: Hover | Land) -> bool:
         done = acting(driver, action)
         if driver.uri == uri:
-            journal.write(f"failsafe:{action.name}")  # from here on nothing older leaves
+            journal.write(f"failsafe:{action.name}")  # from here on no older command is sent
         return done
 
     setattr(MavlinkDriver, "_open", open_it)  # noqa: B010  (which mypy would not let be assigned)

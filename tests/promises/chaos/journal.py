@@ -11,7 +11,7 @@ from skyloop.clock import monotonic_ns
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Something that happened at a time of this host's monotonic clock."""
+    """An event at a time of this host's monotonic clock."""
 
     at_ns: int
     what: str
@@ -19,7 +19,7 @@ class Entry:
 
 
 class Journal:
-    """The writing end. One ``write`` a line, so that a killed process leaves whole lines."""
+    """The writing end. Each line is one ``write``, so that a killed process leaves whole lines."""
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)

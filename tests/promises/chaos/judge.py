@@ -1,7 +1,7 @@
-"""From the journals of a lane to what became of its promises. Pure.
+"""Derives from a lane's journals which promises were kept. Pure.
 
 Times are of one host's monotonic clock. A *disruption* is a fault that takes the pilot, the proxy or the vehicle's
-link away, so that a failsafe is what is wanted; any other fault must leave the flight as it is.
+link away, so that a failsafe is expected; any other fault must leave the flight as it is.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ HOVER_AFTER_S: Final = 0.5  #: the proxy's defaults: failsafe.hover_after_s …
 LAND_AFTER_S: Final = 5.0  #: … failsafe.land_after_s …
 MAX_AGE_S: Final = 0.25  #: … and command.max_age_s
 STALL_S: Final = 1.0  #: how long the library repeats a set-point without a call
-#: Between the moment that counts and the line in the journal lie the scheduler and, on a loaded machine, its queue.
+#: Between the moment that counts and the line in the journal: the scheduler and, on a loaded machine, its queue.
 SLACK_S: Final = 0.05
-#: A call reaches the proxy within this. A failsafe that comes earlier knows of the silence before it alone.
+#: A call reaches the proxy within this. An earlier failsafe can't be a consequence of the silence before the call.
 ARRIVES_S: Final = 0.1
 #: A failsafe that is later than this was missed.
 LATE_S: Final = 1.0
@@ -28,9 +28,9 @@ LATE_S: Final = 1.0
 TAKEOFF_S: Final = 30.0
 #: An emergency stop is executed within this, even if its first packets are lost.
 STOP_S: Final = 3.0
-#: A failsafe's landing reaches the vehicle within this, with a link that may be lost meanwhile.
+#: A failsafe's landing reaches the vehicle within this, even if the link is lost for a while.
 LANDS_S: Final = 30.0
-#: A set-point that was under way when a stop was pressed may still be executed.
+#: A set-point already being sent when a stop was pressed may still be executed.
 UNDER_WAY_S: Final = 0.3
 DISRUPTIONS: Final = frozenset({"pilot_stop", "pilot_kill", "proxy_stop", "proxy_kill", "full_serial_port"})
 _PILOT: Final = frozenset({"pilot_stop", "pilot_kill"})
@@ -42,7 +42,7 @@ _ENDS: Final = frozenset({"touched_down", "disarmed", "other:land", "other:tip",
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """What was done to a lane, from when until when [ns]."""
+    """A fault of a lane, with its beginning and end [ns]."""
 
     kind: str
     begin_ns: int
@@ -51,7 +51,7 @@ class Fault:
 
 @dataclass(slots=True)
 class Verdict:
-    """What one lane showed. Times in s."""
+    """The findings for one lane. Times in s."""
 
     calls: int = 0
     applied: int = 0
@@ -59,8 +59,8 @@ class Verdict:
     needless: list[str] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
     unrecovered: list[str] = field(default_factory=list)
-    unasked: list[str] = field(default_factory=list)  #: flights that no pilot asked for
-    justified: int = 0  #: failsafes that somebody's silence or death asked for
+    unasked: list[str] = field(default_factory=list)  #: flights that no pilot requested
+    justified: int = 0  #: failsafes justified by a process's silence or death
     hover_late_s: list[float] = field(default_factory=list)  #: after ``failsafe.hover_after_s``; negative: before
     recovery_s: dict[str, list[float]] = field(default_factory=dict)
     delay_s: list[float] = field(default_factory=list)  #: from the call to the vehicle
@@ -68,7 +68,7 @@ class Verdict:
 
 
 def faults_of(entries: Iterable[Entry]) -> list[Fault]:
-    """The faults that were begun and ended, from ``begin:KIND`` and ``end:KIND``; they do not overlap in a lane."""
+    """The faults that began and ended, from ``begin:KIND`` and ``end:KIND``; they do not overlap in a lane."""
     faults, begun = [], {}
     for entry in entries:
         verb, _, kind = entry.what.partition(":")
@@ -82,7 +82,7 @@ def faults_of(entries: Iterable[Entry]) -> list[Fault]:
 def judge(
     pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault], *, transit_s: float = 0.0
 ) -> Verdict:
-    """What became of the promises of one lane, from its sorted journals.
+    """Which promises one lane kept, from its sorted journals.
 
     ``transit_s``: how long a set-point may be under way from the proxy to its line in the vehicle's journal.
     """
@@ -119,7 +119,7 @@ class _Calls:
 
 
 def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], failsafes: Sequence[int]) -> None:
-    """Nothing old is executed: no set-point that nobody asked for lately, none from before a failsafe."""
+    """Nothing old is executed: no set-point without a recent call, none from before a failsafe."""
     stalls = [(entry.at_ns - entry.number * 1_000_000, entry.at_ns) for entry in vehicle if entry.what == "stalled"]
     stall_ends = [end for _, end in stalls]
     for entry in vehicle:
@@ -132,13 +132,13 @@ def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], fails
             continue
         begin_ns, end_ns = times
         verdict.delay_s.append((entry.at_ns - begin_ns) / 1e9)
-        # While the vehicle's own process is put off, it does not read what has arrived.
+        # While the vehicle's own process is suspended, it does not read what has arrived.
         meanwhile = stalls[bisect_left(stall_ends, end_ns) : bisect_right(stall_ends, entry.at_ns)]
         at_ns = entry.at_ns - sum(end - max(begin, end_ns) for begin, end in meanwhile)
         age_s = (at_ns - end_ns) / 1e9
         if age_s > STALL_S + MAX_AGE_S + SLACK_S:
             verdict.stale.append(f"number {entry.number} was executed {age_s:.3f} s after its call")
-        # A command under way when the failsafe came may still be executed, if it is young enough.
+        # A command already being sent when the failsafe came may still be executed, if it is recent enough.
         after = bisect_right(failsafes, end_ns + _ns(MAX_AGE_S + SLACK_S))
         if after < len(failsafes) and failsafes[after] < at_ns:
             verdict.stale.append(f"number {entry.number} was executed after a failsafe that came after its call")
@@ -147,7 +147,7 @@ def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], fails
 def _judge_recoveries(
     verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], disruptions: Sequence[Fault]
 ) -> list[tuple[int, int]]:
-    """How soon each disruption was over, and the spans of time in which a failsafe is what is wanted."""
+    """How soon each disruption was over, and the spans of time in which a failsafe is expected."""
     windows = []
     velocities = [entry for entry in vehicle if entry.what == "velocity"]
     times = [entry.at_ns for entry in velocities]
@@ -193,7 +193,7 @@ def _judge_needless(
 
 
 def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Sequence[Fault]) -> None:
-    """A pilot that is stopped or killed is followed by hover, then by landing, while the proxy runs."""
+    """When a pilot is stopped or killed, hover and then landing must follow, while the proxy runs."""
     states = [entry for entry in vehicle if entry.what.startswith("state:")]
     times = [entry.at_ns for entry in states]
 
@@ -222,11 +222,11 @@ def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Seque
 
 
 def _judge_flights(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> None:
-    """Leaving the ground, arming and taking the vehicle from others need a pilot's take-off that is still in force."""
+    """Leaving the ground, arming and taking over from others need a pilot's take-off that is still in force."""
     history = sorted([*_with_touch_downs(vehicle), *pilot], key=lambda entry: entry.at_ns)
     asked: Entry | None = None
     ended: Entry | None = None
-    others = False  # somebody else has decided what becomes of it
+    others = False  # another station has decided the vehicle's fate
     stopped_ns: int | None = None
     for entry in history:
         if entry.what == "ask_takeoff":
@@ -277,7 +277,7 @@ def _led_to(entry: Entry, asked: Entry | None, ended: Entry | None, faults: Sequ
 
 
 def _judge_stops(verdict: Verdict, pilot: Sequence[Entry], vehicle: Sequence[Entry]) -> None:
-    """An emergency stop is executed even if packets are lost. What stands disarmed when it is pressed stays so."""
+    """An emergency stop is executed even if packets are lost. A vehicle disarmed at that moment stays so."""
     stood = [entry.at_ns for entry in vehicle if entry.what in ("disarmed", "state:emergency")]
     turned = [entry for entry in vehicle if entry.what in ("armed", "disarmed")]
     for entry in pilot:

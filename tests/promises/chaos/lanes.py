@@ -1,4 +1,4 @@
-"""A lane: one vehicle's proxy and pilot as processes, and what can be done to them."""
+"""A lane: one vehicle's proxy and pilot as processes, and the faults they can suffer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Lane:
         self.folder = folder
         self.disk = folder / "disk"
         self.faults = Journal(folder / f"{name}.faults")
-        self.complaints: list[str] = []  #: promises that were broken besides those that journals show
+        self.complaints: list[str] = []  #: promises broken besides those visible in the journals
         self._pilots_rooms = folder / ("elsewhere" if network else "run")  # where the proxy's socket can't be found
         self.proxy = self._start_proxy()
         self.pilot = self._start_pilot()
@@ -42,37 +42,37 @@ class Lane:
 
     @property
     def socket(self) -> Path:
-        """The proxy's, on this host."""
+        """The proxy's socket on this host."""
         return self.folder / "run" / f"{self.name}.sock"
 
     def settled(self) -> None:
-        """Note what the proxy holds while nothing happens."""
+        """Record the proxy's resources while nothing happens."""
         self.baseline = Resources.of(self.proxy.pid)
 
     def run(self, module: str, *arguments: str, prefix: Sequence[str] = (), remote: bool = False) -> Process:
-        """A program of this package beside the lane."""
+        """Start a program of this package beside the lane."""
         command = (*prefix, sys.executable, "-m", f"tests.promises.chaos.{module}", *arguments)
         return Process(*command, log=self.folder / f"{self.name}.log", environment=self.environment(remote=remote))
 
     def environment(self, *, remote: bool = False) -> dict[str, str]:
-        """Of its programs; ``remote``: of those that must not find the proxy's socket."""
+        """The environment of its programs; ``remote``: of those that must not find the proxy's socket."""
         rooms = self._pilots_rooms if remote else self.folder / "run"
         return {"SKYLOOP_RUNTIME_DIR": str(rooms), "XDG_STATE_HOME": str(self.disk / "state")}
 
     def restart_proxy(self) -> None:
-        """A new one, once the one before is dead; returns when it serves."""
+        """Start a new proxy once the old one is dead; returns when it serves."""
         self.proxy = self._start_proxy()
         self.proxy.until("ready")
 
     def restart_pilot(self) -> None:
-        """A new one, once the one before is dead."""
+        """Start a new pilot once the old one is dead."""
         self.pilot = self._start_pilot()
 
     def resume(self, ending: threading.Event) -> None:
-        """What it takes for the pilot to fly on after a fault."""
+        """Do what the pilot needs to fly on after a fault."""
 
     def processes(self) -> dict[str, Process]:
-        """Those that must be alive at the end."""
+        """The processes that must be alive at the end."""
         return {"proxy": self.proxy, "pilot": self.pilot}
 
     def flown_since(self, since_ns: int) -> bool:
@@ -80,8 +80,8 @@ class Lane:
         return any(entry.what == "velocity" and entry.at_ns > since_ns for entry in tail(self._vehicle_path))
 
     def verdict(self) -> Verdict:
-        """What its journals tell."""
-        vehicle = read(self._vehicle_path)  # first, so that each call that it executed is in the pilot's
+        """Judge its journals."""
+        vehicle = read(self._vehicle_path)  # read first, so that each call executed by then is in the pilot's journal
         faults = faults_of(read(self.folder / f"{self.name}.faults"))
         return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults, transit_s=self.transit_s)
 
@@ -99,7 +99,7 @@ class Lane:
         return self.run("vehicle", self.name, str(self.folder), *([self.network] if self.network else []))
 
     def _start_pilot(self) -> Process:
-        self.proxy.until("ready")  # who looks for a name that nobody has yet is told so at once
+        self.proxy.until("ready")  # a search for a name without a proxy fails at once
         arguments = ["--network", self.network] if self.network else []
         return self.run("pilot", self.name, str(self.folder), *arguments, remote=True)
 
@@ -108,20 +108,20 @@ Fault = Callable[[Lane, random.Random, threading.Event], None]
 
 
 def pilot_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The pilot is stopped, and goes on."""
+    """The pilot is stopped, and continued."""
     with _stopped(lane.pilot):
         ending.wait(source.choice((0.2, 0.7, 2.5, 7.0)))
 
 
 def pilot_kill(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The pilot dies, and another one comes."""
+    """The pilot dies, and another one replaces it."""
     lane.pilot.kill()
     ending.wait(source.choice((0.1, 1.0, 7.0)))
     lane.restart_pilot()
 
 
 def proxy_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The proxy is stopped, and goes on."""
+    """The proxy is stopped, and continued."""
     with _stopped(lane.proxy):
         ending.wait(source.choice((0.2, 0.7, 3.0)))
 
@@ -156,7 +156,7 @@ def observer_stop(lane: Lane, source: random.Random, ending: threading.Event) ->
 
 
 def foreign_clock(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """An observer whose clock began at another time."""
+    """An observer whose clock started at another time."""
     apart = ("unshare", "--time", "--fork", "--kill-child", "--monotonic", str(TIME_NAMESPACE_S))
     remote = lane.network is not None
     where = [lane.network] if lane.network else []
@@ -165,7 +165,7 @@ def foreign_clock(lane: Lane, source: random.Random, ending: threading.Event) ->
 
 
 def starvation(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """As many programs compute as make each core serve three."""
+    """Compute-bound programs, enough that each core serves three."""
     with ExitStack() as stack:
         for _ in range(2 * (os.cpu_count() or 1)):
             stack.enter_context(_running(lane.run("trouble", "hog")))
@@ -179,19 +179,19 @@ def silent_flood(lane: Lane, source: random.Random, ending: threading.Event) -> 
 
 
 def garbage_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """Connections that send what is no packet."""
+    """Connections that send data which is no packet."""
     with _running(lane.run("trouble", "garbage", str(lane.socket))):
         ending.wait(source.uniform(2.0, 5.0))
 
 
 def request_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """Connections that ask for much and read nothing."""
+    """Connections that request a lot and read nothing."""
     with _running(lane.run("trouble", "requests", str(lane.socket))):
         ending.wait(source.uniform(2.0, 5.0))
 
 
 def network_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """Observers on the network ask for much, and are stopped."""
+    """Observers on the network request a lot, and are stopped."""
     assert lane.network is not None
     greedy = lane.run("trouble", "network_requests", lane.name, lane.network, remote=True)
     with _running(greedy), _stopped(greedy):
@@ -199,7 +199,7 @@ def network_flood(lane: Lane, source: random.Random, ending: threading.Event) ->
 
 
 def disk_full(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The disk fills up on which the flight is being recorded and audited."""
+    """The disk to which the flight is recorded and audited fills up."""
     with _running(lane.run("trouble", "record", lane.name, str(lane.disk))):
         with _running(lane.run("trouble", "fill", str(lane.disk))):
             ending.wait(source.uniform(2.0, 5.0))
@@ -241,7 +241,7 @@ def torment(
     ending: threading.Event,
     report: Callable[[str], None],
 ) -> None:
-    """One fault after another, each kind as often as the others, until ``ending``; waits for recovery in between."""
+    """One fault after another, each kind equally often, until ``ending``; waits for recovery after each."""
     while not ending.is_set():
         for fault in source.sample(faults, len(faults)):
             if ending.is_set():
@@ -265,7 +265,7 @@ def torment(
 
 
 def _await_flight(lane: Lane, ending: threading.Event) -> None:
-    """Until the vehicle is flown again; after a while without, the judge will find it so."""
+    """Wait until the vehicle is flown again; after a time limit, leave that to the judge."""
     over_ns = monotonic_ns()
     deadline = time.monotonic() + RECOVERS_WITHIN_S
     while time.monotonic() < deadline and not lane.flown_since(over_ns + 500_000_000):

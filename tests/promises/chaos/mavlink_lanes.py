@@ -23,7 +23,7 @@ from tests.promises.chaos.processes import Process
 
 PAGE: Final = Path(__file__).resolve().parents[3] / "cockpit-page"
 ESBUILD: Final = PAGE / "node_modules" / ".bin" / "esbuild"
-REST_S: Final = 4.0  #: the pause between a landing and the next take-off: any flight in it is unasked for
+REST_S: Final = 4.0  #: The pause between a landing and the next take-off: any flight during it is unrequested.
 COMES_WITHIN_S: Final = 40.0
 ATTEMPTS: Final = 6
 
@@ -70,7 +70,7 @@ class MavlinkLane(Lane):
 class PageLane(MavlinkLane):
     """Flown by the page's own logic under node, through a cockpit, over a serial port (a pty)."""
 
-    transit_s = SLACK_S  # nothing tells when bytes left the port
+    transit_s = SLACK_S  # nothing shows when bytes have left the port
 
     def __init__(self, name: str, folder: Path) -> None:
         self.cockpit: Process | None = None
@@ -170,7 +170,7 @@ def landed_in_its_takeoff(lane: Lane, source: random.Random, ending: threading.E
 
 
 def tip_over(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """The vehicle is disarmed in its take-off, as when it tips over."""
+    """The vehicle is disarmed during its take-off, as when it tips over."""
     assert isinstance(lane, MavlinkLane)
     begin_ns = monotonic_ns()
     lane.vehicle.order("land")

@@ -1,4 +1,4 @@
-"""A pilot that calls 32 times a second, for ever: ``python -m tests.promises.chaos.pilot NAME FOLDER``; see ``--help``.
+"""A pilot that calls 32 times a second, forever: ``python -m tests.promises.chaos.pilot NAME FOLDER``; see ``--help``.
 
 It journals each take-off that it asks for, and the beginning and the end of each other call, with its number. On
 SIGUSR1 it forks, and the child ends by ``sys.exit``.
@@ -27,11 +27,11 @@ BEGINS_WITHIN_S = 8.0
 
 
 class Pilot:
-    """Takes off, and flies on whenever it may.
+    """Takes off, and flies whenever it may.
 
     Args:
-        drone: What it flies.
-        journal: Of its calls.
+        drone: The drone it flies.
+        journal: The journal of its calls.
         first: The number of its first call.
         rest_s: How long to wait on the ground before the next take-off, with the sticks held [s].
     """
@@ -41,12 +41,12 @@ class Pilot:
         self._journal = journal
         self._numbers = count(first)
         self._rest_s = rest_s
-        self._landed_s: float | None = -math.inf  # when it landed
+        self._landed_s: float | None = -math.inf  # time of the landing
         self._asked_s: float | None = None  # when the present take-off was requested
         self.forks = False
 
     def step(self, now_s: float) -> None:
-        """Do what is due."""
+        """Make the calls that are due."""
         if self.forks:
             self.forks = False
             if os.fork() == 0:
@@ -58,7 +58,7 @@ class Pilot:
             self._landed_s = None
             if state in ("hovering", "flying"):
                 self._asked_s = None
-            if self._asked_s is None or self._rest_s == 0.0:  # a velocity would take the place of the take-off
+            if self._asked_s is None or self._rest_s == 0.0:  # a velocity would replace the take-off
                 self._steer()
             return
         self._landed_s = now_s if self._landed_s is None else self._landed_s
@@ -94,7 +94,7 @@ def main() -> None:
     given = parser.parse_args()
     path = given.folder / f"{given.name}.pilot"
     first = max((entry.number for entry in read(path)), default=0) + 1
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system buries children
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the system reaps children
     with skyloop.connect(
         given.name,
         name="chaos",

@@ -1,4 +1,4 @@
-"""Children that are ended by their own number, and what they hold."""
+"""Children that are ended by their own process id, and the resources they hold."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STARTS_WITHIN_S: Final = 60.0
 
 
 class Process:
-    """A child that is ended by its own number."""
+    """A child that is ended by its own process id."""
 
     def __init__(self, *command: str, log: Path, environment: dict[str, str]) -> None:
         self._said, self._log = "", log
@@ -32,7 +32,7 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Its number."""
+        """Its process id."""
         return self._popen.pid
 
     @property
@@ -41,7 +41,7 @@ class Process:
         return self._popen.poll() is None
 
     def until(self, word: str) -> str:
-        """Wait for a word at its standard output; return all that it said. ``RuntimeError`` if it does not come."""
+        """Wait for a word at its standard output; return all its output. ``RuntimeError`` if it does not appear."""
         stream = self._popen.stdout
         assert stream is not None
         deadline = time.monotonic() + STARTS_WITHIN_S
@@ -65,7 +65,7 @@ class Process:
         os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """End it and what it started, and wait."""
+        """Kill it and its children, and wait."""
         with suppress(ProcessLookupError):
             os.killpg(self.pid, signal.SIGKILL)
         self._popen.wait(10)
@@ -76,7 +76,7 @@ class Process:
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What a proxy holds."""
+    """The resources of a proxy."""
 
     descriptors: int
     threads: int
@@ -84,7 +84,7 @@ class Resources:
 
     @classmethod
     def of(cls, pid: int) -> Resources:
-        """As the kernel counts."""
+        """Count them from the kernel's figures."""
         status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
         descriptors = len(list(Path(f"/proc/{pid}/fd").iterdir()))
         return cls(descriptors, int(status["Threads"]), int(status["VmRSS"].split()[0]) / 1024)

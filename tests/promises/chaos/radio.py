@@ -22,22 +22,22 @@ DISARM: Final = 400
 FORCE: Final = 21196.0
 _V2: Final = 0xFD
 _HEADER: Final = 10
-STALLED_S: Final = 0.08  #: a turn that takes so long was not given the processor
+STALLED_S: Final = 0.08  #: a turn this long means that the process was not scheduled
 _TURN_S: Final = 0.02
-_FULL_TURN_S: Final = 0.002  #: a port that is opened again is full at once
+_FULL_TURN_S: Final = 0.002  #: a reopened port is full at once
 _MOST: Final = 65_536
-_STAMP: Final = struct.Struct("qq")  #: of a datagram, by the kernel
+_STAMP: Final = struct.Struct("qq")  #: the kernel's time stamp of a datagram
 _STAMPED: Final = getattr(socket, "SO_TIMESTAMPNS", 35)
 
 
 def kind_of(frame: bytes) -> int:
-    """The number of a MAVLink 2 frame's message; −1 for anything else."""
+    """The message number of a MAVLink 2 frame; −1 for anything else."""
     whole = len(frame) > _HEADER and frame[0] == _V2
     return int.from_bytes(frame[7:10], "little") if whole else -1
 
 
 def is_stop(frame: bytes) -> bool:
-    """Whether it disarms in flight, too."""
+    """Whether it disarms even in flight."""
     if kind_of(frame) != COMMAND_LONG or len(frame) < _HEADER + 30:
         return False
     first, second = struct.unpack_from("<ff", frame, _HEADER)
@@ -59,7 +59,7 @@ def frames_of(buffer: bytearray) -> Iterator[bytes]:
 
 
 class Radio:
-    """Carries frames, on its own thread.
+    """Carries frames, on a separate thread.
 
     Args:
         autopilot: Port of the autopilot.
@@ -90,8 +90,8 @@ class Radio:
         self._late: list[tuple[float, bytes]] = []
         self._delay_s = 0.0
         self.lost_stops = 0  #: how many of the next stops are lost
-        self.full_until_s = 0.0  #: until then nobody reads the serial port, and nothing more fits in
-        self.moving = False  #: to another port of UDP
+        self.full_until_s = 0.0  #: until then the serial port is not read, and accepts no more data
+        self.moving = False  #: to another UDP port
         threading.Thread(target=self._run, name="radio", daemon=True).start()
 
     def delay(self, seconds: float) -> None:
@@ -102,10 +102,10 @@ class Radio:
         looked_s, full = time.monotonic(), False
         while True:
             now_s = time.monotonic()
-            if self._far is None and now_s - looked_s > STALLED_S:  # of datagrams the kernel tells when they came
+            if self._far is None and now_s - looked_s > STALLED_S:  # for datagrams the kernel's time stamps tell
                 self._note("stalled", round((now_s - looked_s) * 1000))
             looked_s = now_s
-            if now_s < self.full_until_s and not full:  # what is here already has been received: no port can recall it
+            if now_s < self.full_until_s and not full:  # data already here has been received: no port can recall it
                 for frame in self._came():
                     self._up(frame)
             full = now_s < self.full_until_s
@@ -139,7 +139,7 @@ class Radio:
             return []
         with suppress(BlockingIOError):
             self._received += os.read(self._serial, _MOST)
-        self._left_ns = monotonic_ns()  # not before: until it reads, this process may be put off while more comes
+        self._left_ns = monotonic_ns()  # not earlier: until it reads, this process may be suspended while more arrives
         return list(frames_of(self._received))
 
     def _up(self, frame: bytes) -> None:
@@ -177,7 +177,7 @@ class Radio:
 def _monotonic(seconds: int, nanoseconds: int) -> int:
     """Convert a time of the wall clock to the monotonic clock; any error makes it later."""
     best, found_ns = 1 << 62, 0
-    for _ in range(5):  # this process may be put off between two clocks
+    for _ in range(5):  # this process may be suspended between the two clocks
         before_ns, wall_ns, after_ns = monotonic_ns(), time.time_ns(), monotonic_ns()
         if after_ns - before_ns < best:
             best, found_ns = after_ns - before_ns, after_ns - (wall_ns - seconds * 10**9 - nanoseconds)

@@ -27,7 +27,7 @@ REMOVALS: Final = 6
 
 
 def observe(name: str, network: str = "") -> None:
-    """Take everything: feedback, video, events. To be stopped, or killed, as it does."""
+    """Subscribe to everything: feedback, video, events. Made to be stopped or killed meanwhile."""
     with skyloop.connect(name, name="watcher", access="observe", network=network or False, timeout_s=20.0) as drone:
         drone.next_frame(timeout_s=20.0)
         _ready()
@@ -37,7 +37,7 @@ def observe(name: str, network: str = "") -> None:
 
 
 def silent(path: str) -> None:
-    """Connect to a proxy's socket again and again, and never say hello."""
+    """Connect to a proxy's socket repeatedly, and never say hello."""
     held = [_connect(path) for _ in range(CONNECTIONS)]
     _ready()
     while True:
@@ -50,7 +50,7 @@ def silent(path: str) -> None:
 
 
 def garbage(path: str) -> None:
-    """Send what is no packet, on connection after connection."""
+    """Send data that is no packet, on one connection after another."""
     source = random.Random(1)
     _ready()
     while True:
@@ -61,7 +61,7 @@ def garbage(path: str) -> None:
 
 
 def requests(path: str) -> None:
-    """Say hello, ask for much, and never read an answer."""
+    """Say hello, request a lot, and never read an answer."""
     greeting = encode(Request(1, Hello("greedy", Role.OBSERVER)))
     questions = [encode(Request(number, ListParameters())) for number in range(2, 18)]
     questions += [encode(Request(number, Ping(0))) for number in range(18, 218)]
@@ -80,7 +80,7 @@ def requests(path: str) -> None:
 
 
 def network_requests(name: str, network: str) -> None:
-    """Several observers on the network that ask for much; to be stopped as they do."""
+    """Several observers on the network that request a lot; made to be stopped meanwhile."""
     from skyloop.network import FabricSettings
     from skyloop.network import dial as fabric_dial
 
@@ -115,7 +115,7 @@ def hog() -> None:
 
 
 def fill(path: str) -> None:
-    """Fill the disk on which this folder is, and keep it full."""
+    """Fill this folder's disk, and keep it full."""
     block = bytes(1 << 20)
     with (Path(path) / "ballast").open("wb", buffering=0) as ballast:
         _ready()
@@ -147,7 +147,7 @@ def remove_starting(host: str, seed: str) -> None:
         time.sleep(source.choice((0.0, 0.005, 0.02, 0.1)))
         early = _asked(host, Remove(name))
         adding.join()
-        if not early:  # it was not there yet
+        if not early:  # it did not exist yet
             _asked(host, Remove(name))
         rows = [
             row for row in ask(host, Status()).vehicles if row.name == name and row.condition is not Condition.STOPPED

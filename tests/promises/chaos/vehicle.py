@@ -1,7 +1,7 @@
-"""A proxy whose vehicle journals what it is told: ``python -m tests.promises.chaos.vehicle NAME FOLDER [LISTEN]``.
+"""A proxy whose vehicle journals its commands: ``python -m tests.promises.chaos.vehicle NAME FOLDER [LISTEN]``.
 
 The vehicle stands for one that outlives its proxy: a new proxy finds it in the state in which the last one left it, and
-one that nobody steers hovers. ``LISTEN`` is an address of the network, where the proxy serves besides.
+without commands it hovers. ``LISTEN`` is an additional network address for the proxy.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ from tests.promises.chaos.journal import Journal, read
 PERIOD_S = 0.05
 LANDING_S = 1.0
 WIDTH, HEIGHT = 160, 120
-#: What a pilot's call is known by: its number, as a yaw rate that no limit shortens.
+#: A pilot's call is identified by its number, as a yaw rate that no limit reduces.
 NUMBER_RAD_S = 1e-5
-NUMBERS = 150_000  #: after which they begin anew
+NUMBERS = 150_000  #: after which they start again
 
 
 class JournalledVehicle(Driver):
-    """Does at once what it is told, and writes it down."""
+    """Obeys at once, and journals it."""
 
     def __init__(self, folder: Path, name: str) -> None:
         super().__init__(VehicleUri("chaos", text=f"chaos://{name}"))

@@ -22,7 +22,7 @@ from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 WAIT_S = 20.0
-STATION = 250  #: the other one's system id
+STATION = 250  #: the other station's system id
 STEERING = (m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_NAV_TAKEOFF)
 MODES: dict[Kind, dict[str, tuple[int, ...]]] = {
     Kind.ARDUCOPTER: {"GUIDED": (4,), "LAND": (9,), "RTL": (6,), "LOITER": (5,)},
@@ -39,7 +39,7 @@ class Scene:
         self.kind = kind
         self.firmware = MavlinkFirmware(world, kind=kind, ports=Ports.free(kind), boot_s=boot_s)
         self.note = note
-        self.ours: list[int] = []  #: numbers of the commands by which the proxy steered
+        self.ours: list[int] = []  #: numbers of the commands with which the proxy steered
         self.set_points = 0
         self._codec = Codec(STATION, 190)
         self._proxies: list[Proxy] = []
@@ -81,7 +81,7 @@ class Scene:
         return self.firmware.autopilot.flight.place[2]
 
     def station(self, command: int, *arguments: float) -> None:
-        """The other ground station says this."""
+        """Send a command as the other ground station."""
         padded = (*arguments, *[0.0] * (7 - len(arguments)))
         self.station_says(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
 
@@ -95,7 +95,7 @@ class Scene:
         self.station(m.MAV_CMD_DO_SET_MODE, 1.0, *MODES[self.kind][mode])
 
     def station_flies(self, height_m: float = 6.0) -> None:
-        """It arms and takes off."""
+        """The other station arms and takes off."""
         wait_until(lambda: self.firmware.autopilot.ready, "it may be armed")
         self.station_mode("GUIDED")
         self.station(m.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
@@ -105,7 +105,7 @@ class Scene:
         wait_until(lambda: self.height > 0.8 * height_m, "it is up")
 
     def proxy(self) -> Proxy:
-        """One that has little patience, so that a test has not to wait for its ladder for long."""
+        """A proxy with short failsafe times, so that a test need not wait long for its ladder."""
         address = self.address
         self.server = MemoryServer("alpha")
         proxy = Proxy(make_driver(address), self.server, name="alpha")
@@ -116,7 +116,7 @@ class Scene:
         return proxy
 
     def die(self, proxy: Proxy) -> None:
-        """Without a word: nothing is told to the vehicle any more."""
+        """Die without sending anything more to the vehicle."""
         proxy.handler.leave_hovering = lambda now_ns: None  # type: ignore[method-assign]
         proxy.end()
 
@@ -124,7 +124,7 @@ class Scene:
         return open_drone(self.server.dial, app="me", on_exit="hover")
 
     def watched(self, proxy: Proxy, samples: int = 60) -> None:
-        """The proxy heard so many more samples: its ladder had time to act in several steps."""
+        """Wait until the proxy has this many more samples: its ladder had time for several steps."""
         after = proxy._counts["feedback.published"] + samples
         wait_until(lambda: proxy._counts["feedback.published"] >= after, "time passed")
 

@@ -1,4 +1,4 @@
-"""A vehicle that isn't there is not ready: the proxy, the list and the doctor say what is waited for and what to do."""
+"""A vehicle that is absent is not ready: the proxy, the list and the doctor say what they wait for and what to do."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Start = Callable[[str], "Output"]
 
 
 class Output:
-    """The lines of a proxy, with when they came."""
+    """The lines of a proxy, with their times."""
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._lines: Queue[tuple[float, str]] = Queue()
@@ -38,7 +38,7 @@ class Output:
             self._lines.put((time.monotonic(), line.strip()))
 
     def until(self, text: str) -> tuple[float, str]:
-        """When a line with it came, and that line with the next."""
+        """The time of the first line with this text, and that line with the next."""
         while True:
             try:
                 at_s, line = self._lines.get(timeout=PATIENCE_S)
@@ -85,7 +85,7 @@ def test_a_drone_that_is_switched_off(start: Start) -> None:
 
 
 @pytest.mark.process
-def test_a_serial_port_that_is_not_there_and_one_on_which_nothing_comes(start: Start, tmp_path: Path) -> None:
+def test_a_serial_port_that_is_missing_and_one_that_is_silent(start: Start, tmp_path: Path) -> None:
     port = tmp_path / "port"
     output = start(f"mavlink://serial:{port}")
     serving_s, _ = output.until("serving absent")
@@ -97,7 +97,7 @@ def test_a_serial_port_that_is_not_there_and_one_on_which_nothing_comes(start: S
     try:
         port.symlink_to(os.ttyname(theirs))
         _, line = output.until("vehicle of absent: lost")
-        assert "there is no" not in line, "and again whenever it changes"
+        assert "there is no" not in line, "it is reported again when it changes"
         assert "→ check the vehicle's power, cable and speed" in line
     finally:
         os.close(ours)

@@ -1,4 +1,4 @@
-"""What the chaos run's judge makes of journals: it finds each broken promise, and none that was kept."""
+"""The chaos run's judge finds each broken promise in journals, and reports none that was kept."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_flight_without_faults_breaks_nothing() -> None:
         (5.0, 30, "2.0"),  # the call of 3.0 s
     ],
 )
-def test_what_is_old_or_was_never_asked_for_is_stale(what: float, number: int, reason: str) -> None:
+def test_an_old_or_unrequested_command_is_stale(what: float, number: int, reason: str) -> None:
     flight = Flight()
     flight.vehicle.append(entry(what + 0.05, "velocity", number))
     (found,) = flight.judge().stale
@@ -77,7 +77,7 @@ def test_a_set_point_that_waited_for_a_stalled_vehicle_is_not_stale() -> None:
     flight = Flight(away=(5.0, 7.5))
     flight.vehicle += [entry(5.6, "failsafe:hover"), entry(7.0, "velocity", 50)]
     stopped = fault("pilot_stop", 5.05, 7.5)
-    assert len(flight.judge(stopped).stale) == 2, "too old, and from before the failsafe"
+    assert len(flight.judge(stopped).stale) == 2, "one too old, one from before the failsafe"
     flight.vehicle.append(entry(6.99, "stalled", 1900))
     assert not flight.judge(stopped).stale
 
@@ -86,9 +86,9 @@ def test_a_failsafe_while_the_pilot_calls_is_needless() -> None:
     flight = Flight()
     flight.vehicle.append(entry(5.05, "failsafe:hover"))
     assert len(flight.judge().needless) == 1
-    assert len(flight.judge(fault("request_flood", 4.0, 6.0)).needless) == 1, "a flood is no reason"
+    assert len(flight.judge(fault("request_flood", 4.0, 6.0)).needless) == 1, "a flood does not justify a failsafe"
     verdict = flight.judge(fault("proxy_stop", 4.0, 5.0))
-    assert not verdict.needless, "a proxy that was away is one"
+    assert not verdict.needless, "an absent proxy justifies one"
     assert verdict.justified == 1
 
 
@@ -142,11 +142,11 @@ def test_faults_are_read_from_their_beginnings_and_ends() -> None:
     assert faults_of(lines) == [fault("hog", 1, 2)]
 
 
-# Flights that nobody asked for -----------------------------------------
+# Flights that no pilot requested ------------------------------------
 
 
 class TakeOff:
-    """Journals of one take-off at 1 s, up at 2 s; what a test adds comes after it."""
+    """Journals of one take-off at 1 s, up at 2 s; a test adds its own entries after it."""
 
     def __init__(self, *pilot: Entry) -> None:
         self.pilot = [entry(1.0, "ask_takeoff"), *pilot]
@@ -162,12 +162,12 @@ LANDED = (entry(3.0, "other:land"), entry(3.1, "state:landing"), entry(5.0, "sta
 AGAIN = entry(5.1, "state:taking_off")
 
 
-def test_a_takeoff_that_was_asked_for_is_somebody_s() -> None:
+def test_a_requested_takeoff_is_attributed_to_it() -> None:
     assert TakeOff().unasked() == []
     assert TakeOff(entry(9.0, "ask_takeoff")).unasked(*LANDED, entry(9.1, "armed"), entry(9.2, "state:flying")) == []
 
 
-def test_one_that_nobody_asked_for_is_told_with_what_led_to_it() -> None:
+def test_an_unrequested_takeoff_is_reported_with_its_history() -> None:
     flight = TakeOff()
     flight.pilot = []
     assert all("no take-off was ever asked for" in text for text in flight.unasked())
@@ -187,23 +187,23 @@ def test_one_that_nobody_asked_for_is_told_with_what_led_to_it() -> None:
         (entry(3.0, "state:landed"),),
     ],
 )
-def test_what_ended_a_takeoff_ended_it(ended: tuple[Entry, ...]) -> None:
+def test_events_that_end_a_takeoff(ended: tuple[Entry, ...]) -> None:
     assert len(TakeOff().unasked(*ended, entry(5.1, "armed"), entry(5.2, "state:flying"))) == 2
 
 
-def test_a_takeoff_is_not_asked_for_for_ever() -> None:
+def test_a_takeoff_request_does_not_last_forever() -> None:
     flight = TakeOff()
     flight.vehicle = [entry(-1.9, "state:landed")]
     assert flight.unasked(entry(20.0, "armed"), entry(20.1, "state:flying")) == []
     assert len(flight.unasked(entry(40.0, "armed"), entry(40.1, "state:flying"))) == 2
 
 
-def test_to_take_a_vehicle_from_others_is_asked_for_by_a_takeoff_only() -> None:
+def test_only_a_takeoff_requests_to_take_over_a_vehicle() -> None:
     assert len(TakeOff().unasked(entry(3.0, "other:land"), entry(3.5, "guided"))) == 1
     assert TakeOff().unasked(entry(3.5, "guided")) == []
 
 
-def test_a_movement_that_no_stick_has_asked_for_is_found() -> None:
+def test_a_movement_without_a_stick_is_found() -> None:
     (found,) = TakeOff().unasked(entry(3.0, "moved", 700))
     assert "moved at 0.70 m/s" in found
 
@@ -222,7 +222,7 @@ def test_an_emergency_stop_is_executed_within_its_time(at_s: float | None, misse
     assert len(verdict.missed) == missed
 
 
-def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
+def test_a_landing_that_neither_pilot_nor_failsafe_requested_is_needless() -> None:
     taken_off = TakeOff()
     taken_off.vehicle += [entry(3.0, "land")]
     assert len(judge(taken_off.pilot, taken_off.vehicle, []).needless) == 1
@@ -231,12 +231,12 @@ def test_a_landing_that_neither_pilot_nor_failsafe_wanted_is_needless() -> None:
     assert not flight.judge(fault("pilot_stop", 5.0, 12.95)).needless
 
 
-# What lies between a vehicle and its proxy -----------------------------------------
+# Between a vehicle and its proxy ---------------------------------------------------
 
 
 @pytest.mark.parametrize("armed", [False, True])
-def test_an_emergency_stop_of_what_stands_disarmed_is_not_missed(armed: bool) -> None:
-    """Failsafes landed it before, and nothing was left to disarm; but for a propeller that turns again."""
+def test_an_emergency_stop_of_a_disarmed_vehicle_is_not_missed(armed: bool) -> None:
+    """Failsafes landed it before, so nothing remained to disarm; except if a propeller turns again."""
     flight = TakeOff(entry(5.0, "ask_stop"))
     flight.vehicle += [entry(3.0, "state:landed"), entry(3.1, "disarmed"), entry(6.0, "disarmed" if armed else "open")]
     flight.vehicle[-1:-1] = [entry(4.0, "armed")] * armed

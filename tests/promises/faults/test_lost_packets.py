@@ -1,5 +1,5 @@
-"""Over the network packets are lost on the way, the first ones more than others: a node drops what comes before it was
-told of the subscription. What has to arrive is sent again."""
+"""The network loses packets, the first ones most often: a node drops those that arrive before it knows the
+subscription. Packets that must arrive are sent again."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
 @pytest.fixture
 def lost(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, bytes, int]]:
-    """Each packet is lost when it is sent for the first time, by either end; those that were."""
+    """Each packet is lost when either end sends it for the first time; yields the lost ones."""
     lost: set[tuple[str, bytes, int]] = set()
     for end, put in ((FabricServer, FabricServer._put_to), (FabricClient, FabricClient._put)):
 
@@ -31,7 +31,7 @@ def lost(monkeypatch: pytest.MonkeyPatch) -> set[tuple[str, bytes, int]]:
     return lost
 
 
-def test_what_is_lost_on_the_way_arrives_all_the_same_once_and_in_order(lost: set[tuple[str, bytes, int]]) -> None:
+def test_lost_packets_arrive_eventually_once_and_in_order(lost: set[tuple[str, bytes, int]]) -> None:
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     server, log, app_log = (
         FabricServer("alpha", FabricSettings(listen=(place,), multicast=False)),

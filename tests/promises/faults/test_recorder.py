@@ -1,4 +1,4 @@
-"""A recorder that meets what can't be written, or fails itself: a bad sample is left out, and a dead writer is told."""
+"""A recorder that fails, or gets samples it can't write: a bad sample is skipped, and a dead writer is reported."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_sample_that_cannot_be_written_is_left_out_and_counted(tmp_path: Path)
     assert (writer.unwritable, "nobody foresaw this" in writer.unwritable_why) == (1, True)
 
 
-def test_a_writer_that_dies_is_failed_at_once_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_writer_that_dies_is_reported_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     backlog, path = Backlog(MB), tmp_path / "f.mcap"
     told: list[tuple[str, Severity]] = []
     writer = writer_of(path, backlog, told)
@@ -90,7 +90,7 @@ def test_a_writer_that_dies_is_failed_at_once_and_says_so(tmp_path: Path, monkey
     files.until(lambda: writer.state is RecorderState.FAILED, "the state says so")
     writer.stop()
     assert "nobody foresaw this" in writer.reason
-    assert [one.sequence for one in files.of(path, "/alpha/commands")] == [1], "what was committed stays"
+    assert [one.sequence for one in files.of(path, "/alpha/commands")] == [1], "committed samples stay"
     text, severity = told[-1]
     assert severity is Severity.ERROR
     assert "has ended" in text
@@ -118,7 +118,7 @@ def rig() -> Any:
         yield Rig(stack)
 
 
-def test_a_dead_recorder_is_told_to_who_records_and_to_all(
+def test_a_dead_recorder_is_reported_to_its_owner_and_to_all(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     events: list[Event] = []
@@ -135,7 +135,7 @@ def test_a_dead_recorder_is_told_to_who_records_and_to_all(
     assert recorder.state is RecorderState.FAILED
 
 
-def test_a_sample_that_cannot_be_recorded_is_told_with_the_reason(rig: Rig, tmp_path: Path) -> None:
+def test_a_sample_that_cannot_be_recorded_is_reported_with_the_reason(rig: Rig, tmp_path: Path) -> None:
     events: list[Event] = []
     rig.drone.on_event(events.append, inline=True)
     with skyloop.record(rig.drone, tmp_path / "f.mcap", min_free_mb=0, in_process=True) as recorder:
@@ -161,7 +161,7 @@ def test_the_command_ends_when_the_recording_has_failed(
     assert "failed" in capsys.readouterr().out
 
 
-def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_librarys_output_in_the_recorders_process_does_not_end_its_reports(monkeypatch: pytest.MonkeyPatch) -> None:
     news: list[RecorderEvent] = []
     process = object.__new__(RecorderProcess)
 
@@ -197,8 +197,8 @@ def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(mo
     assert [one.text.split(";")[0] for one in news] == ["received", "the recorder's process ended with exit code 1"]
 
 
-def test_feedback_is_recorded_beside_samples_that_make_no_sense(rig: Rig, tmp_path: Path) -> None:
-    """A log entry as no client sends it, sent by one that does: the proxy counts it, and the recording goes on."""
+def test_feedback_is_recorded_beside_invalid_samples(rig: Rig, tmp_path: Path) -> None:
+    """A log entry that no client would send: the proxy counts it, and the recording continues."""
     path = tmp_path / "f.mcap"
     with skyloop.record(rig.drone, path, min_free_mb=0, in_process=True) as recorder:
         for packet in (
@@ -216,7 +216,7 @@ def test_feedback_is_recorded_beside_samples_that_make_no_sense(rig: Rig, tmp_pa
     assert recorder.dropped == {}
 
 
-def test_numbers_of_the_vehicle_that_are_none_are_not_known(rig: Rig) -> None:
+def test_invalid_numbers_from_the_vehicle_are_unknown(rig: Rig) -> None:
     came: list[Feedback] = []
     rig.other.on_feedback(came.append, inline=True)
     events: list[Event] = []

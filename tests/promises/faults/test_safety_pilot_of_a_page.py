@@ -1,4 +1,4 @@
-"""A safety pilot who chooses another mode while a page flies: an emulated autopilot, and what the proxy says to it."""
+"""A safety pilot changes the mode while a page flies: an emulated autopilot, and the proxy's messages to it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Finder:
 
 
 @KINDS
-def test_a_page_on_its_way_to_a_place_leaves_the_vehicle_to_who_changes_its_mode(kind: Kind, tmp_path: Path) -> None:
-    """It was in GUIDED again 0.6 s later, by the page's own hover; and again when the page was closed."""
+def test_a_page_flying_to_a_place_yields_to_a_mode_change(kind: Kind, tmp_path: Path) -> None:
+    """The page's own hover put it back into GUIDED 0.6 s later, and so did closing the page."""
     with Scene(kind, tmp_path / "alpha.flight") as scene:
         proxy = scene.proxy()
         with taken_off(scene), cockpit(Fleet(Finder(scene), look_s=0.05)) as client:

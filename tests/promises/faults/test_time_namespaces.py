@@ -1,4 +1,4 @@
-"""A proxy and an application whose monotonic clocks differ, though they are on one host: in other time namespaces."""
+"""A proxy and an application on one host whose monotonic clocks differ, as they run in different time namespaces."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ UNSHARE = ("unshare", "--time", "--monotonic", str(AHEAD_S))
 
 @functools.cache
 def why_not() -> str:
-    """Why there can be no other time namespace here; empty if there can."""
+    """Why no other time namespace can be made here; empty if it can."""
     if shutil.which("unshare") is None:
         return "there is no unshare (util-linux)"
     tried = subprocess.run([*UNSHARE, "true"], capture_output=True, text=True, check=False)

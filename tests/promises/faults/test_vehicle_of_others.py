@@ -1,4 +1,4 @@
-"""A vehicle that somebody else flies, lands or takes over in flight: an emulated autopilot that two programs command.
+"""A vehicle that others fly, land or take over in flight: an emulated autopilot commanded by two programs.
 
 The other ground station says its commands on another link. What the proxy said is counted where the autopilot hears it.
 """
@@ -39,9 +39,7 @@ def note(tmp_path: Path) -> Path:
 
 @KINDS
 @pytest.mark.parametrize("mode", ["GUIDED", "LOITER", "RTL"])
-def test_a_proxy_that_is_started_beside_a_flight_of_others_says_nothing_to_it(
-    kind: Kind, mode: str, note: Path
-) -> None:
+def test_a_proxy_started_during_the_flight_of_others_sends_nothing(kind: Kind, mode: str, note: Path) -> None:
     with Scene(kind, note) as scene:
         scene.station_flies()
         proxy = scene.proxy()
@@ -53,7 +51,7 @@ def test_a_proxy_that_is_started_beside_a_flight_of_others_says_nothing_to_it(
 
 
 @KINDS
-def test_a_landing_that_others_order_during_a_take_off_is_not_undone_and_who_waits_is_told_why(
+def test_a_landing_ordered_by_others_during_a_take_off_is_not_undone_and_the_caller_gets_the_reason(
     kind: Kind, note: Path
 ) -> None:
     with Scene(kind, note) as scene:
@@ -79,7 +77,7 @@ def _land_when_up(scene: Scene) -> None:
 
 
 def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_own_failsafe_too(note: Path) -> None:
-    """PX4 alone: an ArduCopter in GUIDED looks at no sticks."""
+    """PX4 only: an ArduCopter in GUIDED ignores the sticks."""
     with Scene(Kind.PX4, note) as scene:
         proxy = scene.proxy()
         scene.firmware.autopilot.parameters["COM_RC_LOSS_T"] = 3.0  # the tests' own threads may be late
@@ -89,7 +87,7 @@ def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_ow
             holds = threading.Thread(target=_hold_sticks, args=(scene, let_go))
             holds.start()
             try:
-                with suppress(RefusedError):  # it may be seen flying a moment before it is known who flies it
+                with suppress(RefusedError):  # it may be seen flying a moment before its pilot is known
                     drone.takeoff(timeout_s=WAIT_S)
                 told = drone.wait(lambda f: f.outcome is not None and f.outcome.fate is Fate.OTHERS, timeout_s=WAIT_S)
                 assert told.outcome is not None
@@ -97,7 +95,7 @@ def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_ow
                 at = len(scene.ours)
                 scene.watched(proxy)
                 assert scene.mode == "POSCTL"
-                assert scene.height < 6.0, "it did not go on to the 8 m that were asked for"
+                assert scene.height < 6.0, "it did not continue to the requested 8 m"
             finally:
                 let_go.set()
                 holds.join()
@@ -106,8 +104,8 @@ def test_sticks_that_a_pilot_moves_during_a_take_off_keep_the_vehicle_and_its_ow
 
 
 def _hold_sticks(scene: Scene, let_go: threading.Event) -> None:
-    """Centred ones, of which one is moved when the vehicle is 2 m up, and centred again."""
-    to_move = 15  # messages, 0.3 s of them where nothing holds this thread up
+    """Keep the sticks centred, and move one for a moment when the vehicle is 2 m up."""
+    to_move = 15  # messages, 0.3 s of them if this thread is not delayed
     while not let_go.wait(0.02):
         moving = to_move > 0 and scene.height > 2.0
         to_move -= moving
@@ -116,7 +114,7 @@ def _hold_sticks(scene: Scene, let_go: threading.Event) -> None:
 
 @KINDS
 @pytest.mark.parametrize("mode", ["LAND", "RTL"])
-def test_what_others_order_while_set_points_are_flown_stays_when_the_application_goes_on_or_falls_silent(
+def test_orders_of_others_during_set_points_stand_when_the_application_continues_or_falls_silent(
     kind: Kind, mode: str, note: Path
 ) -> None:
     with Scene(kind, note) as scene:
@@ -134,13 +132,13 @@ def test_what_others_order_while_set_points_are_flown_stays_when_the_application
             wait_until(lambda: not drone.velocity(forward=0.3), "and the program is told so by each of them")
             reason = next(e for e in reversed(drone.recent_events()) if e.kind is EventKind.COMMAND_REFUSED)
             assert "which was not chosen here: hover, take off or land first" in reason.text
-            scene.watched(proxy, 150)  # the set-point decays to hover, and the ladder loses its patience
+            scene.watched(proxy, 150)  # the set-point decays to hover, and the failsafe ladder acts
             wait_until(lambda: not scene.armed, "it lands")
         assert scene.ours == []
 
 
 class Flying(Controller):
-    """Flies on whatever happens, until it fails."""
+    """Keeps flying whatever happens, until it fails."""
 
     fails = False
 
@@ -179,11 +177,11 @@ def _block(drone: Drone) -> None:
 
 @KINDS
 @pytest.mark.parametrize("end", [_controller, _teleop, _fly, _swarm, _block])
-def test_a_safety_pilot_keeps_the_vehicle_whatever_becomes_of_the_program(
+def test_a_safety_pilot_keeps_the_vehicle_whatever_the_program_does(
     kind: Kind, end: Callable[[Drone], None], note: Path
 ) -> None:
-    """A bug in a callback, a key that is let go, the end of ``skyloop fly``, of a swarm and of a block: by itself,
-    the library takes nothing out of the hands of who has selected a mode.
+    """A bug in a callback, a released key, the end of ``skyloop fly``, of a swarm or of a block: the library never
+    takes the vehicle from whoever selected a mode unless the program orders it.
     """
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
@@ -211,7 +209,7 @@ def test_a_safety_pilot_keeps_the_vehicle_whatever_becomes_of_the_program(
 
 @KINDS
 def test_a_safety_pilot_keeps_the_vehicle_on_a_route(kind: Kind, note: Path) -> None:
-    """The route is paused when its place is refused, and that is no decision to take the vehicle back."""
+    """The route is paused when its place is refused, and that does not count as a decision to take the vehicle back."""
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with taken_off(scene) as drone:
@@ -273,18 +271,18 @@ def test_a_killed_proxy_ends_its_own_flight_when_it_is_back_unless_others_took_i
             assert scene.ours == []
 
 
-# An intent that is over stays over -----------------------------------------------------------------------------------
+# An intent that has ended stays ended ----------------------------------------------------------------------------
 
 
 def ready(scene: Scene) -> Drone:
-    """A drone that stands, and may be armed."""
+    """A drone on the ground that may be armed."""
     drone = scene.drone()
     drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
     return drone
 
 
 def stays_down(scene: Scene, proxy: Proxy) -> None:
-    """It stands disarmed, and still does some seconds of its time later."""
+    """Check that it stays disarmed on the ground for some seconds of its own time."""
     wait_until(lambda: not scene.armed, "it stands")
     scene.watched(proxy, 150)
     assert not scene.armed
@@ -292,8 +290,8 @@ def stays_down(scene: Scene, proxy: Proxy) -> None:
 
 
 @KINDS
-def test_a_take_off_that_others_land_at_once_does_not_begin_again_when_it_stands(kind: Kind, note: Path) -> None:
-    """0.1 s after touch-down, motors still turning, it took off again, to 7.8 m, with somebody walking up to it."""
+def test_a_take_off_that_others_land_at_once_does_not_restart_on_the_ground(kind: Kind, note: Path) -> None:
+    """0.1 s after touch-down, motors still turning, it took off again, to 7.8 m, with a person walking up to it."""
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with ready(scene) as drone:
@@ -305,8 +303,8 @@ def test_a_take_off_that_others_land_at_once_does_not_begin_again_when_it_stands
 
 @KINDS
 @pytest.mark.parametrize("wait", [True, False])
-def test_a_vehicle_that_is_disarmed_in_its_take_off_stays_disarmed(kind: Kind, wait: bool, note: Path) -> None:
-    """It tips over, or a switch kills it: 0.1 s later it armed itself, and the call returned as a success."""
+def test_a_vehicle_disarmed_in_its_take_off_stays_disarmed(kind: Kind, wait: bool, note: Path) -> None:
+    """It tips over, or a switch disarms it: 0.1 s later it armed itself, and the call returned as a success."""
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with ready(scene) as drone:
@@ -326,8 +324,8 @@ def test_a_vehicle_that_is_disarmed_in_its_take_off_stays_disarmed(kind: Kind, w
             stays_down(scene, proxy)
 
 
-def test_a_take_off_that_ran_out_of_time_before_the_autopilot_was_ready_is_not_flown_later(note: Path) -> None:
-    """It raised at 4.0 s and took off at 14.6 s, the program waiting for a person."""
+def test_a_take_off_that_timed_out_before_the_autopilot_was_ready_is_not_flown_later(note: Path) -> None:
+    """It raised at 4.0 s, yet took off at 14.6 s, while the program waited for a person."""
     with Scene(Kind.ARDUCOPTER, note, boot_s=6.0) as scene:
         proxy = scene.proxy()
         with scene.drone() as drone:
@@ -338,7 +336,7 @@ def test_a_take_off_that_ran_out_of_time_before_the_autopilot_was_ready_is_not_f
             stays_down(scene, proxy)
 
 
-def test_a_take_off_that_is_waited_for_begins_when_the_autopilot_is_ready(note: Path) -> None:
+def test_a_take_off_still_awaited_begins_when_the_autopilot_is_ready(note: Path) -> None:
     with Scene(Kind.ARDUCOPTER, note, boot_s=6.0) as scene:
         scene.proxy()
         with scene.drone() as drone:
@@ -349,8 +347,8 @@ def test_a_take_off_that_is_waited_for_begins_when_the_autopilot_is_ready(note: 
 
 @KINDS
 @pytest.mark.parametrize("meanwhile", ["hovers", "takes off"])
-def test_a_refused_place_is_not_flown_to_by_its_repeats(kind: Kind, meanwhile: str, note: Path) -> None:
-    """go_to(z=-4) was refused, and stood on the floor 3 to 4 s later with its motors running."""
+def test_the_repeats_of_a_refused_place_do_not_fly_there(kind: Kind, meanwhile: str, note: Path) -> None:
+    """go_to(z=-4) was refused, yet 3 to 4 s later the vehicle stood on the floor with its motors running."""
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with ready(scene) as drone:
@@ -371,7 +369,7 @@ def test_a_refused_place_is_not_flown_to_by_its_repeats(kind: Kind, meanwhile: s
 
 @KINDS
 def test_a_take_off_right_after_a_landing(kind: Kind, note: Path) -> None:
-    """It was told "disarmed itself", by an arming that was heard before."""
+    """It was reported as "disarmed itself", because of an arming received before."""
     with Scene(kind, note) as scene:
         scene.proxy()
         with taken_off(scene) as drone:

@@ -1,4 +1,4 @@
-"""``python -m tests.promises.fuzz``: fuzzes all targets, or those named, each for a while some side by side."""
+"""``python -m tests.promises.fuzz``: fuzzes all targets, or those named, each for a while, some in parallel."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.promises.fuzz.targets import CORPUS, TARGETS, seeds
 EPILOG = (
     "Example: python -m tests.promises.fuzz --seconds 600 recording; ends with 1 if something was found, and keeps it."
 )
-MEMORY_MB = 1024  #: of a process; more is a finding
-SLOW_S = 10  #: an input that takes longer is a finding
+MEMORY_MB = 1024  #: of a process; more counts as a finding
+SLOW_S = 10  #: a slower input counts as a finding
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fuzz(name: str, seconds: int, keep: bool) -> bool:
-    """Whether nothing was found."""
+    """Returns whether nothing was found."""
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix=f"fuzz-{name}-") as folder:
         given, found = Path(folder) / "seeds", Path(folder) / "found"
@@ -55,7 +55,7 @@ def _fuzz(name: str, seconds: int, keep: bool) -> bool:
         kept = CORPUS / name
         kept.mkdir(parents=True, exist_ok=True)
         options = [f"-max_total_time={seconds}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SLOW_S}", "-max_len=16384"]
-        # A finding goes where the ordinary tests replay it.
+        # A finding is stored where the ordinary tests replay it.
         options.append(f"-artifact_prefix={kept}/found-")
         command = [sys.executable, "-m", "tests.promises.fuzz.run", name, str(found), str(given), *options]
         result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)

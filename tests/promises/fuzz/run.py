@@ -7,7 +7,7 @@ import logging
 import pkgutil
 import sys
 
-#: What a target runs through, instrumented before it is imported.
+#: The modules that a target uses, instrumented before they are imported.
 PACKAGES = {
     "samples": ["skyloop.messages"],
     "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.network.packets"],
@@ -24,7 +24,7 @@ PACKAGES = {
 
 
 def main() -> None:
-    """Runs until libFuzzer's options end it."""
+    """Run until libFuzzer's options end it."""
     import atheris
 
     name = sys.argv.pop(1)
@@ -36,7 +36,7 @@ def main() -> None:
                 try:
                     importlib.import_module(f"{package}.{info.name}")
                 except ImportError:
-                    continue  # of an extra that is not here
+                    continue  # it belongs to an extra that is not installed
     from tests.promises.fuzz.targets import TARGETS
 
     atheris.Setup(sys.argv, TARGETS[name])

@@ -1,5 +1,5 @@
-"""What is fuzzed. Each target takes bytes, and returns or raises :class:`skyloop.errors.SkyloopError` of the kinds that
-its documentation names; anything else is a finding."""
+"""The fuzz targets. Each takes bytes, and returns or raises the kinds of :class:`skyloop.errors.SkyloopError` that its
+documentation names; anything else is a finding."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CORPUS: Final = Path(__file__).parent / "corpus"
 
 
 def samples(data: bytes) -> None:
-    """A packet of the transports: what can be decoded can be encoded, and comes back as it was."""
+    """A packet of the transports: what can be decoded can be encoded, and comes back unchanged."""
     from skyloop.messages import decode, encode
 
     with suppress(DecodeError):
@@ -28,7 +28,7 @@ def samples(data: bytes) -> None:
 
 
 def packets(data: bytes) -> None:
-    """The packets that the ends of a transport exchange between themselves."""
+    """The packets that a transport's two ends exchange for their own purposes."""
     from skyloop.network import packets as fabric
     from skyloop.transport.local import packets as local
 
@@ -45,7 +45,7 @@ def packets(data: bytes) -> None:
 
 
 def proxy(data: bytes) -> None:
-    """A running proxy, told packets by somebody who said hello, or did not: it goes on, and nothing is raised."""
+    """A running proxy that gets packets from a client with or without a hello: it keeps running and raises nothing."""
     from skyloop.transport.base import Peer
 
     bench = _bench()
@@ -59,7 +59,7 @@ def proxy(data: bytes) -> None:
 
 
 def ardrone(data: bytes) -> None:
-    """What an AR.Drone, or whoever pretends to be one, sends and gets."""
+    """The data an AR.Drone, or an impostor, sends and receives."""
     from skyloop.vehicles.ardrone.wire import at, configuration, navdata
     from skyloop.vehicles.ardrone.wire.pave import PaveParser
     from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
@@ -89,7 +89,7 @@ def ardrone(data: bytes) -> None:
 
 
 def tello(data: bytes) -> None:
-    """What a Tello sends."""
+    """The data a Tello sends."""
     from skyloop.drivers import h264
     from skyloop.vehicles.tello import wire
     from skyloop.vehicles.tello.wire import Assembly
@@ -107,7 +107,7 @@ def tello(data: bytes) -> None:
 
 
 def mavlink(data: bytes) -> None:
-    """What comes from a MAVLink vehicle, in one datagram, as a stream, and as one that was cut into datagrams."""
+    """The data of a MAVLink vehicle: in one datagram, as a stream, and as a stream cut into datagrams."""
     from skyloop.vehicles.mavlink.wire.codec import Codec
 
     Codec(1, 1).decode(data, whole=True)
@@ -119,7 +119,7 @@ def mavlink(data: bytes) -> None:
 
 
 def msp(data: bytes) -> None:
-    """What a flight controller answers by MSP, and what an emulated one is sent."""
+    """A flight controller's answers by MSP, and the requests an emulated one receives."""
     from skyloop.clock import NS_PER_S
     from skyloop.drivers.uri import parse_uri
     from skyloop.vehicles.msp.parameters import options_of
@@ -132,14 +132,14 @@ def msp(data: bytes) -> None:
         now_ns += NS_PER_S // 50
         session.poll(now_ns)
         session.receive(part, now_ns)
-        if part:  # as a payload with a good checksum
+        if part:  # as a payload with a valid checksum
             session.receive(encode(Frame(part[0], part[1:], Direction.REPLY)), now_ns)
             session.receive(encode(Frame(0x2000 | part[0] & 3, part[1:], Direction.REPLY)), now_ns)
         session.drain()
 
 
 def vrpn(data: bytes) -> None:
-    """What a motion capture server sends by VRPN, or whoever pretends to be one; what comes out goes on as frames."""
+    """The data a VRPN motion capture server, or an impostor, sends; the results are passed on as frames."""
     from skyloop.motion_capture.pose import plausible
     from skyloop.motion_capture.vrpn import Decoder, SensorSelection
 
@@ -151,7 +151,7 @@ def vrpn(data: bytes) -> None:
 
 
 def recording(data: bytes) -> None:
-    """A recording that somebody else made: opened, and all that is in it read."""
+    """A recording made by someone else: opened, and read completely."""
     from skyloop.recording.reader import Recording
 
     with _file(data) as path, suppress(FileFormatError, UsageError):
@@ -189,7 +189,7 @@ def files(data: bytes) -> None:
 
 
 def page(data: bytes) -> None:
-    """What the page sends to the cockpit over its socket."""
+    """The page's messages to the cockpit over its socket."""
     from skyloop.cockpit.commands import decode_command, decode_fleet_command, untimely
 
     with suppress(DecodeError):
@@ -210,7 +210,7 @@ TARGETS: Final[dict[str, Target]] = {
 
 
 def seeds(name: str) -> Iterator[bytes]:
-    """Inputs to begin with: what is in the corpus, and what the tests have anyway."""
+    """Initial inputs: those of the corpus, and those the tests already have."""
     for file in sorted((CORPUS / name).glob("*")):
         yield file.read_bytes()
     if name in ("samples", "packets", "proxy"):
@@ -221,7 +221,7 @@ def seeds(name: str) -> Iterator[bytes]:
 
 
 def _parts(data: bytes) -> Iterator[bytes]:
-    """Several packets in one input: each after its length in two bytes."""
+    """Several packets in one input, each after its length in two bytes."""
     at = 0
     while at + 2 <= len(data):
         size = int.from_bytes(data[at : at + 2], "little")

@@ -1,4 +1,4 @@
-"""What fuzzing has found, and what leads into corners, again: nothing raises what it should not, or takes long."""
+"""Replays earlier findings and inputs that reach corner cases: nothing raises an unexpected error, or takes long."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tests.promises.fuzz.targets import TARGETS, seeds
 LONGEST_S = 5.0
 
 
-def test_each_target_says_what_it_runs_through() -> None:
+def test_each_target_names_the_modules_it_uses() -> None:
     assert PACKAGES.keys() == TARGETS.keys()
 
 
 @pytest.mark.parametrize("name", TARGETS)
-def test_the_kept_corpus_is_survived(name: str) -> None:
+def test_the_corpus_causes_no_finding(name: str) -> None:
     number = 0
     for seed in seeds(name):
         begin = time.process_time()

@@ -1,4 +1,4 @@
-"""Hosts for a test, and processes in them; skipped with the reason where none can be made."""
+"""Hosts for a test, and processes on them; skipped with the reason where none can be made."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.measuring.workers import Workers
 from tests.promises.hosts.remote import Remote
 from tests.support.processes import Process
 
-#: A vehicle without cameras, in whose world time passes three times as fast: it flies no better, and takes off sooner.
+#: A vehicle without cameras, in a world running three times as fast: it flies no better, but takes off sooner.
 FAST = "sim://?world=empty&cameras=none&speed=3"
 
 
@@ -30,7 +30,7 @@ def lab(_possible: None) -> Iterator[Lab]:
 
 @dataclass(frozen=True)
 class Lan:
-    """Hosts of one segment, whose programs look for one another."""
+    """Hosts of one segment, whose programs discover each other."""
 
     lab: Lab
     segment: Segment
@@ -49,7 +49,7 @@ def lan(lab: Lab) -> Lan:
 
 @pytest.fixture
 def remote(lab: Lab) -> Iterator[Callable[[Host], Remote]]:
-    """Starts applications that do what they are told. They end with the test, before the hosts."""
+    """Starts applications that obey the test. They end with the test, before the hosts."""
     with Workers() as workers:
         yield lambda host: Remote(workers, host)
 

@@ -1,4 +1,4 @@
-"""What the tests let an application on another host do; each function is called there by :class:`Remote`."""
+"""Functions that the tests run in an application on another host; :class:`Remote` calls each one there."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PERIOD_S = 0.05
 
 
 def connect(here: Here, target: str, /, *, priority: int = 16, **options: Any) -> str:
-    """Connect and write down what is told of the link and of events; where it is connected to."""
+    """Connect, and record changes of the link and events; returns the address connected to."""
     drone = here.drones[target] = skyloop.connect(target, authority=skyloop.Authority(priority=priority), **options)
     drone.on_link(here.tell(f"{target} link"))
     drone.on_event(here.tell(f"{target} event"), inline=True)
@@ -36,7 +36,7 @@ def wait(here: Here, name: str, state: str, timeout_s: float = 10.0) -> None:
 
 
 def wait_link(here: Here, name: str, state: str, since_ns: int = 0, timeout_s: float = 10.0) -> int:
-    """Wait until the link was told to be in this state, at this time or later; when that was."""
+    """Wait until the link was reported in this state, at this time or later; returns when."""
     told = here.told[f"{name} link"]
 
     def when() -> list[int]:
@@ -47,13 +47,13 @@ def wait_link(here: Here, name: str, state: str, since_ns: int = 0, timeout_s: f
 
 
 def wait_authority(here: Here, name: str, state: str, timeout_s: float = 10.0) -> int:
-    """Wait for the authority to be in this state; when it was seen."""
+    """Wait for the authority to be in this state; returns when it was seen."""
     eventually(lambda: here.drones[name].authority.state == state, f"the authority is {state}", timeout_s)
     return time.monotonic_ns()
 
 
 def keep_flying(here: Here, name: str, forward: float = 0.1) -> None:
-    """Command afresh twenty times a second from now on, whatever comes of it; until :func:`stop_flying`."""
+    """Send new commands twenty times a second, whatever the results, until :func:`stop_flying`."""
     end = here.objects[f"{name} end"] = threading.Event()
     calls = here.objects[f"{name} calls"] = []
     drone = here.drones[name]
@@ -71,7 +71,7 @@ def keep_flying(here: Here, name: str, forward: float = 0.1) -> None:
 
 
 def stop_flying(here: Here, name: str) -> list[tuple[int, bool]]:
-    """When it was called, and whether a command was sent."""
+    """Stop flying; returns the times of the calls, and whether each sent a command."""
     here.objects[f"{name} end"].set()
     here.objects[f"{name} thread"].join()
     calls: list[tuple[int, bool]] = here.objects[f"{name} calls"]
@@ -79,7 +79,7 @@ def stop_flying(here: Here, name: str) -> list[tuple[int, bool]]:
 
 
 def watch_commands(here: Here, name: str) -> None:
-    """Write down each command that the proxy received."""
+    """Record each command that the proxy received."""
     here.drones[name].on_command(here.tell(f"{name} command"), inline=True)
 
 
@@ -96,7 +96,7 @@ def links(here: Here, name: str) -> list[tuple[int, str]]:
 
 
 def watch_frames(here: Here, name: str, /, **options: Any) -> None:
-    """Write down the shape, the age [s] and the time of capture [ns] of each frame."""
+    """Record the shape, the age [s] and the time of capture [ns] of each frame."""
     write = here.tell(f"{name} frame")
     here.drones[name].on_frame(lambda frame: write((frame.shape, frame.age_s, frame.captured_ns)), **options)
 
@@ -106,7 +106,7 @@ def frames(here: Here, name: str) -> list[tuple[int, tuple[tuple[int, ...], floa
 
 
 def wait_frames(here: Here, name: str, number: int, since_ns: int = 0, timeout_s: float = 15.0) -> int:
-    """Wait for so many frames from now, or from a time on; when the last of them came."""
+    """Wait for this many frames, from now or from a given time; returns when the last one arrived."""
     told = here.told[f"{name} frame"]
     since_ns = since_ns or time.monotonic_ns()
 
@@ -118,7 +118,7 @@ def wait_frames(here: Here, name: str, number: int, since_ns: int = 0, timeout_s
 
 
 def wait_failsafe(here: Here, name: str, step: str, timeout_s: float = 10.0) -> int:
-    """Wait until feedback tells of a step of the failsafe ladder; when it was seen."""
+    """Wait until feedback shows a step of the failsafe ladder; returns when it was seen."""
     here.drones[name].wait(lambda feedback: feedback.failsafe.value == step, timeout_s=timeout_s)
     return time.monotonic_ns()
 
@@ -128,7 +128,7 @@ def feedback(here: Here, name: str) -> skyloop.Feedback:
 
 
 def clock(here: Here, name: str) -> tuple[int, int]:
-    """The proxy's clock less this host's, as estimated, and how wrong that may be [ns]."""
+    """The proxy's clock minus this host's, as estimated, and its uncertainty [ns]."""
     drone = here.drones[name]
     return drone.clock_offset_ns, drone.clock_uncertainty_ns
 
@@ -149,7 +149,7 @@ def priority(here: Here, name: str) -> int:
 
 
 def watch_numbers(here: Here, name: str) -> None:
-    """Write down the number of each packet of feedback, also of one that comes twice."""
+    """Record the number of each feedback packet, including duplicates."""
     found = here.objects[f"{name} numbers"] = []
     connection = here.drones[name]._connection._session
     assert connection is not None
@@ -164,7 +164,7 @@ def watch_numbers(here: Here, name: str) -> None:
 
 
 def numbers(here: Here, name: str, count: int) -> list[int]:
-    """Numbers of so many packets of feedback."""
+    """Numbers of this many feedback packets."""
     found: list[int] = here.objects[f"{name} numbers"]
     eventually(lambda: len(found) >= count, f"{count} samples of feedback came")
     return list(found)

@@ -1,4 +1,4 @@
-"""What runs on hosts to find out what their network is like, without anything of Skyloop: echoes and streams.
+"""Programs that measure the network between hosts without Skyloop: echoes and streams.
 
 ``python tests/promises/hosts/probes.py echo PROTOCOL ADDRESS``, or ``send PROTOCOL ADDRESS COUNT PERIOD_S``, which
 prints a JSON list of when each probe came back, by its number: ``[number, sent_ns, heard_ns]``; or ``clock``, its own
@@ -16,12 +16,12 @@ import time
 
 PORT = 7000
 RECORD = struct.Struct("!qq")
-SETTLE_S = {"udp": 0.5, "tcp": 20.0}  # how long the last may be waited for: those by TCP come for sure
+SETTLE_S = {"udp": 0.5, "tcp": 20.0}  # how long to wait for the last one: TCP's are certain to arrive
 KINDS = {"udp": socket.SOCK_DGRAM, "tcp": socket.SOCK_STREAM}
 
 
 def echo(protocol: str, address: str) -> None:
-    """Give back what comes, for ever."""
+    """Return whatever arrives, forever."""
     sock = socket.socket(socket.AF_INET, KINDS[protocol])
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     sock.bind((address, PORT))
@@ -39,7 +39,7 @@ def echo(protocol: str, address: str) -> None:
 
 
 def send(protocol: str, address: str, count: int, period_s: float) -> None:
-    """Probes at a period, and what came back of them."""
+    """Send probes at a period; returns those that came back."""
     sock = socket.socket(socket.AF_INET, KINDS[protocol])
     sock.connect((address, PORT))
     if protocol == "tcp":

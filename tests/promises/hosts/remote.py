@@ -1,4 +1,4 @@
-"""An application on another host that does what a test tells it, call by call, and says what came of it."""
+"""An application on another host that executes a test's calls one by one, and returns the results."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _Arguments = ParamSpec("_Arguments")
 
 
 class RemoteError(Exception):
-    """What a call raised over there, with its traceback."""
+    """An exception of a remote call, with its traceback."""
 
 
 class Here:
-    """What an application has: its drones, and what it was told, with the time on its own clock [ns]."""
+    """An application's state: its drones and its records, with the time on its clock [ns]."""
 
     def __init__(self) -> None:
         self.drones: dict[str, Drone] = {}
@@ -30,13 +30,13 @@ class Here:
         self.objects: dict[str, Any] = {}
 
     def tell(self, what: str) -> Callable[[Any], None]:
-        """A listener that writes down what it gets."""
+        """A listener that records what it gets."""
         found = self.told.setdefault(what, [])
         return lambda value: found.append((time.monotonic_ns(), value))
 
 
 class Remote:
-    """``do(function, …)`` calls a function of a module there, as ``function(here, …)``; its result comes back."""
+    """``do(function, …)`` calls a function of a module there, as ``function(here, …)``, and returns its result."""
 
     def __init__(self, workers: Workers, host: Host) -> None:
         self.host = host
@@ -46,11 +46,11 @@ class Remote:
     def begin(
         self, work: Callable[Concatenate[Here, _Arguments], _Result], *args: _Arguments.args, **kw: _Arguments.kwargs
     ) -> None:
-        """Start a call whose :meth:`end` is waited for later."""
+        """Start a call that a later :meth:`end` waits for."""
         self._worker.pipe.send((work.__module__, work.__qualname__, args, kw))
 
     def end(self, timeout_s: float = ANSWERS_WITHIN_S) -> Any:
-        """The result of the call that was begun. Raises :class:`RemoteError` for what it raised."""
+        """The result of the call in progress. Raises :class:`RemoteError` for an exception there."""
         good, answer = self._worker.answer(timeout_s)
         if good:
             return answer
@@ -69,7 +69,7 @@ class Remote:
 
 
 def serve(pipe: Pipe) -> None:
-    """What a remote application's process does."""
+    """The main loop of a remote application's process."""
     here = Here()
     pipe.send("ready")
     try:

@@ -1,4 +1,4 @@
-"""Who is found on a network of several hosts, and what is told of a name that is not there or taken."""
+"""Discovery on a network of several hosts, and the errors for names that are missing or taken."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_proxies_of_other_hosts_are_listed_and_connected_to_by_name(
         app.do(flying.connect, "hidden")
 
 
-def test_a_name_that_another_host_has_is_refused_with_who_has_it(lan: Lan, start: Start, proxy: Start) -> None:
+def test_a_name_used_on_another_host_is_refused_with_its_owner(lan: Lan, start: Start, proxy: Start) -> None:
     hangar, roof = lan.host("hangar"), lan.host("roof")
     first = proxy(hangar, "alpha")
     second = start(roof, "-m", "skyloop", "proxy", "sim://?cameras=none", "--name", "alpha", "--network")

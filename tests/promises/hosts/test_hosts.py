@@ -1,4 +1,4 @@
-"""The hosts, segments and paths themselves, by plain UDP and TCP: what the other tests here stand on."""
+"""The hosts, segments and paths that the other tests rely on, tested by plain UDP and TCP."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Start = Callable[..., Process]
 
 
 def rounds(host: Host, protocol: str, address: str, count: int) -> list[tuple[int, int]]:
-    """Probes that came back: their numbers and how long they took [ns]."""
+    """The probes that came back: their numbers and round-trip times [ns]."""
     said = host.run(sys.executable, PROBES, "send", protocol, address, str(count), str(PERIOD_S))
     return [(number, heard - sent) for number, sent, heard in json.loads(said)]
 
@@ -35,7 +35,7 @@ def reaches(host: Host, address: str) -> bool:
     return bool(rounds(host, "udp", address, 1))
 
 
-def test_hosts_of_one_segment_reach_one_another_and_nobody_else(lab: Lab, start: Start) -> None:
+def test_hosts_of_one_segment_reach_only_one_another(lab: Lab, start: Start) -> None:
     segment = lab.segment("10.77.1.0/24")
     alpha, bravo, outsider = (lab.host(name) for name in ("alpha", "bravo", "outsider"))
     address = segment.join(alpha)
@@ -80,7 +80,7 @@ def test_a_router_between_two_segments(lab: Lab, start: Start) -> None:
     assert len(rounds(alpha, "udp", address, 10)) == 10
 
 
-def test_behind_a_router_that_hides_them_hosts_reach_out_and_are_not_reached(lab: Lab, start: Start) -> None:
+def test_hosts_behind_nat_reach_out_but_are_not_reached(lab: Lab, start: Start) -> None:
     if not any((File(folder) / "nft").exists() for folder in os.environ["PATH"].split(":")):
         pytest.skip("there is no program 'nft': install nftables")
     inside, outside = lab.segment("10.77.1.0/24"), lab.segment("10.77.2.0/24")
@@ -98,7 +98,7 @@ def test_behind_a_router_that_hides_them_hosts_reach_out_and_are_not_reached(lab
         rounds(bravo, "udp", hidden, 1)
 
 
-def test_a_clock_set_apart(lab: Lab) -> None:
+def test_a_clock_with_an_offset(lab: Lab) -> None:
     ahead = lab.host("ahead", clock_ahead_s=1000)
     before_ns = time.monotonic_ns()
     there_ns = int(ahead.run(sys.executable, PROBES, "clock"))
@@ -107,8 +107,8 @@ def test_a_clock_set_apart(lab: Lab) -> None:
 
 
 @pytest.mark.usefixtures("_possible")
-def test_nothing_outlives_whoever_made_it() -> None:
-    """Killed with no chance to clean up, it leaves no process that holds a namespace."""
+def test_nothing_outlives_its_creator() -> None:
+    """Killed without a chance to clean up, the creator leaves no process that holds a namespace."""
     script = (
         "from benchmarks.hosts.namespaces import Lab\n"
         "lab = Lab(); a = lab.host('alpha'); lab.segment('10.77.1.0/24').join(a); print(a.pid, flush=True); input()"
@@ -148,7 +148,7 @@ def test_a_path_delays_reorders_and_loses(lab: Lab, ends: tuple[Host, Host], sta
     there, back = path.tell()
     assert len(found) == there.packets
     assert there.packets + there.lost == back.packets == 300 - back.lost
-    assert 20 <= back.lost <= 110  # of 300, at 20 %: more than five standard deviations off are not chance
+    assert 20 <= back.lost <= 110  # of 300, at 20 %: more than five standard deviations off is not chance
     assert min(taken for _, taken in found) >= 2 * 0.02e9
     numbers = [number for number, _ in found]
     assert numbers != sorted(numbers)
@@ -165,18 +165,18 @@ def test_a_path_delays_reorders_and_loses(lab: Lab, ends: tuple[Host, Host], sta
     assert len(rounds(ends[1], "udp", path.first, 10)) == 10
 
 
-def test_tcp_loses_nothing_and_waits_instead(lab: Lab, ends: tuple[Host, Host], start: Start) -> None:
-    """What the comparison of datagrams with TCP rests on: here a retransmission delays all that comes behind it."""
+def test_tcp_loses_nothing_but_waits(lab: Lab, ends: tuple[Host, Host], start: Start) -> None:
+    """The premise of the comparison of datagrams with TCP: here a retransmission delays everything behind it."""
     path = Path(lab, *ends, seed=1, impairments=Impairments(loss=0.1, delay_s=0.005))
     start(ends[0], PROBES, "echo", "tcp", path.first).until("ready")
     found = rounds(ends[1], "tcp", path.first, 200)
     assert [number for number, _ in found] == list(range(200))
     taken = [ns for _, ns in found]
     assert statistics.median(taken) >= 0.01e9
-    assert max(taken) >= 0.02e9, "no retransmission was waited for, which takes at least another round trip"
+    assert max(taken) >= 0.02e9, "there was no retransmission, which takes at least another round trip"
 
 
-def test_the_fate_of_a_packet_is_the_seeds(lab: Lab, ends: tuple[Host, Host], start: Start) -> None:
+def test_the_seed_decides_the_fate_of_each_packet(lab: Lab, ends: tuple[Host, Host], start: Start) -> None:
     lost = []
     for _ in range(2):
         path = Path(lab, *ends, seed=7, impairments=Impairments(loss=0.3))

@@ -1,4 +1,4 @@
-"""What becomes of packets on a bad path: pure, so it needs neither root nor time."""
+"""The fate of packets on a bad path: pure, so it needs neither root nor time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PAUSES_NS = st.lists(st.integers(0, 10_000_000), min_size=1, max_size=100)
 
 
 def arrivals(way: Way, pauses_ns: list[int]) -> dict[int, tuple[int, int]]:
-    """When each packet that came out went in and when it was due, by its number."""
+    """When each packet that left went in and when it was due, by its number."""
     now_ns, sent, found = 0, [], {}
     for number, pause_ns in enumerate(pauses_ns):
         now_ns += pause_ns
@@ -38,7 +38,7 @@ def arrivals(way: Way, pauses_ns: list[int]) -> dict[int, tuple[int, int]]:
 
 
 @given(IMPAIRMENTS, PAUSES_NS, st.integers())
-def test_each_packet_is_lost_or_comes_once_within_the_bounds(
+def test_each_packet_is_lost_or_arrives_once_within_the_bounds(
     wrong: Impairments, pauses_ns: list[int], seed: int
 ) -> None:
     way = Way(seed, wrong)
@@ -60,7 +60,7 @@ def test_jitter_alone_keeps_the_order(delay_s: float, jitter_s: float, pauses_ns
 
 
 @given(RATES, PAUSES_NS, st.integers())
-def test_which_are_lost_does_not_depend_on_what_else_goes_wrong(loss: float, pauses_ns: list[int], seed: int) -> None:
+def test_the_lost_packets_do_not_depend_on_other_impairments(loss: float, pauses_ns: list[int], seed: int) -> None:
     plain = arrivals(Way(seed, Impairments(loss=loss)), pauses_ns)
     late = arrivals(Way(seed, Impairments(loss, delay_s=0.05, jitter_s=0.02, reorder=0.5)), pauses_ns)
     assert set(plain) == set(late)
@@ -76,7 +76,7 @@ def test_rates_are_kept_and_those_held_back_are_overtaken() -> None:
     assert order != sorted(order)
 
 
-def test_changed_rates_hold_for_what_comes_later() -> None:
+def test_changed_rates_apply_to_later_packets() -> None:
     way = Way(0, Impairments(loss=1.0))
     way.put(b"lost", 0)
     way.impairments = Impairments(delay_s=0.001)

@@ -1,4 +1,4 @@
-"""Links between hosts that break: who is told, what the vehicle does meanwhile, and how all is put back."""
+"""Broken links between hosts: notification, the vehicle's behaviour meanwhile, and recovery."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ S = 1_000_000_000
 
 
 @pytest.mark.parametrize(("down", "up"), [("cut", "restore"), ("unplug", "plug")])
-def test_a_link_cut_and_restored_is_back_within_two_seconds_with_everything_as_it_was(
+def test_a_link_cut_and_restored_is_back_within_two_seconds_with_its_state_restored(
     lan: Lan, proxy: Start, remote: OnHost, down: str, up: str
 ) -> None:
-    """The application is told, and does nothing itself. A cut is silent, as in radio; a cable loses its carrier."""
+    """The application is notified, and does nothing itself. A cut is silent, as by radio; an unplugged cable is not."""
     hangar, desk = lan.host("hangar"), lan.host("desk")
     proxy(hangar, uri="sim://?world=empty&cameras=front")
     app = remote(desk)
@@ -34,8 +34,8 @@ def test_a_link_cut_and_restored_is_back_within_two_seconds_with_everything_as_i
     cut_ns = time.monotonic_ns()
     lost_ns = app.do(flying.wait_link, "alpha", "lost", cut_ns)
     assert lost_ns - cut_ns < 5.0 * S
-    assert app.do(flying.call, "alpha", "velocity", forward=0.3) is False, "nothing to do, and nothing raised"
-    time.sleep(max(0.0, 3.0 - (time.monotonic_ns() - cut_ns) / S))  # so that all retries of all layers are slow ones
+    assert app.do(flying.call, "alpha", "velocity", forward=0.3) is False, "no vehicle to command, and no exception"
+    time.sleep(max(0.0, 3.0 - (time.monotonic_ns() - cut_ns) / S))  # so that all retries of all layers are slow by now
     getattr(lan.segment, up)(desk)
     back_ns = time.monotonic_ns()
     up_ns = app.do(flying.wait_link, "alpha", "up", back_ns)
@@ -69,19 +69,21 @@ def test_a_pilot_cut_off_leaves_a_vehicle_that_fails_safe_and_executes_nothing_o
     assert 0.3 * S < hover_ns - cut_ns < 1.5 * S, "failsafe.hover_after_s is 0.5 s after the last command"
     witness.do(flying.wait, "alpha", "hovering")
     pilot.do(flying.wait_link, "alpha", "lost", cut_ns)
-    time.sleep(max(0.0, 2.5 - (time.monotonic_ns() - cut_ns) / S))  # the pilot goes on commanding, into nothing
+    time.sleep(max(0.0, 2.5 - (time.monotonic_ns() - cut_ns) / S))  # the pilot keeps commanding, without effect
 
     lan.segment.restore(desk)
     back_ns = time.monotonic_ns()
     pilot.do(flying.wait_authority, "alpha", "held")
-    witness.do(flying.wait_failsafe, "alpha", "none", timeout_s=30.0)  # its controller ran on: the first fresh command
+    witness.do(
+        flying.wait_failsafe, "alpha", "none", timeout_s=30.0
+    )  # its controller kept running: the first new command
     witness.do(flying.wait, "alpha", "flying")
     pilot.do(flying.stop_flying, "alpha")
 
     applied: list[Applied] = witness.do(flying.commands, "alpha")
     late = [a for a in applied if isinstance(a.applied, Velocity) and cut_ns + S < a.applied_ns]
-    assert late, "the pilot flies again"
-    # All hosts here read one clock, so the time of sending is the pilot's own.
+    assert late, "the pilot does not fly again"
+    # All hosts here share one clock, so the time of sending is the pilot's own.
     stale = [a for a in late if a.sent_ns < back_ns - 0.25 * S]
     assert not stale, f"{len(stale)} commands from before the return were executed"
     assert min(a.applied_ns for a in late) >= back_ns

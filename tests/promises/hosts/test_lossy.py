@@ -1,4 +1,4 @@
-"""Commands and feedback on a path that loses, delays and reorders: what arrives has not waited for a retransmission."""
+"""Commands and feedback on a path that loses, delays and reorders: nothing that arrives waited for a retransmission."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.network import DATAGRAMS, PATH, TCP
 pytest.importorskip("zenoh")
 SECONDS = 6.0
 TRIES = 3
-#: A retransmission of TCP takes another round trip, or 200 ms; less than that is a crowded machine's.
+#: A retransmission of TCP takes another round trip, or 200 ms; shorter delays come from a busy machine.
 SLACK_US = 8e3
 CROWDED_US = 120e3
 
@@ -23,9 +23,9 @@ def test_at_ten_percent_loss_nothing_waits_for_what_was_lost() -> None:
         [found] = network.measure(SECONDS, [0.1], [DATAGRAMS]).cases
         sent = sum(found.channels[name].sent for name in (COMMAND, FEEDBACK))
         arrived = sum(found.channels[name].arrived for name in (COMMAND, FEEDBACK))
-        # What was lost stays lost: five standard deviations off, it is not chance.
+        # Lost packets stay lost: five standard deviations off is not chance.
         assert 0.7 < arrived / sent < 0.98
-        assert found.channels[VIDEO].arrived, "video is sent reliably, and comes"
+        assert found.channels[VIDEO].arrived, "video is sent reliably, and must arrive"
         summaries = [found.channels[name].age for name in (COMMAND, FEEDBACK)]
         ages_us.append(max(summary.p99_us for summary in summaries if summary is not None))
         if ages_us[-1] < PATH.longest_s * 1e6 + CROWDED_US:
@@ -35,9 +35,9 @@ def test_at_ten_percent_loss_nothing_waits_for_what_was_lost() -> None:
 
 @pytest.mark.usefixtures("_possible")
 def test_by_tcp_alone_commands_wait_for_what_was_lost() -> None:
-    """So the test above would find it."""
+    """It shows that the test above would notice such waits."""
     [found] = network.measure(4.0, [0.1], [TCP]).cases
     age = found.channels[COMMAND].age
     assert age is not None
     assert age.p99_us > PATH.longest_s * 1e6 + SLACK_US
-    assert found.channels[FEEDBACK].share > 0.6, "what was lost comes again; a busy machine leaves some out by itself"
+    assert found.channels[FEEDBACK].share > 0.6, "TCP repeats lost packets; a busy machine drops some too"

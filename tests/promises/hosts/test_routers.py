@@ -1,4 +1,4 @@
-"""Programs that reach a proxy only through a router: of segments with nothing else in common, and from behind NAT."""
+"""Programs that reach a proxy only through a router: from separate segments, and from behind NAT."""
 
 from __future__ import annotations
 
@@ -26,9 +26,7 @@ def flies(app: Remote, network: str) -> None:
     app.do(flying.wait_frames, "alpha", 2)
 
 
-def test_a_router_joins_segments_that_have_nothing_else_in_common(
-    lab: Lab, start: Start, proxy: Start, remote: OnHost
-) -> None:
+def test_a_router_joins_separate_segments(lab: Lab, start: Start, proxy: Start, remote: OnHost) -> None:
     pytest.importorskip("zenoh")
     inside, outside = lab.segment("10.77.1.0/24"), lab.segment("10.77.2.0/24")
     hangar, desk, middle = (lab.host(name) for name in ("hangar", "desk", "middle"))
@@ -41,11 +39,11 @@ def test_a_router_joins_segments_that_have_nothing_else_in_common(
     flies(app, addresses[1])
     app.do(flying.watch_numbers, "alpha")
     numbers = app.do(flying.numbers, "alpha", 40)
-    assert len(set(numbers)) == len(numbers), "each sample comes once"
+    assert len(set(numbers)) == len(numbers), "a sample arrived twice"
 
 
 def test_proxies_and_programs_behind_nat_meet_at_a_router(lab: Lab, start: Start, proxy: Start, remote: OnHost) -> None:
-    """Two sites, each behind a router that hides its hosts; a third place that both can call."""
+    """Two sites, each behind a router with NAT, and a third place that both can reach."""
     pytest.importorskip("zenoh")
     if shutil.which("nft") is None:
         pytest.skip("there is no program 'nft': install nftables")
@@ -68,7 +66,7 @@ def test_proxies_and_programs_behind_nat_meet_at_a_router(lab: Lab, start: Start
     flies(remote(desk), meeting)
 
 
-def test_several_sites_are_joined_by_a_router_each(lab: Lab, start: Start, proxy: Start, remote: OnHost) -> None:
+def test_several_sites_are_joined_by_one_router_each(lab: Lab, start: Start, proxy: Start, remote: OnHost) -> None:
     pytest.importorskip("zenoh")
     between = lab.segment("10.99.0.0/24")
     near, far = [], []
@@ -85,7 +83,7 @@ def test_several_sites_are_joined_by_a_router_each(lab: Lab, start: Start, proxy
     flies(remote(desk), second)
 
 
-def test_where_a_direct_way_and_a_router_are_found_each_sample_comes_once(
+def test_with_a_direct_path_and_a_router_each_sample_arrives_once(
     lab: Lab, start: Start, proxy: Start, remote: OnHost
 ) -> None:
     pytest.importorskip("zenoh")

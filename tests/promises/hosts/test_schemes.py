@@ -62,7 +62,7 @@ def test_several_programs_share_a_drone(lan: Lan, proxy: Start, remote: OnHost) 
     bob.do(flying.wait_authority, "alpha", "held")
 
 
-def test_video_goes_to_several_hosts_as_each_wants_it(lan: Lan, proxy: Start, remote: OnHost) -> None:
+def test_video_goes_to_several_hosts_in_the_form_each_requests(lan: Lan, proxy: Start, remote: OnHost) -> None:
     hangar = lan.host("hangar")
     proxy(hangar, uri="sim://?world=room&cameras=front&fps=15")
     wishes: dict[str, dict[str, Any]] = {
@@ -81,4 +81,4 @@ def test_video_goes_to_several_hosts_as_each_wants_it(lan: Lan, proxy: Start, re
     }
     assert shapes == {"one": {(240, 320, 3)}, "two": {(240, 320, 3)}, "three": {(120, 160, 3)}}
     captured_ns = [at for _, (_, _, at) in viewers["three"].do(flying.frames, "alpha")]
-    assert len(captured_ns) <= (captured_ns[-1] - captured_ns[0]) / 1e9 * 5.0 + 2.0, "five in a second are wanted"
+    assert len(captured_ns) <= (captured_ns[-1] - captured_ns[0]) / 1e9 * 5.0 + 2.0, "five per second were requested"

@@ -1,4 +1,4 @@
-"""A swarm over the network whose users stop and die: each of its drones that flies fails safe."""
+"""A swarm over the network whose users stop and die: each of its flying drones fails safe."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def test_ten_drones_of_three_users_with_observers_fail_safe_with_their_users() -
     found = swarm.measure(6.0, drones=10, users=3, observers=3)
     assert (found.drones, found.users, found.observers, found.hosts) == (10, 3, 3, True)
     verdict = found.failsafe
-    # On a machine with other work a user may get no turn for half a second: its drones fail safe before it is stopped.
+    # On a busy machine a user may not be scheduled for half a second: its drones fail safe before it is stopped.
     assert verdict.missed <= verdict.needless
     assert verdict.expected >= 10, (
-        "each user's drones once, and the first one's twice, but for some that are late to fly"
+        "each user's drones once, and the first one's twice, except for some that take off late"
     )
     assert verdict.delay is not None
     assert verdict.delay.median_us < 1e6

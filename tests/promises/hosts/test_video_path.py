@@ -1,4 +1,4 @@
-"""Video over the uplink of a mobile network: pure traces and figures, and some seconds of one between two hosts."""
+"""Video over a mobile network's uplink: pure traces and figures, and some seconds of real video between two hosts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skyloop.errors import UsageError
 MS = 1_000_000
 SECONDS = 15.0
 OUTAGE_MS = (3000, 5000)
-#: After an outage the first packet passes alone, and the next ones slowly: each answer waits for a while.
+#: After an outage the first packet passes alone, and the next ones slowly: each answer takes a while.
 SLOW = ((5000, 48), (5250, 8640), (5500, 3840), (5750, 3360), (6000, 4512), (6250, 6576), (6500, 2496), (6750, 4000))
 BACK_WITHIN_MS = 5000
 
@@ -27,13 +27,13 @@ def test_packets_leave_with_the_opportunities_of_the_trace() -> None:
     modem = Modem(Trace("made up", (2, 5, 5, 9, 20), queue=6000))
     assert modem.leaves_ns(1000, 0) == 2 * MS
     assert modem.leaves_ns(500, 1 * MS) == 2 * MS, "it fits beside the first"
-    assert modem.leaves_ns(3000, 2 * MS) == 5 * MS, "larger ones take as many as they need"
+    assert modem.leaves_ns(3000, 2 * MS) == 5 * MS, "larger ones use several opportunities"
     assert modem.leaves_ns(1, 6 * MS) == 9 * MS
     assert modem.leaves_ns(1500, 10 * MS) == 20 * MS
     assert modem.leaves_ns(1500, 21 * MS) == 22 * MS, "the trace is repeated"
 
 
-def test_a_full_queue_drops_what_comes() -> None:
+def test_a_full_queue_drops_packets() -> None:
     modem = Modem(Trace("made up", (100,), queue=3000))
     assert [modem.leaves_ns(1500, 0) for _ in range(3)] == [100 * MS, 200 * MS, None]
     assert modem.leaves_ns(1500, 100 * MS) == 300 * MS
@@ -43,7 +43,7 @@ def test_a_full_queue_drops_what_comes() -> None:
     st.lists(st.integers(0, 50), min_size=1, max_size=30).map(sorted).filter(lambda times: times[-1] > 0),
     st.lists(st.tuples(st.integers(0, 30 * MS), st.integers(1, 3000)), max_size=50),
 )
-def test_what_leaves_is_in_order_never_early_and_never_more_than_carried(
+def test_packets_leave_in_order_never_early_and_never_beyond_the_capacity(
     times: list[int], packets: list[tuple[int, int]]
 ) -> None:
     trace = Trace("made up", tuple(times), queue=1_000_000)
@@ -59,7 +59,7 @@ def test_what_leaves_is_in_order_never_early_and_never_more_than_carried(
     assert size * 8e-3 <= possible
 
 
-def test_a_path_keeps_its_delay_beside_the_trace() -> None:
+def test_a_path_has_its_own_delay_beside_the_trace() -> None:
     way = Way(0, Impairments(delay_s=0.02, trace=Trace("made up", (10, 1000), queue=1500)))
     way.put(b"first", 0)
     way.put(bytes(1500), 0)
@@ -77,7 +77,7 @@ def test_the_synthetic_trace_is_like_a_phones_in_a_car() -> None:
 
 
 @pytest.mark.parametrize("times", [(), (0,), (-1, 3), (3, 2)])
-def test_times_that_make_no_trace_are_refused(times: tuple[int, ...]) -> None:
+def test_times_that_do_not_form_a_trace_are_refused(times: tuple[int, ...]) -> None:
     with pytest.raises(UsageError, match="trace bad"):
         Trace("bad", times)
     with pytest.raises(UsageError, match="no trace 'unheard-of'"):
@@ -94,7 +94,7 @@ def test_a_picture_carries_its_stamp_and_follows_from_it(size: Size) -> None:
     assert moving_scene.psnr_db(picture, scene.picture(stamp_ns + 500 * MS)) < 25
 
 
-def test_only_the_time_in_which_the_path_carries_enough_counts() -> None:
+def test_only_time_with_enough_capacity_counts() -> None:
     # A second of 600 kbit/s, one of nothing, one of 600 again; a picture every 100 ms, 50 ms old, none in the second.
     trace = Trace("made up", tuple(second * 1000 + ms for second in (0, 2) for ms in range(0, 1000, 20)))
     pictures = [(ms * MS, (ms + 50) * MS) for ms in (*range(0, 900, 100), *range(2000, 2900, 100))]
@@ -117,14 +117,14 @@ def _machine() -> Machine:
 
 
 @pytest.mark.usefixtures("_possible")
-def test_on_a_bad_uplink_the_picture_stays_fresh_and_commands_are_not_held_up() -> None:
+def test_on_a_bad_uplink_the_picture_stays_fresh_and_commands_are_not_delayed() -> None:
     pytest.importorskip("zenoh")
     pytest.importorskip("av", reason="H.264 needs the extra 'video'")
     quiet, watched = video_path.measure(SECONDS, [traces.synthetic()], [NO_VIDEO, "H.264, adaptive"]).cases
     assert watched.video is not None
     assert watched.command is not None
     assert quiet.command is not None
-    # The figures themselves are the benchmark's: a busy machine adds to each of them.
+    # The figures themselves belong to the benchmark: a busy machine adds to each of them.
     assert watched.video.p50 < 300
     assert watched.pictures_per_s > 5
     assert watched.command.p95 < quiet.command.p95 + 150
@@ -133,7 +133,7 @@ def test_on_a_bad_uplink_the_picture_stays_fresh_and_commands_are_not_held_up() 
 
 @pytest.mark.usefixtures("_possible")
 def test_after_an_outage_the_link_comes_back_under_a_stream_of_fixed_rate() -> None:
-    """One end has noticed that the links ended, and the other has not, or one has given up a link just made."""
+    """One end noticed that the links ended and the other did not, or one end gave up a link that was just made."""
     pytest.importorskip("zenoh")
     pytest.importorskip("av", reason="H.264 needs the extra 'video'")
     begin_ms, end_ms = OUTAGE_MS
@@ -148,6 +148,6 @@ def test_after_an_outage_the_link_comes_back_under_a_stream_of_fixed_rate() -> N
 
 
 def _spread(from_ms: int, kbit_s: int) -> list[int]:
-    """Return times for so many packets a second, evenly over 250 ms."""
+    """Return times for this many packets a second, evenly over 250 ms."""
     count = round(kbit_s / (8e-3 * traces.OPPORTUNITY * 4))
     return [from_ms + (250 * n + 125) // count for n in range(count)]

@@ -1,4 +1,4 @@
-"""What an intruder tries, and how one sees that it worked."""
+"""The attempts of an intruder, and how to see that one worked."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from skyloop.network.session import Session, acquire, release
 from skyloop.transport.base import EVENTS, FEEDBACK
 from tests.promises.security.rig import DRONE, Intruder, Rig
 
-LIAR = "f" * 16  #: RUN of a proxy that is none
-PUSH = Velocity(0.111)  #: a command that nobody else gives
+LIAR = "f" * 16  #: RUN of an impostor's proxy
+PUSH = Velocity(0.111)  #: a command that no other client sends
 LIE = 0.123  #: a battery that the vehicle never reports
 PARAMETER = "limits.tilt"
 TILT = 0.0567
@@ -47,7 +47,7 @@ _NUMBERS = count(10**6)
 
 
 class Deed(NamedTuple):
-    """Something to try. ``done`` says whether it had any effect so far."""
+    """An attempt. ``done`` says whether it has had any effect so far."""
 
     what: str
     do: Callable[[Rig, Intruder], None]
@@ -55,7 +55,7 @@ class Deed(NamedTuple):
 
 
 def _command(rig: Rig, action: Velocity | EmergencyStop) -> Command:
-    """Young, newer than all of jane's and than those tried before, and of her lease."""
+    """Recent, newer than all of jane's and all earlier attempts', and with her lease."""
     number = next(_NUMBERS)
     return Command(number, rig.jane.lease, number, rig.bench.clock(), action)
 
@@ -170,7 +170,7 @@ def _let_in(rig: Rig, intruder: Intruder) -> None:
         sender = layout.parse_sender(str(query.key_expr))
         wish = packets.decode_join(bytes(query.payload))
         welcome = packets.Welcome(packets.REVISION, LIAR)
-        if intruder.ring is not None:  # with what it has
+        if intruder.ring is not None:  # with the keys it has
             terms = (DRONE, wish.run, sender.who, sender.id)
             proof, agreed = Agreement(intruder.ring, *terms).answer(wish.proof)
             topics, trailer = Seal(agreed.down).seal(str(query.key_expr), b"", packets.key(1, bytes(32)))
@@ -302,7 +302,7 @@ DEEDS = (
 )
 
 
-#: The columns: whose key is used, and in words.
+#: The columns: whose key is used, in words.
 COLUMNS = {
     "nobody": "without keys",
     "kim": "another pilot of it",
@@ -313,11 +313,11 @@ COLUMNS = {
     "hub": "a router",
     "eve": "revoked",
 }
-#: What works, by the deed's words; everything else has no effect.
+#: The attempts that work, by the deed's words; all others have no effect.
 SEEN = {"nobody", "kim", "bob", "olga"}
 WORKS = {
     "find the drone": {*SEEN, "oscar", "bravo", "hub"},
-    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy hands on nothing of others
+    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy forwards nothing of others
     "see its feedback": SEEN,
     "see its video": SEEN,
     "read its parameters": SEEN,

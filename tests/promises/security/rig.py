@@ -1,4 +1,4 @@
-"""A drone on the network with its rightful users, and somebody with the plain API of Zenoh who tries things."""
+"""A drone on the network with its rightful users, and an intruder with Zenoh's plain API."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _NUMBERS = itertools.count(10**6)
 
 
 def make_lab(directory: Path) -> Lab:
-    """Jane flies alpha while Wendy looks on; the others have keys, too, but not for what they will try."""
+    """Jane flies alpha while Wendy observes; the others have keys too, but not for what they will try."""
     lab = Lab.make(directory, now=NOW - timedelta(days=40))
     for name, role, drones in (
         ("alpha", "proxy", "alpha"),
@@ -64,16 +64,16 @@ def keys_of(lab: Lab, name: str, directory: Path) -> Path:
 
 
 class Rig:
-    """A proxy named ``alpha`` with a fake vehicle, jane who flies it, and wendy who looks on. ``keys`` is None for a
-    network without keys, where everybody is called ``anyone``. ``routed``: applications were given a router's address,
+    """A proxy named ``alpha`` with a fake vehicle, jane who flies it, and wendy who observes. ``keys`` is None for a
+    network without keys, where everyone is called ``anyone``. ``routed``: applications were given a router's address,
     too."""
 
     def __init__(self, keys: Callable[[str], Path] | None, *, routed: bool = False) -> None:
         self._keys = keys
         self.place = f"127.0.0.1:{free_port('127.0.0.1')}"
-        #: Where applications call the intruder: without keys whoever they find, as by multicast, with keys a router.
+        #: The address by which applications reach the intruder: without keys any peer they find, with keys a router.
         self.lair = f"127.0.0.1:{free_port('127.0.0.1')}" if keys is None or routed else ""
-        self.frames = 0  #: that were published
+        self.frames = 0  #: number of published frames
         self._ends = ExitStack()
 
     def __enter__(self) -> Rig:
@@ -98,7 +98,7 @@ class Rig:
         return settings if self._keys is None else secured(settings, load(self._keys(who)))
 
     def settings(self, who: str) -> FabricSettings:
-        """An application's."""
+        """The settings of an application."""
         return self._settings(who, connect=(self.place, self.lair) if self.lair else (self.place,))
 
     def dialer(self, who: str) -> Dialer:
@@ -112,11 +112,11 @@ class Rig:
         return f"tcp/{place}" if self._keys is None else f"quic/{place}?mixed_rel=1"
 
     def who(self, name: str) -> str:
-        """What somebody is called on this network."""
+        """The name by which this network knows a user."""
         return "anyone" if self._keys is None else name
 
     def connection_of(self, app: App) -> str:
-        """What an eavesdropper would have to know."""
+        """The connection's id, which an eavesdropper would have to know."""
         assert isinstance(app.end, FabricClient)
         return app.end._id
 
@@ -124,7 +124,7 @@ class Rig:
         return bytes.fromhex(self.server._run)
 
     def intruder(self, name: str) -> Intruder:
-        """Somebody who is linked to the proxy, and to the applications where they call. It ends with this rig."""
+        """An intruder linked to the proxy, and to the applications where they call. It ends with this rig."""
         keys = None if self._keys is None else self._keys(name)
         listen = (self._endpoint(self.lair),) if self.lair else ()
         somebody = Intruder(third_party(self.endpoint, keys, listen=listen), self.who(name), self, keys)
@@ -141,7 +141,7 @@ def third_party(
     mode: str = "peer",
     listen: tuple[str, ...] = (),
 ) -> Any:
-    """A session of the plain API, configured by whoever wants something; raises ``zenoh.ZError`` if nothing answers."""
+    """A session of the plain API with any configuration; raises ``zenoh.ZError`` if nothing answers."""
     config = zenoh.Config()
     tls: dict[str, Any] = {"enable_mtls": True, "verify_name_on_connect": False}
     if keys is not None:
@@ -171,8 +171,10 @@ def third_party(
 
 
 class Intruder:
-    """Somebody with a session of the plain API, who knows the layout of keys, the packets and how they are sealed as it
-    is documented. ``got`` is what it could read."""
+    """An intruder with a session of the plain API, who knows the documented layout of keys, packets and seals.
+
+    ``got`` holds the data it could read.
+    """
 
     def __init__(self, session: Any, who: str, rig: Rig, keys: Path | None = None) -> None:
         self.session = session
@@ -182,15 +184,15 @@ class Intruder:
         self.got: list[tuple[str, bytes]] = []
         self.held: list[Any] = []
         self.ring = None if keys is None else KeyRing(load(keys))
-        self.admission = Admission()  #: with keys: how the proxy has let it in, if it has
+        self.admission = Admission()  #: with keys: how the proxy admitted it, if it did
 
     def close(self) -> None:
         if not self.session.is_closed():
             self.session.close()
 
     def put(self, key: str, packet: bytes, attachment: bytes = bytes(8)) -> None:
-        """By both links. A put without a publisher is sent whether or not this end was told that somebody listens, so
-        what is kept from arriving is kept by the other end."""
+        """Send by both links. A put without a publisher is sent whether or not this end knows of a subscriber, so only
+        the other end can keep it from arriving."""
         packet, attachment = self.seal(key, packet, attachment)
         self.session.put(key, packet, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
         publisher = self.session.declare_publisher(key, reliability=zenoh.Reliability.BEST_EFFORT)
@@ -198,8 +200,8 @@ class Intruder:
         self.held.append(publisher)
 
     def seal(self, key: str, packet: bytes, attachment: bytes) -> tuple[bytes, bytes]:
-        """Packet and attachment as somebody seals them who has these keys: for its own connection, and what is
-        published with the key that all have who may see the drone."""
+        """Packet and attachment as a holder of these keys seals them: for its own connection, and for published data
+        with the key of all who may see the drone."""
         if self.id in key:
             return self.admission.sealer.seal(key, attachment, packet)
         if isinstance(self.admission.topics, Open) and ("/topic/" in key or "/video/" in key):
@@ -209,7 +211,7 @@ class Intruder:
         return packet, attachment
 
     def send(self, way: str, sample: Sample, *, who: str | None = None, connection: str | None = None) -> None:
-        """As an application, by one of its keys or by somebody else's."""
+        """Send as an application, with one of its own keys or another user's."""
         key = layout.upward(way, DRONE, who or self.who, connection or self.id)
         self.put(key, encode(sample))
 
@@ -236,7 +238,7 @@ class Intruder:
         return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
 
     def join(self, who: str | None = None) -> bool:
-        """Begin a connection, with its token, as the layout of keys says; whether the proxy agreed."""
+        """Open a connection, with its token, as the layout of keys says; returns whether the proxy agreed."""
         who = who or self.who
         self.listen(layout.to(DRONE, self.id))
         self.held.append(self.session.liveliness().declare_token(layout.app(DRONE, who, self.id)))
@@ -249,6 +251,6 @@ class Intruder:
         return False
 
     def see(self) -> None:
-        """Be among those who may read what is published, if these keys let it in."""
+        """Subscribe to everything published, if these keys allow it."""
         if self.ring is not None and not self.admission.offer:
             self.join()

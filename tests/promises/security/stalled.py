@@ -1,6 +1,6 @@
-"""A program that asks a proxy over the network for much, and reads nothing: ``stalled.py ENDPOINT KEYS DRONE COUNT``.
+"""Requests a lot from a proxy over the network, and reads nothing: ``stalled.py ENDPOINT KEYS DRONE COUNT``.
 
-It says ``joined N`` when it has so many connections, and ``stalled`` when it has asked.
+It says ``joined N`` once it has that many connections, and ``stalled`` once it has sent its requests.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Attempts with the plain API of Zenoh: which key lets one do what. ``docs/security.md`` shows the outcomes."""
+"""Attempts with Zenoh's plain API: what each key permits. ``docs/security.md`` shows the outcomes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.promises.security.rig import Intruder, Rig, keys_of, make_lab
 
 @pytest.fixture(scope="module")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A lab with keys, from which eve was shut out later on."""
+    """A lab with keys, one of which (eve's) was revoked later."""
     directory = tmp_path_factory.mktemp("keys")
     lab = make_lab(directory / "lab")
     eve = keys_of(lab, "eve", directory)
@@ -30,7 +30,7 @@ def secured(keys: Callable[[str], Path]) -> Iterator[Rig]:
 
 @pytest.fixture
 def rig(request: pytest.FixtureRequest, keys: Callable[[str], Path]) -> Iterator[Rig]:
-    """The one that all attempts without effect share, or a new one for an attempt that works."""
+    """A rig shared by all attempts without effect, or a new one for an attempt that works."""
     deed, who = request.node.callspec.params["deed"], request.node.callspec.params["who"]
     if who != "nobody" and not works(deed, who):
         yield request.getfixturevalue("secured")
@@ -51,7 +51,7 @@ def intruder(rig: Rig, who: str) -> Iterator[Intruder]:
 def test_an_attempt(deed: Deed, who: str, rig: Rig, intruder: Intruder) -> None:
     if works(deed, who):
 
-        def tried() -> bool:  # again, as datagrams may be lost and subscriptions need a moment to be known
+        def tried() -> bool:  # repeated, as datagrams may be lost and subscriptions take a moment to be known
             deed.do(rig, intruder)
             return comes_true(lambda: deed.done(rig, intruder), 0.5)
 

@@ -1,4 +1,4 @@
-"""What the cockpit starts for somebody: few at one time, ended with who asked, and not for a page from elsewhere."""
+"""Processes that the cockpit starts on request: few at a time, ended with the requester, none for foreign pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAMES = own_names("127.0.0.1", 8123)
 
 
 class Children:
-    """Commands of children that say that they run, and then do nothing until they are told to end."""
+    """Commands of children that report that they run, and then do nothing until they are stopped."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -41,7 +41,7 @@ class Children:
         return ["sh", "-c", f"echo $$ > {mark}; while [ ! -e {go} ]; do sleep 0.01; done; echo done > {target}"]
 
     def pids(self) -> list[int]:
-        """Of those that are alive."""
+        """The process ids of those that are alive."""
         written = [path.read_text().strip() for path in (self.folder / "running").iterdir()]
         return [int(pid) for pid in written if pid and Path(f"/proc/{pid}").exists()]
 
@@ -67,12 +67,12 @@ def test_reports_are_made_one_at_a_time_and_few_may_wait(tmp_path: Path) -> None
         (tmp_path / "go").touch()
         done = [await task for task in wanted if task not in refused]
         assert done == ["done\n"] * (1 + MAX_WAITING)
-        assert await reports.make(tmp_path / "a.mcap") == "done\n", "and then there is room again"
+        assert await reports.make(tmp_path / "a.mcap") == "done\n", "then there is room again"
 
     asyncio.run(main())
 
 
-def test_who_goes_away_ends_the_work_or_leaves_the_line(tmp_path: Path) -> None:
+def test_a_requester_that_leaves_ends_the_work_or_leaves_the_queue(tmp_path: Path) -> None:
     children = Children(tmp_path)
 
     async def main() -> None:
@@ -90,7 +90,7 @@ def test_who_goes_away_ends_the_work_or_leaves_the_line(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_a_report_that_takes_too_long_or_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_that_takes_too_long_or_fails_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     children = Children(tmp_path)
 
     async def main() -> None:
@@ -108,7 +108,7 @@ def test_a_report_that_takes_too_long_or_fails_is_told(tmp_path: Path, monkeypat
 
 @pytest.mark.process
 def test_a_page_that_is_closed_ends_its_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over HTTP: the server is asked, the connection ends, and so does the child."""
+    """Over HTTP: the page requests a report, the connection ends, and so does the child."""
     children = Children(tmp_path)
     folder = tmp_path / "recordings"
     folder.mkdir()
@@ -124,15 +124,15 @@ def test_a_page_that_is_closed_ends_its_report(tmp_path: Path, monkeypatch: pyte
 
 
 @pytest.mark.process
-def test_a_report_ends_with_the_process_that_wanted_it(tmp_path: Path) -> None:
+def test_a_report_ends_with_the_process_that_requested_it(tmp_path: Path) -> None:
     fifo = tmp_path / "never.mcap"
-    os.mkfifo(fifo)  # who opens it waits for ever
+    os.mkfifo(fifo)  # opening it blocks forever
     command = [sys.executable, "-m", "skyloop.cockpit.reports", "report", str(fifo), str(tmp_path / "report.html")]
     with subprocess.Popen(command, stdin=subprocess.PIPE) as child:
         assert child.stdin is not None
         with pytest.raises(subprocess.TimeoutExpired):
             child.wait(1.0)
-        child.stdin.close()  # what the kernel does for a parent that is killed
+        child.stdin.close()  # as the kernel does for a parent that is killed
         assert child.wait(10) == 1
 
 
@@ -168,7 +168,9 @@ def test_recordings_and_replays_are_few(tmp_path: Path, monkeypatch: pytest.Monk
     asyncio.run(main())
 
 
-def test_many_who_ask_for_the_list_at_once_cost_as_much_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_simultaneous_requests_for_the_list_cost_as_much_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     looked: list[str] = []
 
     def look(path: Path) -> Any:
@@ -188,12 +190,12 @@ def test_many_who_ask_for_the_list_at_once_cost_as_much_as_one(tmp_path: Path, m
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
 def test_a_link_on_another_site_starts_nothing(site: str) -> None:
-    """It has no origin: a browser says where it stood. ``same-site`` is another port of this machine, too."""
+    """It has no origin: a browser says where the link was. ``same-site`` includes other ports of this machine."""
     told = [(b"host", b"127.0.0.1:8123"), (b"sec-fetch-site", site.encode())]
     for path in ("/api/recordings/a.mcap/report", "/api/recordings", "/api/drones", "/static/page.js"):
         assert "another page" in foreign("http", "GET", told, NAMES, path)
     assert foreign("websocket", "GET", told, NAMES, "/ws/overview")
-    assert foreign("http", "GET", told, NAMES, "/") == "", "a link to the page itself is welcome"
+    assert foreign("http", "GET", told, NAMES, "/") == "", "a link to the page itself is allowed"
     for own in (b"same-origin", b"none"):
         told = [(b"host", b"127.0.0.1:8123"), (b"sec-fetch-site", own)]
         assert foreign("http", "GET", told, NAMES, "/api/recordings/a.mcap/report") == ""

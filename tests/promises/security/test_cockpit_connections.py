@@ -1,4 +1,4 @@
-"""Who opens connections to the cockpit and says nothing, or too many, takes nothing from people who are logged in."""
+"""Clients that open connections to the cockpit and say nothing, or open too many, do not affect logged-in users."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ import pytest
 from websockets.sync.client import connect as open_socket
 from websockets.typing import Origin
 
-DESCRIPTORS = 256  # that the cockpit may have open, so that a test need not open thousands
+DESCRIPTORS = 256  # the cockpit's limit, so that a test need not open thousands
 HALF_OPEN = 400
 
 
 @pytest.fixture
 def cockpit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[str, Callable[[], str]]]:
-    """A cockpit with few descriptors: its address, and what it wrote to its standard error."""
+    """A cockpit with few descriptors: its address, and its output to standard error."""
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
     command = f"ulimit -n {DESCRIPTORS}; exec {sys.executable} -m skyloop.cockpit"
     with tempfile.TemporaryFile() as said:
@@ -64,9 +64,9 @@ def test_half_open_requests_neither_silence_a_page_nor_keep_a_new_one_out(
         for _ in range(HALF_OPEN):
             half = held.enter_context(socket.create_connection((host, int(port)), 5))
             half.send(b"GET / HTTP/1.1\r\nHost: ")
-        # Those that wait in the kernel's queue for descriptors to get free would be asked after them.
-        assert json.loads(page.recv(3))["type"] == "overview", "a page goes on"
-        assert ask(address, "/api/session")["role"] == "pilot", "and another one comes in"
+        # Those that wait in the kernel's queue for free descriptors would be served after them.
+        assert json.loads(page.recv(3))["type"] == "overview", "a page keeps working"
+        assert ask(address, "/api/session")["role"] == "pilot", "another page can connect"
         fresh = held.enter_context(open_socket(f"{address.replace('http', 'ws')}/ws/overview", origin=Origin(address)))
         assert json.loads(fresh.recv(3))["type"] == "overview"
-    assert len(complaints().splitlines()) < 20, "a flood is told in few words"
+    assert len(complaints().splitlines()) < 20, "a flood causes few log lines"

@@ -1,4 +1,4 @@
-"""A program that draws or logs under thousands of names takes neither a page's pictures nor the event loop."""
+"""A program that draws or logs under thousands of names blocks neither a page's pictures nor the event loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def drawing(source: str, captured_ns: int = 5) -> Annotation:
 
 
 class Page:
-    """A socket that takes everything at once."""
+    """A socket that accepts everything at once."""
 
     def __init__(self) -> None:
         self.sent: list[str] = []
@@ -41,7 +41,7 @@ def video(page: Page, feed: EventFeed, counts: PageCounts) -> VideoSender:
     return sender
 
 
-def test_a_new_page_is_sent_few_drawings_in_pieces_and_gets_round_all() -> None:
+def test_a_new_page_gets_drawings_in_small_pieces_and_in_turn_all_of_them() -> None:
     drone, counts, page = FakeDrone(), PageCounts(), Page()
 
     async def main() -> None:
@@ -60,7 +60,7 @@ def test_a_new_page_is_sent_few_drawings_in_pieces_and_gets_round_all() -> None:
             drone.draw(drawing(f"source {number}"))
         beside = asyncio.create_task(others())
         await asyncio.sleep(0)
-        assert woken == [1], "the loop is told once of them all"
+        assert woken == [1], "the loop is woken once for all of them"
         sender = video(page, feed, counts)
         seen: set[str] = set()
         while len(seen) < MAX_SOURCES:
@@ -69,8 +69,8 @@ def test_a_new_page_is_sent_few_drawings_in_pieces_and_gets_round_all() -> None:
             await sender._send_drawings()
             assert page.sent
             assert sum(map(len, page.sent[:-1])) <= DRAWN_BYTES
-            assert steps - before >= len(page.sent), "others had their turn after each"
-            assert not seen & {json.loads(text)["source"] for text in page.sent}, "those first that wait for longest"
+            assert steps - before >= len(page.sent), "other tasks had their turn after each"
+            assert not seen & {json.loads(text)["source"] for text in page.sent}, "those that waited longest come first"
             seen |= {json.loads(text)["source"] for text in page.sent}
         page.sent.clear()
         await sender._send_drawings()
@@ -78,7 +78,7 @@ def test_a_new_page_is_sent_few_drawings_in_pieces_and_gets_round_all() -> None:
         assert feed.drawings.refused == SOURCES - MAX_SOURCES
         drone.draw(drawing("source 3", captured_ns=6))
         await sender._send_drawings()
-        assert [json.loads(text)["captured_ns"] for text in page.sent] == ["6"], "who was there first goes on"
+        assert [json.loads(text)["captured_ns"] for text in page.sent] == ["6"], "the older source continues"
         beside.cancel()
         feed.close()
 
@@ -86,7 +86,7 @@ def test_a_new_page_is_sent_few_drawings_in_pieces_and_gets_round_all() -> None:
     assert len(counts.sources) <= MAX_SOURCES
 
 
-def test_a_drawing_is_made_a_message_once_for_all_pages() -> None:
+def test_a_drawing_is_encoded_once_for_all_pages() -> None:
     drone, pages = FakeDrone(), [Page(), Page()]
 
     async def main() -> None:
@@ -100,7 +100,7 @@ def test_a_drawing_is_made_a_message_once_for_all_pages() -> None:
     assert pages[0].sent[0] is pages[1].sent[0]
 
 
-def test_what_is_old_makes_room() -> None:
+def test_old_drawings_make_room() -> None:
     clock = ManualClock()
     newest: Newest[str, int] = Newest(2, clock)
     for name in "abc":
@@ -131,7 +131,7 @@ def test_there_are_never_more_than_allowed_and_a_known_one_is_never_refused(step
         clock.advance(seconds)
 
 
-def test_series_that_are_logged_no_more_make_room_for_others() -> None:
+def test_series_no_longer_logged_make_room_for_others() -> None:
     clock, drone = ManualClock(), FakeDrone()
     listening = LogFeed(drone, clock)  # type: ignore[arg-type]
     listening.want(True)

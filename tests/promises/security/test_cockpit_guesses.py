@@ -1,4 +1,4 @@
-"""Guessing tokens is slow, and locks nobody out who has one."""
+"""Guessing tokens is slow, and does not lock out anyone who has one."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_each_wrong_token_of_an_address_waits_twice_as_long_up_to_a_limit() -> N
     assert wrong.count == 9
 
 
-def test_an_address_that_is_quiet_for_long_begins_anew() -> None:
+def test_an_address_that_is_quiet_for_long_starts_afresh() -> None:
     clock = ManualClock()
     wrong = WrongTokens(clock)
     for _ in range(5):
@@ -61,7 +61,7 @@ def test_many_addresses_together_wait_too() -> None:
     assert wrong.another("later") == FIRST_S
 
 
-def test_addresses_kept_in_mind_are_few(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_number_of_remembered_addresses_is_bounded(caplog: pytest.LogCaptureFixture) -> None:
     wrong = WrongTokens(ManualClock())
     for number in range(MAX_ADDRESSES + 10):
         wrong.another(f"{number}")
@@ -71,7 +71,7 @@ def test_addresses_kept_in_mind_are_few(caplog: pytest.LogCaptureFixture) -> Non
     assert sum("from a" in record.message for record in caplog.records) == 7, "1, 2, 4, … 64"
 
 
-def test_a_guesser_who_is_gone_is_named_as_that(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_guesser_that_is_gone_is_logged_as_such(caplog: pytest.LogCaptureFixture) -> None:
     gate = TokenGate(list[Token](), "c", ManualClock())
     assert gate.wrong_token_s({"client": None}) == FIRST_S
     assert gate.wrong_token_s({"client": ("10.0.0.1", 1)}) == FIRST_S
@@ -82,7 +82,7 @@ def test_a_guesser_who_is_gone_is_named_as_that(caplog: pytest.LogCaptureFixture
 
 
 @pytest.mark.parametrize("by", ["header", "login"])
-def test_a_guesser_gets_few_answers_and_the_right_token_is_taken_meanwhile(
+def test_a_guesser_gets_few_answers_while_the_right_token_is_accepted(
     by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Who gets a connection at all, what the proxy's end refuses by itself, and what a newer roster changes at once."""
+"""Admission to connections, refusals by the proxy's own end, and the immediate effects of a newer roster."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 @pytest.fixture(scope="module")
 def other_lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
-    """Somebody else's authority, which issues the same names."""
+    """A different authority, which issues the same names."""
     return make_lab(tmp_path_factory.mktemp("other") / "lab")
 
 
@@ -57,7 +57,7 @@ def rig(lab: Lab) -> Iterator[Rig]:
 
 
 def test_a_key_of_this_lab_connects(rig: Rig, lab: Lab) -> None:
-    """What the others are compared with."""
+    """The baseline for the tests below."""
     third_party(rig.endpoint, lab.folder("olga"), timeout_ms=SHORT_MS).close()
 
 
@@ -155,7 +155,7 @@ def test_another_drones_proxy_that_listens_as_this_one_is_not_found(lab: Lab, tm
 
 @pytest.fixture
 def joined(rig: Rig) -> Iterator[Callable[[str], Intruder]]:
-    """Intruders who have connected as they may, under their own names."""
+    """Intruders with the connections they are allowed, under their own names."""
     there: list[Intruder] = []
 
     def join(who: str) -> Intruder:
@@ -185,7 +185,7 @@ REQUESTS: dict[str, Callable[[Rig], AnyRequest]] = {
 def test_an_order_by_the_key_for_questions_is_refused_and_told(
     rig: Rig, joined: Callable[[str], Intruder], who: str, what: str
 ) -> None:
-    """The one key of an observer that reaches the proxy carries no orders, whoever sends them by it."""
+    """The one key by which an observer reaches the proxy carries no orders, whoever uses it."""
     intruder = joined(who)
     before = len(rig.bench.published(EventKind.COMMAND_REFUSED))
     told, holder = list(rig.bench.driver.told), rig.bench.proxy.handler.authority.holder
@@ -270,7 +270,7 @@ def test_our_ends_refuse_keys_of_another_role_or_name(rig: Rig, lab: Lab) -> Non
 
 
 def test_the_echoes_of_commands_are_seen_by_observers(rig: Rig) -> None:
-    """Not a secret: who flies how is published, as on one host; only the commands themselves can't be listened to."""
+    """Not a secret: commands of others are published, as on one host; only the original commands can't be read."""
     olga = rig.intruder("olga")
     olga.see()
     olga.listen(layout.topic(DRONE, COMMANDS))
@@ -287,7 +287,7 @@ def test_the_echoes_of_commands_are_seen_by_observers(rig: Rig) -> None:
 
 
 def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None:
-    """A pilot's command passes it, an observer's and one in another's name do not; the proxy trusts the router."""
+    """It forwards a pilot's command, but not an observer's or one in another's name; the proxy trusts the router."""
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     endpoint = f"quic/{place}?mixed_rel=1"
     identities = [entry.identity for entry in lab.roster.entries]
@@ -335,7 +335,7 @@ def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None
                     return (keys[-1], word) in heard  # noqa: B023  put last, so the others would have come before
 
                 wait_until(lambda: asked(b"first"), "a question arrives")
-                # By now it knows who has subscribed: before, a command may have gone nowhere, and a question not.
+                # By now it knows the subscribers: before, a command may have been lost, but not a question.
                 wait_until(lambda: asked(b"then"), "and another one")
             passed[who] = {key for key, _ in heard if key in (false, *keys)}
     mine = {who: {layout.upward(way, DRONE, who, "0" * 16) for way in ("command", "order", "ask")} for who in passed}

@@ -1,4 +1,4 @@
-"""Files that people are given: each is refused with words, in little time, whatever stands in it."""
+"""Files from others: each bad one is refused with a clear error, in little time, whatever it contains."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ONNX files that hold or fill the process that loads them, and what dependencies would report of their users."""
+"""ONNX files that block or fill the process that loads them, and reports that dependencies might send about users."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skyloop.vision.simulated import SIMULATED_WEIGHTS
 from tests.support.policies import write as write_policy
 
 pytestmark = pytest.mark.process
-TRY_ALONE = onnx.try_alone  # before the other tests' shortcut is in its place
+TRY_ALONE = onnx.try_alone  # taken before the other tests' shortcut replaces it
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +69,7 @@ def huge(path: Path) -> Path:
 
 
 def test_a_file_beside_a_network_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Python looks for modules in the working directory first, of a child process that is given its program there."""
+    """Python searches the working directory first for modules in a child process that gets its program there."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [one for one in sys.path if one])
     (tmp_path / "numpy.py").write_text("open('was_run', 'w')")
@@ -78,7 +78,7 @@ def test_a_file_beside_a_network_is_not_run(tmp_path: Path, monkeypatch: pytest.
     assert not (tmp_path / "was_run").exists()
 
 
-def test_who_is_allowed_less_loads_networks_all_the_same(tmp_path: Path) -> None:
+def test_a_user_with_low_limits_can_still_load_networks(tmp_path: Path) -> None:
     path = tmp_path / "policy.onnx"
     write_policy(path)
     program = (
@@ -100,17 +100,17 @@ def test_a_tensor_of_gigabytes_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [endless, huge])
-def test_weights_of_a_tracker_are_tried_alone_too(
+def test_weights_of_a_tracker_are_also_tried_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: Callable[[Path], Path]
 ) -> None:
-    """OpenCV loads them, which has limits of its own for some of this, and none for the rest."""
+    """OpenCV loads them, which has its own limits for some of this, and none for the rest."""
     pytest.importorskip("cv2")
     monkeypatch.setattr(onnx, "CPU_S", 4)
     with pytest.raises(FileFormatError, match=r"weights\.onnx (is refused|can't be loaded as the weights of)"):
         LearnedTracker(make(tmp_path / "weights.onnx"))
 
 
-def test_what_is_no_network_is_told_as_before(tmp_path: Path) -> None:
+def test_a_file_that_is_no_network_is_reported_as_before(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(FileFormatError, match=r"text\.onnx can't be loaded as an ONNX file: "):
         OnnxDetector(tmp_path / "text.onnx")
@@ -125,7 +125,7 @@ def test_networks_of_people_are_loaded_as_before(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not find_spec("onnxruntime"), reason="ONNX Runtime is not installed")
 def test_no_dependency_reports(tmp_path: Path) -> None:
-    """Each was imported, and a network loaded, in a home directory of its own: nothing but ours is in it."""
+    """Each was imported, and a network loaded, with an empty home directory: only our files are in it."""
     code = (
         "import skyloop, os; from skyloop.cli.doctor import _extras; list(_extras());"
         "from skyloop.vision import OnnxDetector; from skyloop.vision.simulated import SIMULATED_WEIGHTS;"

@@ -1,4 +1,4 @@
-"""Recordings that were made to do harm: none costs more than its own size explains, and none ends in a traceback."""
+"""Malicious recordings: none costs more than its own size explains, and none ends in a traceback."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def chunk(compression: str, packed: bytes, unpacked: int, *, start: int = 1, end
 
 
 def with_records(path: Path, flight: Path, *records: bytes) -> Path:
-    """A recording's metadata, these records, and no end, as a killed recorder leaves it."""
+    """A recording with its metadata, these records, and no end, as a killed recorder leaves it."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("skyloop")
@@ -71,7 +71,7 @@ def with_records(path: Path, flight: Path, *records: bytes) -> Path:
 
 
 def with_messages(path: Path, flight: Path, topic: str, *messages: bytes, log_ns: int = 1) -> Path:
-    """A whole recording with these messages of one channel, and the metadata of another."""
+    """A complete recording with these messages of one channel, and the metadata of another."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("skyloop")
@@ -118,7 +118,7 @@ def empty_messages() -> bytes:
 
 BOMBS = [zstd_zeros, zstd_that_lies, zstd_without_size, lz4_zeros, empty_records, empty_messages]
 
-# In a process of its own: memory is the greatest that it ever had.
+# In a separate process, as peak memory never decreases.
 _LOOK = """
 import resource, sys, time
 from skyloop.recording.reader import Recording
@@ -139,13 +139,13 @@ def test_a_small_file_takes_little_memory_and_time_whatever_it_unpacks_to(tmp_pa
     assert done.returncode == 0, done.stderr
     for path, line in zip(paths, done.stdout.splitlines(), strict=True):
         memory_kb, seconds, damaged = line.split("|")
-        assert damaged != "[]", f"{path.name} is told as damage"
+        assert damaged != "[]", f"{path.name} is reported as damaged"
         assert float(memory_kb) < 70_000, path.name
         assert float(seconds) < 2.0, path.name
 
 
 def test_what_recorders_write_is_within_the_limits(tmp_path: Path) -> None:
-    """Pictures and telemetry that never change: nothing real packs better."""
+    """Pictures and telemetry that never change: no real data compresses better."""
     still = cv2.imencode(".png", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
     for kind in (CompressionType.ZSTD, CompressionType.LZ4):
         plan = Plan(seconds=4.0, compression=kind, chunk_size=4 << 20, packed=lambda _: still)
@@ -156,7 +156,7 @@ def test_what_recorders_write_is_within_the_limits(tmp_path: Path) -> None:
         assert max(ratios) < scan.MAX_RATIO / 3
 
 
-def test_a_part_that_is_too_large_is_told_and_the_rest_is_read(tmp_path: Path, flight: Path) -> None:
+def test_a_part_that_is_too_large_is_reported_and_the_rest_is_read(tmp_path: Path, flight: Path) -> None:
     one = record(3, struct.pack("<HI", 9, 1) + b"s" + bytes(8))
     path = with_records(tmp_path / "x.mcap", flight, zstd_zeros(), chunk("", one, len(one)))
     recording = Recording.open(path)
@@ -196,7 +196,7 @@ def test_records_without_end_are_read_up_to_a_limit(
     assert "too many records" in recording.cut
 
 
-def test_messages_outside_of_chunks_are_read_in_parts(
+def test_messages_outside_chunks_are_read_in_parts(
     tmp_path: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scan, "_RUN", 1000)
@@ -242,7 +242,9 @@ def test_a_picture_is_refused_by_its_head(data: bytes, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     "data", [b"", b"BM" + bytes(60), b"II*\0" + bytes(60), b"P6 30000 30000 255\n", b"\xff\xd8\xff"]
 )
-def test_what_is_neither_jpeg_nor_png_does_not_come_to_a_decoder(data: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_data_that_is_neither_jpeg_nor_png_does_not_reach_a_decoder(
+    data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it came to the decoder"))
     with pytest.raises(FileFormatError, match="neither JPEG nor PNG"):
         decode_image(data, "frame 1", grey=False)
@@ -261,7 +263,9 @@ def test_the_head_tells_the_size_that_a_decoder_finds() -> None:
         assert why_not_decoded(data) == ""
         assert decode_image(data, "x", grey=False).shape == (48, 65, 3)
     filler = b"\xff\xe1\x00\x04\xff\xc0" + b"\x00junk" + b"\xff\xff\xfe\x00\x02"
-    assert image_size(jpeg(7, 5, filler=filler)) == (7, 5), "of the frame, not of what lies in another segment"
+    assert image_size(jpeg(7, 5, filler=filler)) == (7, 5), (
+        "the size of the frame, not of what another segment contains"
+    )
     assert MAX_PIXELS >= 7680 * 4320
 
 
@@ -305,7 +309,7 @@ VALUES = {
 
 
 def everything(path: Path, folder: Path) -> None:
-    """All that is done with a recording."""
+    """Every operation on a recording."""
     recording = Recording.open(path)
     describe(path)
     name = recording.drone().name
@@ -325,11 +329,11 @@ def everything(path: Path, folder: Path) -> None:
         try:
             act()
         except SkyloopError:
-            assert number < 3, "what is damaged can be recovered"
+            assert number < 3, "damaged recordings can be recovered"
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_values_that_nobody_can_work_with_are_counted_and_left_out(name: str, tmp_path: Path, flight: Path) -> None:
+def test_unusable_values_are_counted_and_left_out(name: str, tmp_path: Path, flight: Path) -> None:
     channel, message = VALUES[name]
     good = b'{"captured_ns":5,"published_ns":6,"seq":1}'
     messages = [good, message, message, good] if channel == "feedback" else [message]
@@ -337,7 +341,7 @@ def test_values_that_nobody_can_work_with_are_counted_and_left_out(name: str, tm
     everything(path, tmp_path)
 
 
-def test_a_message_of_no_time_that_can_be_told_is_left_out(tmp_path: Path, flight: Path) -> None:
+def test_a_message_with_an_invalid_time_is_left_out(tmp_path: Path, flight: Path) -> None:
     for log_ns in (0, MAX_NS, (1 << 64) - 1):
         path = with_messages(tmp_path / "x.mcap", flight, "/alpha/feedback", b'{"captured_ns":5}', log_ns=log_ns)
         (tmp_path / "recovered.mcap").unlink(missing_ok=True)
@@ -364,7 +368,7 @@ def test_a_message_of_no_time_that_can_be_told_is_left_out(tmp_path: Path, fligh
         ("unix_ns", '"yesterday"'),
     ],
 )
-def test_metadata_that_nobody_wrote_is_refused_with_words(key: str, value: str, tmp_path: Path, flight: Path) -> None:
+def test_invalid_metadata_is_refused_with_a_clear_error(key: str, value: str, tmp_path: Path, flight: Path) -> None:
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -398,7 +402,7 @@ def test_a_bad_file_is_a_row_with_its_reason(tmp_path: Path, flight: Path, monke
     assert "what nobody thought of" in describe(worse).problem
 
 
-def test_a_file_name_that_is_no_text_hides_no_other(
+def test_a_file_name_that_is_not_text_hides_no_other(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One name that was not UTF-8 emptied the whole list, in the cockpit and in the terminal."""
@@ -415,7 +419,7 @@ def test_a_file_name_that_is_no_text_hides_no_other(
     assert recordings._path("caf\\xe9.mcap").read_bytes() == flight.read_bytes()
 
 
-def test_the_terminals_list_tells_of_all(
+def test_the_terminals_list_shows_all(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def log(*words: str | Path) -> Ended:

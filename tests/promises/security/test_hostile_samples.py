@@ -1,8 +1,8 @@
-"""Samples with numbers, shapes and depths that nobody means: refused when they are decoded, or harmless to all who
-take them.
+"""Samples with meaningless numbers, shapes and depths: refused at decoding, or harmless to all
+receivers.
 
-Each sample that may travel is taken as it is, and what is in it is replaced by what a hostile program may put there.
-What the codec lets through goes to those who use it: the cockpit's feeds and the recorder's translation.
+Each kind of sample is taken, and its values are replaced by those that a hostile program may send. Samples that pass
+the codec go to its users: the cockpit's feeds and the recorder's translation.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def nested(depth: int) -> Any:
 
 
 def places(value: Any, path: tuple[int | str, ...] = ()) -> list[tuple[int | str, ...]]:
-    """Where something lies in a body, at any depth."""
+    """The path of each value in a body, at any depth."""
     inside = enumerate(value) if isinstance(value, list) else value.items() if isinstance(value, dict) else ()
     return [path, *(deeper for key, item in inside for deeper in places(item, (*path, key)))]
 
@@ -88,14 +88,14 @@ def put(value: Any, path: tuple[int | str, ...], hostile: Any) -> Any:
 
 
 class Ears:
-    """In a drone's place: gives what a feed listens with."""
+    """Stands in for a drone, and gives the listeners of a feed."""
 
     def on_command(self, function: Any, *, inline: bool) -> Any: ...
     def on_log(self, function: Any, *, inline: bool) -> Any: ...
 
 
 def consume(sample: Sample) -> None:
-    """All that is done with a sample when nobody can be asked whether it makes sense."""
+    """Everything done with a sample without a way to check whether it makes sense."""
     if isinstance(sample, Feedback):
         feedback_values(sample, 0)
         motion_values(sample)
@@ -185,7 +185,7 @@ def consume_result(payload: bytes) -> None:
     assert peak < MOST_BYTES
 
 
-def test_values_may_lie_in_one_another_only_so_deep() -> None:
+def test_values_may_be_nested_only_so_deep() -> None:
     deepest = nested(MAX_DEPTH)
     assert unpack(pack(deepest)) == deepest
     with pytest.raises(UsageError, match=f"more than {MAX_DEPTH} deep"):
@@ -223,12 +223,12 @@ def test_a_shape_that_is_not_that_of_the_values_is_refused(shape: tuple[int, ...
         {"text": "x" * 4097},
     ],
 )
-def test_a_log_entry_that_makes_no_sense_is_refused(changes: dict[str, Any]) -> None:
+def test_an_invalid_log_entry_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(DecodeError):
         decode(log_entry(**changes))
 
 
-def test_a_drawing_that_makes_no_sense_is_refused() -> None:
+def test_an_invalid_drawing_is_refused() -> None:
     good = Annotation("me", "front", 1, 320, 240, (Points(((1.0, 2.0),), (1, 2, 255)),))
     assert decode(encode(good)) == good
     for shape in (Points(((math.nan, 1.0),)), Points(((1.0, 1.0),), (256, 0, 0)), Points(((1.0, 1.0),), (-1, 0, 0))):
@@ -239,7 +239,7 @@ def test_a_drawing_that_makes_no_sense_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("part", "parts"), [(1, 1), (1, 0), (3, 2), (0, 1025)])
-def test_a_part_that_is_none_is_refused(part: int, parts: int) -> None:
+def test_an_invalid_share_is_refused(part: int, parts: int) -> None:
     with pytest.raises((DecodeError, ValueError)):
         decode(packet(12, ["detector", "front", part, parts, 1]))
     if parts <= 1024:
@@ -263,7 +263,7 @@ def test_any_text_is_a_request_for_video_or_refused(text: str) -> None:
 
 
 def test_parameters_of_a_driver_travel_whatever_their_bounds_are() -> None:
-    """They are no peer's: NaN and infinity in them are shown as they are."""
+    """They do not come from a peer: NaN and infinity in them are shown as they are."""
     reply = decode((Path(__file__).parents[2] / "data/packets/golden/reply-value.bin").read_bytes())
     assert isinstance(reply, Reply)
     parameter = Parameter("x", reply.body.parameter.type, math.inf, minimum=-math.inf)  # type: ignore[union-attr]

@@ -1,4 +1,4 @@
-"""The places of a proxy on its host: nobody who says nothing, or asks for many, keeps a pilot out; and no lock does."""
+"""A proxy's connections on its host: silent clients, clients that open many, and locks do not keep a pilot out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SERVER = "skyloop.transport.local.server"
 
 
 class Place:
-    """A server, and connections to it that know how to say nothing."""
+    """A server, and silent connections to it."""
 
     def __init__(self, stack: ExitStack) -> None:
         self.log = ServerLog()
@@ -46,7 +46,7 @@ class Place:
         return sock
 
     def admitted(self, *, pilot: bool) -> str:
-        """One more application that says who it is; why it can't stay."""
+        """Add an application that introduces itself; returns why it can't stay."""
         before = len(self.log.joined)
         self.raw(hello())
         wait_until(lambda: len(self.log.joined) > before, "it joined")
@@ -61,14 +61,14 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
 
 
 def word(sock: Socket) -> str:
-    """Why the server ended a connection."""
+    """The reason for which the server ended a connection."""
     message = parse(sock.recv(1000))
     assert isinstance(message, Bye)
     return message.reason
 
 
 @pytest.mark.parametrize("first", [(), (hello(),)], ids=["nothing", "no Hello"])
-def test_connections_that_say_nothing_keep_nobody_out(
+def test_silent_connections_keep_no_one_out(
     place: Place, monkeypatch: pytest.MonkeyPatch, first: tuple[bytes, ...]
 ) -> None:
     monkeypatch.setattr(f"{SERVER}.MAX_CLIENTS", 4)
@@ -80,7 +80,7 @@ def test_connections_that_say_nothing_keep_nobody_out(
     wait_until(lambda: len(place.log.joined) == known + 1, "the pilot is in")
     assert place.server.admit(place.log.joined[-1], pilot=True) == ""
     assert "its place at local:alpha went to a newer connection" in word(silent[0])
-    for _ in range(8):  # whatever goes on, who has said who it is stays
+    for _ in range(8):  # introduced clients stay, whatever else happens
         place.raw(*first)
     wait_until(lambda: len(place.server._connections) <= 4, "the others gave way to one another")
     assert client.send(b"still here")
@@ -101,7 +101,7 @@ def test_a_connection_without_its_first_packet_ends(place: Place, monkeypatch: p
     wait_until(lambda: len(place.server._connections) == 1, "nothing is left of the first")
 
 
-def test_a_connection_without_its_hello_is_ended_and_told() -> None:
+def test_a_connection_without_its_hello_is_ended_and_reported() -> None:
     with Bench() as bench:
         eye, silent = bench.join("eye"), bench.stranger()
         eye.sync()  # it is known by now
@@ -129,7 +129,7 @@ def test_one_process_does_not_get_all_places(place: Place, monkeypatch: pytest.M
 
 
 def test_one_other_user_does_not_get_all_places(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Members of a group are let in; that they are is shown elsewhere."""
+    """Members of a group are admitted; other tests show that they are."""
     monkeypatch.setattr(f"{SERVER}.MAX_PER_USER", 2)
     monkeypatch.setattr(f"{SERVER}.may_connect", lambda *_: True)
     pids = iter(range(100, 200))
@@ -138,7 +138,7 @@ def test_one_other_user_does_not_get_all_places(place: Place, monkeypatch: pytes
         place.admitted(pilot=True)
     assert "uid 54321 has 2 connections to local:alpha" in word(place.raw())
     monkeypatch.setattr(f"{SERVER}.credentials", lambda _: Credentials(next(pids), os.geteuid(), 0))
-    assert place.admitted(pilot=True) == "", "the proxy's own user is let in"
+    assert place.admitted(pilot=True) == "", "the proxy's own user is admitted"
 
 
 def test_observers_leave_places_for_pilots(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,7 +150,7 @@ def test_observers_leave_places_for_pilots(place: Place, monkeypatch: pytest.Mon
     assert place.admitted(pilot=True) == ""
 
 
-def test_an_observer_for_whom_there_is_no_place_is_refused() -> None:
+def test_an_observer_without_a_free_place_is_refused() -> None:
     with Bench() as bench:
         bench.server.admit = lambda peer, *, pilot: "" if pilot else "full"  # type: ignore[method-assign]
         app = bench.stranger()
@@ -160,8 +160,8 @@ def test_an_observer_for_whom_there_is_no_place_is_refused() -> None:
         assert isinstance(app.ask(Hello("pilot", Role.PILOT)), Welcome)
 
 
-def test_somebody_elses_lock_holds_nobody_up(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A member of a group can open the directory for reading, and lock it for as long as it likes."""
+def test_another_users_lock_delays_no_one(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A member of a group can open the directory for reading, and lock it as long as it likes."""
     group = grp.getgrgid(os.getegid()).gr_name
     monkeypatch.setenv("SKYLOOP_GROUP", group)
     bravo = LocalServer("bravo", group=group)
@@ -185,7 +185,7 @@ def test_somebody_elses_lock_holds_nobody_up(place: Place, monkeypatch: pytest.M
 
 
 def test_looking_waits_for_no_lock(place: Place) -> None:
-    """Not even the owner's: what a killed proxy left is then left until the next time."""
+    """Not even the owner's: what a killed proxy left then stays until the next time."""
     directory = find_directory()
     dead = directory.path / "dead.sock"
     with Socket() as sock:

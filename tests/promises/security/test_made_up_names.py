@@ -1,4 +1,4 @@
-"""Names that an application has made up (of topics, cameras, processors) are refused, and cost nothing that stays."""
+"""Names that an application invents (of topics, cameras, processors) are refused, and cost nothing permanent."""
 
 from __future__ import annotations
 
@@ -64,11 +64,11 @@ def test_what_exists_can_be_subscribed_to(topic: str) -> None:
         ),
     ],
 )
-def test_what_does_not_exist_is_refused_with_what_does(topic: str, words: str) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(topic: str, words: str) -> None:
     assert words in topic_problem(topic, lambda: CAMERAS)
 
 
-def test_who_asks_for_made_up_cameras_is_told_counted_and_in_the_end_disconnected(bench: Bench) -> None:
+def test_requests_for_made_up_cameras_are_answered_counted_and_finally_disconnected(bench: Bench) -> None:
     eye, bad = bench.join("eye"), bench.join("bad", Role.OBSERVER)
     bad.end.subscribe("video/made-up")
     bad.sync()
@@ -81,7 +81,7 @@ def test_who_asks_for_made_up_cameras_is_told_counted_and_in_the_end_disconnecte
     eye.sync()
 
 
-def test_a_connection_has_only_so_many_topics(bench: Bench) -> None:
+def test_the_number_of_topics_of_a_connection_is_bounded(bench: Bench) -> None:
     eye, bad = bench.join("eye"), bench.join("bad", Role.OBSERVER)
     for number in range(MAX_SUBSCRIPTIONS):
         bad.end.subscribe(f"results/detector-{number}")
@@ -90,7 +90,7 @@ def test_a_connection_has_only_so_many_topics(bench: Bench) -> None:
     assert f"exceeds the {MAX_SUBSCRIPTIONS} topics" in told[0].text
 
 
-def test_a_drawing_on_a_camera_that_is_none_reaches_nobody(bench: Bench) -> None:
+def test_a_drawing_on_a_missing_camera_reaches_no_one(bench: Bench) -> None:
     eye, bad = bench.join("eye"), bench.join("bad", Role.OBSERVER)
     eye.end.subscribe(ANNOTATIONS)
     for camera in ("made-up", "front"):
@@ -154,7 +154,7 @@ def test_made_up_cameras_over_the_network_make_no_threads(readers: Readers) -> N
     assert "known: bottom, front" in readers.video.problem(1, "video/made-up")
 
 
-def test_what_serves_a_reader_ends_with_it(readers: Readers) -> None:
+def test_resources_for_a_reader_end_with_it(readers: Readers) -> None:
     for round_ in range(3):
         for connection in range(5):
             for camera in CAMERAS:
@@ -168,22 +168,22 @@ def test_what_serves_a_reader_ends_with_it(readers: Readers) -> None:
     assert readers.video._variants == {}
 
 
-def test_forms_of_frames_are_bounded_and_the_usual_ones_always_to_be_had(readers: Readers) -> None:
+def test_the_forms_of_frames_are_bounded_but_the_usual_ones_always_available(readers: Readers) -> None:
     forms = [f"video/front?scale=0.{number:03}" for number in range(100, 200)]
     assert sum(readers.video.subscribe(0, form) for form in forms) == MAX_FORMS_EACH
     assert f"at most {MAX_FORMS_EACH} forms" in readers.video.problem(0, forms[-1])
     taken = sum(readers.video.subscribe(number, form) for number, form in enumerate(forms))
     assert taken <= MAX_FORMS
     assert f"at most {MAX_FORMS} forms" in readers.video.problem("new", forms[-1])
-    assert readers.video.subscribe("new", forms[1]), "one that there is costs nothing more"
+    assert readers.video.subscribe("new", forms[1]), "an existing one costs nothing more"
     for usual in ("video/front", "video/front?encoding=jpeg&quality=80"):
         assert readers.video.subscribe(0, usual)
         assert readers.video.subscribe("new", usual)
-    for part in range(50):  # a group of workers: together they take each frame once
+    for part in range(50):  # a group of workers, which together receive each frame once
         assert readers.video.subscribe(f"worker {part}", f"video/bottom?part={part}/50")
 
 
-# What a client remembers ---------------------------------------------------------------------------------------
+# A client's memory ---------------------------------------------------------------------------------------------
 
 
 class Ears:
@@ -193,7 +193,7 @@ class Ears:
     def check_open(self) -> None: ...
 
 
-def test_a_client_forgets_processors_that_nobody_here_asks_for() -> None:
+def test_a_client_forgets_processors_that_are_not_requested_here() -> None:
     channels = ResultChannels(Ears(), Scheduler(), FeedbackHistory())  # type: ignore[arg-type]
     channels.everything.add(lambda _: None, lambda: 0)
     channels.channel("mine").keep()
@@ -216,7 +216,7 @@ def test_a_slot_for_all_results_forgets_the_oldest_processors() -> None:
     assert slot.dropped == MAX_CHANNELS
 
 
-def test_a_good_application_is_told_nothing_of_this(bench: Bench) -> None:
+def test_a_good_application_is_not_affected(bench: Bench) -> None:
     app: App = bench.join("good")
     app.end.subscribe("video/front")
     app.end.subscribe("stream/front")

@@ -1,4 +1,4 @@
-"""However many connections, signs of life and bytes one key brings, the others find the drone, get in and fly."""
+"""However many connections, tokens and bytes one key brings, the others can find the drone, connect and fly."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def others_get_in(rig: Rig) -> None:
     assert Velocity(0.1) in rig.bench.driver.told
 
 
-def test_one_key_does_not_take_the_places_of_all(rig: Rig, olga: Intruder) -> None:
+def test_one_key_does_not_take_all_places(rig: Rig, olga: Intruder) -> None:
     got_in = sum(joins(rig, olga, layout.new_id()) for _ in range(MAX_CLIENTS))
     assert got_in == PER_KEY
     others_get_in(rig)
@@ -80,7 +80,7 @@ def test_one_key_does_not_take_the_places_of_all(rig: Rig, olga: Intruder) -> No
 
 
 def test_thousands_of_signs_of_life_hide_no_drone(rig: Rig) -> None:
-    try:  # Zenoh's "clients" are not let in any more: a peer passed on all that they declared, to everybody
+    try:  # Zenoh's "clients" are no longer admitted: a peer forwarded all that they declared to everyone
         session = third_party(rig.endpoint, rig._keys("olga") if rig._keys else None, timeout_ms=1000, mode="client")
     except zenoh.ZError:
         session = rig.intruder("olga").session
@@ -91,7 +91,7 @@ def test_thousands_of_signs_of_life_hide_no_drone(rig: Rig) -> None:
         assert len(held) == FLOOD
 
 
-def test_what_is_larger_than_any_packet_is_never_put_together(rig: Rig, olga: Intruder) -> None:
+def test_data_larger_than_any_packet_is_never_assembled(rig: Rig, olga: Intruder) -> None:
     assert olga.join()
     key = layout.upward(layout.ASK, DRONE, "olga", olga.id)
     strays = rig.server.strays
@@ -122,7 +122,7 @@ class HugeAttachment:
     attachment: Any = Huge()
 
 
-def test_what_is_too_large_is_refused_before_it_is_copied() -> None:
+def test_oversized_data_is_refused_before_it_is_copied() -> None:
     huge: Any = Huge()
     with pytest.raises(DecodeError, match="at most 4096"):
         packets.copied(huge, packets.MAX_OWN)
@@ -164,7 +164,7 @@ def test_three_keys_that_may_not_fly_leave_a_key_for_pilots_room() -> None:
 def test_signs_of_life_are_remembered_by_key() -> None:
     tokens = Tokens(by_key=True)
     assert sum(tokens.add("olga", str(n)) for n in range(2 * TOKENS_PER_KEY)) == TOKENS_PER_KEY
-    assert tokens.add("olga", "0"), "it is there already"
+    assert tokens.add("olga", "0"), "it is already known"
     assert tokens.add("jane", "a")
     assert tokens.any_of({"a": "jane", "b": "kim"})
     assert not tokens.has("olga", "a")
@@ -175,7 +175,7 @@ def test_signs_of_life_are_remembered_by_key() -> None:
     assert sum(everybody.add("anyone", str(n)) for n in range(2 * TOKENS)) == TOKENS
 
 
-def test_who_answers_for_one_name_a_thousand_times_hides_no_other() -> None:
+def test_answering_a_thousand_times_for_one_name_hides_no_other() -> None:
     many = [packets.ProxyInfo("bravo", f"{n:016x}", n, "", 1, "", "") for n in range(1000)]
     alpha = packets.ProxyInfo("alpha", "f" * 16, 10**6, "", 1, "", "")
     assert _oldest_of_each([*reversed(many), alpha]) == [*many[:RUNS_PER_NAME], alpha]

@@ -54,8 +54,8 @@ _numbers = itertools.count()
 
 
 def fly(bench: Bench, pilot: App) -> Command:
-    """Have a command of the pilot executed, which is what somebody records. No two commands are alike, so that the one
-    that was executed is this one; datagrams may be lost or overtaken."""
+    """Have a pilot's command executed, which the attacker records. No two commands are alike, so the executed one is
+    known, even if datagrams are lost or overtaken."""
     sent: list[Command] = []
 
     def executed() -> bool:
@@ -67,7 +67,7 @@ def fly(bench: Bench, pilot: App) -> Command:
 
 
 def wait_briefly(condition: Callable[[], bool]) -> bool:
-    """Whether it comes true soon: what is sent by datagrams is sent again if not."""
+    """Whether it becomes true soon; if not, data sent by datagrams is sent again."""
     deadline = time.monotonic() + 0.3
     while not condition():
         if time.monotonic() > deadline:
@@ -77,7 +77,7 @@ def wait_briefly(condition: Callable[[], bool]) -> bool:
 
 
 def send_until_refused(bench: Bench, sender: App, packet: bytes) -> str:
-    """Send bytes by an application's connection; returns why they were refused, as is told to all."""
+    """Send bytes over an application's connection; returns the published reason for their refusal."""
     before = len(bench.published(EventKind.COMMAND_REFUSED))
 
     def told() -> bool:
@@ -93,12 +93,12 @@ def send_until_refused(bench: Bench, sender: App, packet: bytes) -> str:
 
 @pytest.fixture
 def jane(bench: Bench) -> App:
-    """Who flies."""
+    """The pilot."""
     return bench.airborne("jane")
 
 
 def test_at_once_by_the_same_connection(bench: Bench, jane: App) -> None:
-    """Where packets come by two ways, the transport takes the second one for what it is and no event tells of it."""
+    """Where packets arrive by two paths, the transport recognises the second one as a duplicate, without an event."""
     recorded = fly(bench, jane)
     for _ in range(5):
         assert jane.end.send(encode(recorded))
@@ -116,7 +116,7 @@ def test_again_by_the_same_connection(bench: Bench, jane: App) -> None:
 
 
 def test_by_another_pilot_while_the_holder_flies(bench: Bench, jane: App) -> None:
-    """The lease in the packet is the one in force, and the packet is young: it is the connection that is wrong."""
+    """The packet has the current lease, and is recent: it is the connection that is wrong."""
     recorded = fly(bench, jane)
     eve = bench.join("eve")
     done = list(bench.driver.told)
@@ -181,7 +181,7 @@ def test_before_its_time(bench: Bench, jane: App) -> None:
 
 
 def test_from_before_the_failsafe(bench: Bench, jane: App) -> None:
-    """Young, in sequence, of the right lease: but the pilot was silent since it was asked for."""
+    """Recent, in sequence, with the right lease, but the pilot was silent after it was sent."""
     recorded = fly(bench, jane)
     bench.run(0.6)  # silence: the vehicle hovers
     assert bench.driver.told[-1] == Hover()
@@ -192,7 +192,7 @@ def test_from_before_the_failsafe(bench: Bench, jane: App) -> None:
 
 
 def test_an_emergency_stop_of_any_pilot_is_taken_however_old(bench: Bench, jane: App) -> None:
-    """On purpose: whoever sees that something goes wrong must be able to stop it. So a recorded one works, too."""
+    """On purpose: anyone who sees that something goes wrong must be able to stop it. So a recorded stop works, too."""
     fly(bench, jane)
     recorded = encode(Command(1, 99, 1, 1, EmergencyStop()))
     bob = bench.join("bob")

@@ -1,5 +1,5 @@
-"""Keys that are revoked while everything runs, and what the key of a router can do: by whichever way the newer roster
-has come, connections end, nobody new is let in, and nothing more can be read."""
+"""Keys that are revoked at run time, and the powers of a router's key. By whichever path the newer roster arrived,
+connections end, no one new is admitted, and nothing more can be read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lab(tmp_path: Path) -> Lab:
 
 @pytest.fixture
 def kept(lab: Lab, tmp_path: Path) -> Callable[[str], Path]:
-    """Everybody's keys; those of who is to be revoked as a thief has copied them."""
+    """Everyone's keys; the revoked user's as a thief has copied them."""
     stolen = {name: keys_of(lab, name, tmp_path / "stolen") for name in ("alpha", "hub", "olga", "eve")}
     return lambda name: stolen[name] if name in ("hub", "olga", "eve") else lab.folder(name)
 
@@ -61,12 +61,12 @@ def test_a_router_that_is_revoked_in_flight_does_no_harm(rig: Rig, lab: Lab) -> 
     rig.jane.sync()
     assert [deed.what for deed in HARM if deed.done(rig, hub)] == []
     rig.jane.command(Velocity(0.3))
-    assert rig.bench.driver.told[-1:] == [Velocity(0.3)], "the pilot flies on"
+    assert rig.bench.driver.told[-1:] == [Velocity(0.3)], "the pilot keeps flying"
     hub.close()
 
 
-def test_what_a_router_passes_on_is_taken_once_and_as_it_was(routed: Rig) -> None:
-    """It sees the sealed bytes. Sent again, or by another key or with another attachment, they have no effect."""
+def test_packets_forwarded_by_a_router_are_accepted_once_and_unchanged(routed: Rig) -> None:
+    """It sees the sealed bytes. Repeated, or sent with another key or attachment, they have no effect."""
     hub, connection = routed.intruder("hub"), routed.connection_of(routed.jane)
     passing: list[tuple[str, bytes, bytes]] = []
     hub.held.append(
@@ -105,8 +105,8 @@ def test_what_a_router_passes_on_is_taken_once_and_as_it_was(routed: Rig) -> Non
     hub.close()
 
 
-def test_who_is_revoked_can_read_nothing_more_while_the_others_see_on(rig: Rig, lab: Lab) -> None:
-    """Its own program goes on listening, and Zenoh's access control is that of the start."""
+def test_a_revoked_user_reads_nothing_more_while_the_others_continue(rig: Rig, lab: Lab) -> None:
+    """Its own program keeps listening, and Zenoh's access control is that of the start."""
     olga = rig.intruder("olga")
     olga.see()
     olga.listen(layout.topic(DRONE, FEEDBACK))
@@ -125,7 +125,7 @@ def test_who_is_revoked_can_read_nothing_more_while_the_others_see_on(rig: Rig, 
     wait_until(shut, "olga's connection is ended")
     bye = packets.bye("its key was revoked, or its rights were changed")
     wait_until(lambda: bye in [packet for _, packet in olga.got], "olga is told")
-    time.sleep(sealing.SWITCH_S)  # what is published in this time may still be read
+    time.sleep(sealing.SWITCH_S)  # data published in this time may still be read
     olga.got.clear()
     for number in range(20):
         rig.bench.driver.report(battery=0.5 + number / 100)
@@ -141,7 +141,7 @@ def test_who_is_revoked_can_read_nothing_more_while_the_others_see_on(rig: Rig, 
 
 
 def test_applications_leave_a_proxy_whose_key_is_revoked(tmp_path: Path) -> None:
-    """Only the application has the newer roster: the proxy's host is where the thief is."""
+    """Only the application has the newer roster: the thief is on the proxy's host."""
     lab = make_lab(tmp_path / "lab")
     stolen = keys_of(lab, "alpha", tmp_path / "stolen")
     with Rig(lambda name: stolen if name == "alpha" else lab.folder(name)) as rig:
@@ -152,8 +152,8 @@ def test_applications_leave_a_proxy_whose_key_is_revoked(tmp_path: Path) -> None
             fabric_dial(DRONE, rig.settings("jane"), find_s=0.5)(ClientLog())
 
 
-def test_a_connection_is_not_made_anew_to_who_was_revoked_meanwhile(tmp_path: Path) -> None:
-    """The dialer of a program that runs on goes by the roster of now, not by that of its start."""
+def test_no_new_connection_is_made_to_a_user_revoked_meanwhile(tmp_path: Path) -> None:
+    """The dialer of a running program uses the current roster, not that of its start."""
     lab = make_lab(tmp_path / "lab")
     copies = {name: keys_of(lab, name, tmp_path / "copies") for name in ("alpha", "kim")}
     with Rig(lambda name: copies.get(name, lab.folder(name))) as rig:
@@ -166,8 +166,8 @@ def test_a_connection_is_not_made_anew_to_who_was_revoked_meanwhile(tmp_path: Pa
                 dial(ClientLog())
 
 
-def test_an_application_goes_on_to_the_proxy_that_has_the_key(routed: Rig) -> None:
-    """Somebody else says first that it is the proxy, and answers who asks."""
+def test_an_application_moves_on_to_the_proxy_that_has_the_key(routed: Rig) -> None:
+    """An impostor says first that it is the proxy, and answers queries."""
     false = "0" * 16
     hub = routed.intruder("hub")
     key = layout.info(DRONE)
@@ -200,7 +200,7 @@ def test_a_connection_ends_with_its_key_though_a_router_lies_between(rig: Rig, m
     assert "expired" in rig.wendy.closed_by.get(timeout=10.0)
 
 
-def test_a_router_begins_anew_without_who_is_revoked(lab: Lab, kept: Callable[[str], Path]) -> None:
+def test_a_restarted_router_excludes_revoked_users(lab: Lab, kept: Callable[[str], Path]) -> None:
     """Others pass; the revoked pilot, who was linked, is denied everything."""
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     keys = load(keys_of(lab, "hub", lab.directory / "router"))
@@ -239,8 +239,8 @@ def test_a_router_begins_anew_without_who_is_revoked(lab: Lab, kept: Callable[[s
         release(session, linger=False)
 
 
-def test_commands_need_a_pilots_key_whatever_a_router_lets_pass(rig: Rig) -> None:
-    """An observer and a router work together: the proxy looks at whose connection it is."""
+def test_commands_need_a_pilots_key_whatever_a_router_forwards(rig: Rig) -> None:
+    """An observer and a router collude: the proxy checks whose connection it is."""
     olga, hub = rig.intruder("olga"), rig.intruder("hub")
     olga.see()
     key = layout.upward(layout.COMMAND, DRONE, "olga", olga.id)

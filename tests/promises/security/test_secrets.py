@@ -1,4 +1,4 @@
-"""Passwords and keys of an address never leave the vehicle's driver, by whatever way."""
+"""Passwords and keys in an address never leave the vehicle's driver by any path."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ CAMERA = f"rtsp://admin:{SECRET}@127.0.0.1:9/live"
         (f"video://rtsp://cam/live%3Ftoken={SECRET}", "video://rtsp://cam/live"),
         (f"video://http://cam/user=a&password={SECRET}/1", "video://http://cam/user=a&password=***/1"),
         (f"video://rtsp://cam/user=a_password={SECRET}_x.sdp", "video://rtsp://cam/user=a_password=***"),
-        # A password with a character that separates an address's parts, not encoded: where it ends is not known.
+        # A password with an unencoded character that separates an address's parts: its end is ambiguous.
         (f"video://rtsp://admin:{SECRET}?x@cam/live", "video://rtsp://***?***"),
         (f"video://rtsp://admin:123?{SECRET}@cam/live", "video://rtsp://***?***"),
         (f"mavlink://udp:?camera=rtsp://u:{SECRET}&x@cam/live", "mavlink://udp:?camera=rtsp://***&***"),
@@ -138,7 +138,7 @@ def test_the_error_about_a_camera_does_not_repeat_its_secrets() -> None:
 
 
 class Careless(Driver):
-    """Tells whatever its library says, with the address in it."""
+    """Repeats whatever its library says, including the address."""
 
     def __init__(self, *, opens: bool = True) -> None:
         super().__init__(parse_uri(f"video://{CAMERA}?camera=front"))
@@ -161,7 +161,7 @@ class Careless(Driver):
         raise ConnectionError(CAMERA)
 
 
-def test_what_a_library_says_of_the_address_is_told_without_the_secrets(tmp_path: Path) -> None:
+def test_a_librarys_messages_about_the_address_are_shown_without_the_secrets(tmp_path: Path) -> None:
     """Events, the link's reason, answers, feedback, the overview, Welcome and the audit trail, byte by byte."""
     server, audit = MemoryServer("careless"), tmp_path / "audit.jsonl"
     driver = Careless()
@@ -204,7 +204,7 @@ def test_a_recording_is_found_in_a_folder_that_looks_like_a_secret(path: str) ->
 
 
 def test_a_short_secret_hides_nothing_but_itself() -> None:
-    """Each of its letters was hidden in all that was told of the vehicle, and could be read from that."""
+    """Each of its letters was hidden in all texts about the vehicle, and could be read from that."""
     uri = parse_uri("mavlink://udp:0.0.0.0:14550?signing_key=ab&camera=rtsp://u:p@h/x")
     assert uri.scrub("up, not able to open rtsp://u:p@h/x") == "up, not able to open rtsp://h/x"
     assert uri.scrub("key ab, password p") == "key ***, password ***"
@@ -244,7 +244,7 @@ def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.process
 @pytest.mark.skipif(sys.platform != "linux", reason="reads command lines from /proc")
 @pytest.mark.usefixtures("sockets")
-def test_a_camera_with_a_password_is_flown_past_everybody_who_looks(tmp_path: Path) -> None:
+def test_a_camera_with_a_password_is_flown_without_showing_it_to_anyone(tmp_path: Path) -> None:
     """Real processes: ``ps``, ``skyloop list``, ``drone.uri``, events, a recording and its export."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         camera = f"rtsp://admin:{SECRET}@127.0.0.1:{silent.getsockname()[1]}/live"
@@ -263,7 +263,7 @@ def test_a_camera_with_a_password_is_flown_past_everybody_who_looks(tmp_path: Pa
 
 
 def _read(path: Path) -> bytes:
-    with suppress(OSError):  # it has ended meanwhile
+    with suppress(OSError):  # it may have ended meanwhile
         return path.read_bytes()
     return b""
 

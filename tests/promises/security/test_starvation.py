@@ -1,4 +1,4 @@
-"""A weak key, or a program that hangs, does not keep a pilot from flying: it is let go, and that is told."""
+"""A weak key, or a program that hangs, does not keep a pilot from flying: it is disconnected, and that is reported."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["sockets", "start"]  # fixtures
 pytestmark = pytest.mark.process
 LOCAL = "127.0.0.1"
 STALLED = 40  #: connections of one observer's key that stop reading
-GOES_ON = 24  #: commands that the pilot wants to see applied meanwhile, at 32 Hz
+GOES_ON = 24  #: commands that must be applied meanwhile, at 32 Hz
 #: Longest gap of the pilot's commands, and longest time that an emergency stop may take. Both take milliseconds, but
 #: the attack and its victims share few cores here; before, the gap was 10.6 s and the stop took 4.6 s.
 STARVED_S = 2.5
@@ -89,7 +89,7 @@ def test_observers_that_stop_reading_delay_no_command_and_no_emergency_stop(
         def let_go() -> list[str]:
             return [event.text for event in list(events) if "connection of stalled ended" in event.text]
 
-        # On a busy machine Zenoh gives their links up first, and they are gone by that.
+        # On a busy machine Zenoh may end their links first, which disconnects them, too.
         eventually(lambda: len(let_go()) == STALLED, "all that stopped reading were let go, and it was told", 30.0)
         stalled = sum("it took nothing" in text for text in let_go())
 
