@@ -162,7 +162,7 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover for good: nothing is steered from here afterwards.
+        """Hover permanently: nothing is steered from here afterwards.
 
         A vehicle without a native hover is left at a standstill, as far as a single set-point can achieve that.
         """

@@ -95,7 +95,7 @@ class Flight:
         self._state = FlightState.LANDED  # of a vehicle without a concept of flight, or of the steered task
         self._begun_ns = 0  # when the steered task began
         self._was_up = False  # the vehicle has reported to be in the air while steered
-        self._landed_ns: int | None = None  # since when it has reported to stand while steered
+        self._landed_ns: int | None = None  # since when it has reported standing while steered
         self._seen = False  # an altitude has been seen
         self._lowest, self._lowest_ns = math.inf, 0
         self._blind_ns: int | None = None  # since when a landing has had no sensor evidence

@@ -1,6 +1,6 @@
 """One thread that receives for many local transport servers; the others can leave it when one of them blocks it.
 
-A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call less, which is
+A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call fewer, which is
 better for one vehicle. For a hundred vehicles that makes two hundred threads that wake one another. Here, one thread
 waits for all connections (epoll), reads all available packets, and handles one packet of each connection in turn.
 Landings and stops come first, then set-points, then the rest; each class gets some turns, however busy the others are.
