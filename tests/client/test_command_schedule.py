@@ -325,7 +325,7 @@ def test_commands_given_while_the_link_was_down(age_s: float, kept: bool) -> Non
 
 @pytest.mark.parametrize("action", [Land(), FORWARD, Takeoff()])
 @pytest.mark.parametrize(("link_back_s", "fate"), [(0.0, Fate.AUTHORITY), (0.1, Fate.LINK)])
-def test_what_waited_long_for_the_lease_says_whether_the_link_was_lost_when_it_was_asked_for(
+def test_a_command_dropped_while_awaiting_the_lease_says_whether_its_link_was_lost(
     action: AnyAction, link_back_s: float, fate: Fate
 ) -> None:
     """It is never sent, but a caller who still waits for a landing may request it again; that one is sent if only the

@@ -137,7 +137,7 @@ def test_authority_messages_of_older_ends(name: str, known: Sample) -> None:
 
 
 @pytest.mark.parametrize("for_s", [0.0, -1.0, 86_401.0, math.nan, math.inf])
-def test_a_time_that_makes_no_sense_is_refused(for_s: float) -> None:
+def test_an_invalid_time_is_refused(for_s: float) -> None:
     with pytest.raises(DecodeError, match=r"86400|Expected"):
         decode(encode(Request(1, RequestAuthority(for_s=for_s))))
 

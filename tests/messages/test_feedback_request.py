@@ -45,7 +45,7 @@ def test_a_union_covers_both_requests_and_no_more(one: FeedbackRequest, other: F
 
 
 @pytest.mark.parametrize("max_hz", [0.0, -1.0, math.nan, math.inf, 1001, 1e-300, True, "5"])
-def test_a_rate_that_makes_no_sense(max_hz: Any) -> None:
+def test_an_invalid_rate(max_hz: Any) -> None:
     with pytest.raises(UsageError, match=r"max_hz is .* and must be from 0\.001 to 1000 samples a second"):
         FeedbackRequest(max_hz)
 

@@ -214,7 +214,7 @@ def test_the_computers_own_sleep_is_measured() -> None:
     assert -(10**9) < slept_ns() < 10 * 365 * 24 * 3600 * 10**9
 
 
-def test_the_pilot_is_told_when_an_attitude_vehicle_drifts() -> None:
+def test_the_pilot_is_warned_when_an_attitude_vehicle_drifts() -> None:
     """It went level when its velocity was lost, and silently flew on at its speed."""
     bench = Bench(ATTITUDE)
     bench.driver.answers = False

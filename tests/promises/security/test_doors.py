@@ -62,7 +62,7 @@ def test_a_key_of_this_lab_connects(rig: Rig, lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["quic", "quic-mixed", "tls", "tcp", "udp"])
-def test_without_a_key_nobody_connects(rig: Rig, lab: Lab, scheme: str) -> None:
+def test_a_client_without_a_key_does_not_connect(rig: Rig, lab: Lab, scheme: str) -> None:
     endpoint = rig.endpoint if scheme == "quic-mixed" else f"{scheme}/{rig.place}"
     with pytest.raises(zenoh.ZError):
         third_party(endpoint, None, authority=lab.folder("olga") / "ca.pem", timeout_ms=SHORT_MS)
@@ -80,7 +80,7 @@ def test_an_expired_key_does_not_connect(rig: Rig, lab: Lab) -> None:
         third_party(rig.endpoint, lab.folder("old"), timeout_ms=SHORT_MS)
 
 
-def test_somebody_elses_certificate_without_its_key_does_not_connect(rig: Rig, lab: Lab, tmp_path: Path) -> None:
+def test_anothers_certificate_without_its_key_does_not_connect(rig: Rig, lab: Lab, tmp_path: Path) -> None:
     mixed = keys_of(lab, "olga", tmp_path)
     (mixed / "identity.pem").write_bytes((lab.folder("jane") / "identity.pem").read_bytes())
     with pytest.raises(zenoh.ZError):
@@ -100,7 +100,7 @@ def test_a_link_ends_with_its_key(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("who", ["kim", "olga"])
-def test_nobody_connects_to_a_pilot_or_an_observer_who_listens_as_if_it_were_a_proxy(lab: Lab, who: str) -> None:
+def test_no_one_connects_to_a_pilot_or_an_observer_that_poses_as_a_proxy(lab: Lab, who: str) -> None:
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     config = zenoh.Config()
     folder = lab.folder(who)
@@ -182,7 +182,7 @@ REQUESTS: dict[str, Callable[[Rig], AnyRequest]] = {
 
 @pytest.mark.parametrize("what", [*ORDERS, *REQUESTS])
 @pytest.mark.parametrize("who", ["olga", "bob", "kim"])
-def test_an_order_by_the_key_for_questions_is_refused_and_told(
+def test_an_order_by_the_key_for_questions_is_refused_and_reported(
     rig: Rig, joined: Callable[[str], Intruder], who: str, what: str
 ) -> None:
     """The one key by which an observer reaches the proxy carries no orders, whoever uses it."""
@@ -201,7 +201,7 @@ def test_an_order_by_the_key_for_questions_is_refused_and_told(
     assert rig.bench.proxy.parameters.get("limits.tilt").value != 0.0567
 
 
-def test_recorded_bytes_by_another_pilots_own_connection_are_refused_and_told(
+def test_recorded_bytes_by_another_pilots_own_connection_are_refused_and_reported(
     rig: Rig, joined: Callable[[str], Intruder]
 ) -> None:
     kim = joined("kim")
@@ -213,7 +213,7 @@ def test_recorded_bytes_by_another_pilots_own_connection_are_refused_and_told(
     assert rig.bench.driver.told == told
 
 
-def test_commands_of_a_connection_that_never_was_are_refused_and_told(rig: Rig) -> None:
+def test_commands_of_a_connection_that_never_existed_are_refused_and_reported(rig: Rig) -> None:
     before = len(rig.bench.published(EventKind.COMMAND_REFUSED))
     told = list(rig.bench.driver.told)
     kim = rig.intruder("kim")
@@ -234,7 +234,7 @@ def test_commands_of_a_connection_that_never_was_are_refused_and_told(rig: Rig) 
 # What a newer roster changes at once ---------------------------------------------------------------------------
 
 
-def test_who_is_revoked_in_flight_loses_the_drone_and_does_not_come_back(tmp_path: Path) -> None:
+def test_a_client_revoked_in_flight_loses_the_drone_and_does_not_come_back(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "lab")
     with Rig(lab.folder) as rig:
         ring = rig.server._settings.ring

@@ -43,7 +43,7 @@ def bench() -> Iterator[Bench]:
     "topic",
     [*sorted(PLAIN), "results/detector-1.b", "video/front", "stream/bottom", "video/front?encoding=jpeg&quality=80"],
 )
-def test_what_exists_can_be_subscribed_to(topic: str) -> None:
+def test_existing_topics_can_be_subscribed_to(topic: str) -> None:
     assert topic_problem(topic, lambda: CAMERAS) == ""
 
 

@@ -151,7 +151,7 @@ def present(**counts: tuple[int, bool]) -> list[tuple[str, bool]]:
         ("jane", True, present(**{f"o{n}": (PER_KEY, n == 0) for n in range(4)}), f"at most {MAX_CLIENTS}"),
     ],
 )
-def test_who_gets_a_place(who: str, flies: bool, here: list[tuple[str, bool]], why: str) -> None:
+def test_the_allocation_of_connections(who: str, flies: bool, here: list[tuple[str, bool]], why: str) -> None:
     answer = no_place_reason(who, flies, here)
     assert bool(answer) == bool(why)
     assert why in answer

@@ -132,7 +132,7 @@ def test_by_an_observer(bench: Bench, jane: App) -> None:
     assert bench.driver.told == done
 
 
-def test_by_somebody_who_did_not_say_hello(bench: Bench, jane: App) -> None:
+def test_by_a_client_without_a_hello(bench: Bench, jane: App) -> None:
     recorded = fly(bench, jane)
     stranger = bench.stranger()
     stranger.name = f"application {jane.app_id + 1}"
@@ -152,7 +152,7 @@ def test_by_the_same_pilot_under_a_later_lease(bench: Bench, jane: App) -> None:
     assert bench.driver.told == done
 
 
-def test_when_nobody_flies(bench: Bench, jane: App) -> None:
+def test_while_no_one_flies(bench: Bench, jane: App) -> None:
     recorded = fly(bench, jane)
     jane.end.close()
     wait_until(lambda: bench.published(EventKind.AUTHORITY_LOST), "jane has gone")

@@ -92,7 +92,7 @@ def test_an_address_is_shown_without_its_secrets(given: str, shown: str) -> None
             msgspec.json.encode(uri)
 
 
-def test_only_what_opens_the_vehicle_gets_the_secret(tmp_path: Path) -> None:
+def test_only_the_code_that_opens_the_vehicle_gets_the_secret(tmp_path: Path) -> None:
     video = video_options(parse_uri(f"video://{CAMERA}"))
     assert video.source is not None
     assert video.source.name == CAMERA
