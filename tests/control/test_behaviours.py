@@ -175,7 +175,7 @@ def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleTyp
         assert pilot.passed == 0
         assert not pilot.done
         assert math.dist(after[:2], before[:2]) < 0.3, "it turns on the spot"
-        assert "gates: searching the gate" in told
+        assert "gates: searching for the gate" in told
         assert drawn
         assert drawn[-1].source == "gates"
 

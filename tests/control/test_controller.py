@@ -240,8 +240,8 @@ class Steering(Controller):
 def test_a_misspelt_callback_is_named(drone: Drone) -> None:
     summary = Misspelt(drone).run(seconds=0)
     assert summary.notes == (
-        "Misspelt.onframe is called by nobody: is on_frame meant?",
-        "Misspelt.on_feedbacks is called by nobody: is on_feedback meant?",
+        "Misspelt.onframe is never called: did you mean on_frame?",
+        "Misspelt.on_feedbacks is never called: did you mean on_feedback?",
     )
     assert str(summary).splitlines()[1] == f"note: {summary.notes[0]}"
     nothing = "Empty has none of on_feedback, on_frame, on_result: nothing was called"
@@ -257,7 +257,7 @@ def test_a_forgotten_take_off_is_named(proxy: ScriptedProxy, drone: Drone, state
     if state is FlightState.FLYING:
         assert notes == ()
     else:
-        assert notes == ("it never took off: set-points went to a drone on the ground; call drone.takeoff() before",)
+        assert notes == ("the drone never took off, so its set-points had no effect: call drone.takeoff() first",)
 
 
 def test_limited_set_points_are_told_by_limit_and_number(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -128,7 +128,7 @@ def test_who_does_not_get_through_gives_up() -> None:
     for _ in range(300):
         world.velocity, world.flown = Velocity(), np.zeros(3)  # held by something
         world.step(visible=False)
-    assert world.law.stuck == "it does not get through"
+    assert world.law.stuck == "the vehicle does not get through the gate"
 
 
 def test_before_feedback_it_stays() -> None:

@@ -90,7 +90,7 @@ def test_holds_its_place_and_says_so_when_the_velocity_is_not_known(
     follower.on_frame(frame(now + 1_000_000_000, [(7, [0.3, 0.0, 2.5])]))
     assert drone.told[-2:] == [
         ("follow: the vehicle's velocity is not known: hovering", Severity.WARNING),
-        ("follow: the vehicle's motion is known again: flying on", Severity.INFO),
+        ("follow: the vehicle's motion is known again: continuing", Severity.INFO),
     ]
 
 

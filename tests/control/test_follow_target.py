@@ -130,7 +130,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
         ({"box": box, "mode": None}, "mode is None"),
         ({"box": box, "detector": 7}, "detector is 7 and must have detect"),
-        ({"box": (math.nan, 1, 20, 20)}, "must be of finite numbers"),
+        ({"box": (math.nan, 1, 20, 20)}, "must consist of finite numbers"),
         ({"box": (1, 2, 3)}, "must be x, y, width and height"),
         ({"box": "here"}, "must be x, y, width and height"),
         ({"box": 4}, "must be x, y, width and height"),
@@ -310,7 +310,7 @@ def test_the_behaviour_flies_tells_and_ends_after_the_loss() -> None:
     assert drone.hovers == 1
     assert drone.told == [
         ("follow target: following", Severity.INFO),
-        ("follow target: hidden: on by its last motion", Severity.WARNING),
+        ("follow target: hidden: following its predicted motion", Severity.WARNING),
         ("follow target: lost: hovering where it went out of sight", Severity.WARNING),
         ("follow target: lost: looking around", Severity.WARNING),
         ("follow target: lost for too long: given up", Severity.WARNING),

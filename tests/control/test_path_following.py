@@ -130,7 +130,7 @@ def test_another_source_of_positions_and_its_loss(how: str) -> None:
         assert flight.done
         texts = [event.text for event in drone.recent_events()]
         assert "the position is not known: hovering" in texts
-        assert "the position is known again: flying on" in texts
+        assert "the position is known again: continuing" in texts
         assert flight.error.rms_m < 0.2
 
 

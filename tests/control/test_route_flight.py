@@ -152,5 +152,5 @@ def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path, monkeypatc
         with pytest.raises(UnknownNameError, match="rear"):
             save_photo(drone, tmp_path, TakePhoto(1, "rear"))
         (tmp_path / "file").touch()
-        with pytest.raises(UsageError, match="can't be made"):
+        with pytest.raises(UsageError, match="can't be created"):
             save_photo(drone, tmp_path / "file", TakePhoto(1, None))

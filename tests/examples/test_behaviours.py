@@ -49,7 +49,7 @@ def test_an_example_is_short_and_says_how_to_run_it(name: str) -> None:
 
 def test_gates(run: Run) -> None:
     printed = run("fly_gates")
-    assert "through gate 1, on to gate 2" in printed
+    assert "through gate 1, next is gate 2" in printed
     assert printed.splitlines()[-1] == "passed 5 of 5 gates"
 
 
