@@ -93,7 +93,7 @@ def test_grey_images_are_coloured(made: list[Network], weights: Path) -> None:
 def test_weights_of_another_network(made: list[Network], weights: Path) -> None:
     tracker = LearnedTracker(weights)
     made[0].broken = True
-    with pytest.raises(FileFormatError, match=r"weights\.onnx does not work as the weights of TrackerVit: .*layer"):
+    with pytest.raises(FileFormatError, match=r"weights\.onnx does not work as weights of TrackerVit: .*layer"):
         tracker.start(IMAGE, (10, 20, 30, 40))
     with pytest.raises(UsageError, match="was not started"):
         tracker.update(IMAGE)

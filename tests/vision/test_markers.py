@@ -153,7 +153,7 @@ def test_a_detector_of_the_wrong_dictionary_says_which_tags_it_saw() -> None:
         assert detector.detect(image, INTRINSICS) == []
     others = "7 of 6x6_50, 60 of 6x6_100"
     nothing = "no marker of 4x4_50 was found in 80 images"
-    assert detector.why_nothing() == f"{nothing}, but others were, of other dictionaries: {others}"
+    assert detector.why_nothing() == f"{nothing}, but markers of other dictionaries were: {others}"
     right = MarkerDetector("6x6_250")
     right.detect(image, INTRINSICS)
     assert right.why_nothing() == ""
@@ -164,4 +164,4 @@ def test_a_detector_that_sees_nothing_says_so_after_some_images() -> None:
     assert detector.why_nothing() == ""
     for _ in range(100):
         detector.detect(empty, INTRINSICS)
-    assert detector.why_nothing().startswith("no marker of 4x4_50 was found in 100 images, nor one of another")
+    assert detector.why_nothing().startswith("no marker of 4x4_50 was found in 100 images, nor of another")

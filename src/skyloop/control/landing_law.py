@@ -1,7 +1,7 @@
 """Land on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
 A filter of straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. The vehicle flies to
-where the marker will be when the set-point takes effect, with the marker's velocity and acceleration, based on the vehicle's
+where the marker will be when the set-point takes effect, with the marker's velocity and acceleration, by the vehicle's
 predicted motion (:mod:`.response`). It descends while inside a cone over the marker, as in Saripalli, Montgomery and
 Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003; outside the cone it keeps its
 height, or climbs to see more, and closes up first. The last part, where the marker no longer fits into the image, is
