@@ -161,7 +161,7 @@ def test_places(where: str, found: tuple[str, int]) -> None:
 
 @pytest.mark.parametrize("where", ["", "x", ":", ":80", "127.0.0.1", "127.0.0.1:", "1:65536", "-1", "٣"])
 def test_places_that_are_none(where: str) -> None:
-    with pytest.raises(UsageError, match="is no place for metrics"):
+    with pytest.raises(UsageError, match="is not an address for metrics"):
         serve(list, where)
 
 
@@ -178,7 +178,7 @@ def test_beyond_loopback_there_is_a_warning() -> None:
         pass
     with serving_beside("0", said.append)([]):
         pass
-    assert "WARNING: whoever reaches this address can read them" in said[0]
+    assert "WARNING: anyone who reaches this address can read them" in said[0]
     assert "WARNING" not in said[1]
 
 

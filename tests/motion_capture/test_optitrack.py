@@ -67,7 +67,7 @@ def test_a_server_that_stops_is_told_and_a_frozen_pose_never_given(server: Proce
         told: list[str] = []
         with capture.on_event(lambda event: told.append(event.text)):
             server.signal(signal.SIGSTOP)
-            wait_until(lambda: "alpha is not tracked any more" in told, "it was told")
+            wait_until(lambda: "alpha is no longer tracked" in told, "it was told")
             assert capture.pose("alpha") is None
             assert capture.state("alpha") is TrackState.LOST
             server.signal(signal.SIGCONT)

@@ -51,7 +51,7 @@ def test_addresses(address: str, kind: str, up: str, configuration: dict[str, st
     [
         ("host", "no motion capture system"),
         ("vicon:host", "no motion capture system"),
-        ("vicon://", "names no host"),
+        ("vicon://", "has no host"),
         ("vikon://h", "did you mean 'vicon'"),
         ("vicon://h?latncy=1", "did you mean 'latency'"),
         ("vicon://h?latency=nan", "latency is 'nan'"),
@@ -181,7 +181,7 @@ def test_the_mean_turn_is_that_of_the_middle() -> None:
 
 @pytest.mark.parametrize(("noise_m", "noise_rad"), [(0.01, 0.001), (0.0002, 0.05)])
 def test_a_calibration_of_what_moves_is_refused_with_its_spread(noise_m: float, noise_rad: float) -> None:
-    with pytest.raises(UsageError, match=r"spread by .* mm and .*°.*let it stand still"):
+    with pytest.raises(UsageError, match=r"spread by .* mm and .*°.*keep the drone still"):
         calibrate(at_rest(UPRIGHT, noise_m=noise_m, noise_rad=noise_rad))
     with pytest.raises(UsageError, match="too few"):
         calibrate(at_rest(UPRIGHT, count=5))

@@ -85,7 +85,7 @@ def test_a_proxy_that_ends_is_lost_tracking(proxy: Proxy) -> None:
         told: list[str] = []
         with capture.on_event(lambda event: told.append(event.text)):
             process.end()
-            wait_until(lambda: "alpha is not tracked any more" in told, "it was told")
+            wait_until(lambda: "alpha is no longer tracked" in told, "it was told")
         assert capture.pose("alpha") is None
 
 

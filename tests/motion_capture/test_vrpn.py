@@ -145,7 +145,7 @@ def test_a_server_that_invents_sensors_costs_no_memory() -> None:
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        ("vrpn://h/Rig", r"named in bodies, as \{'alpha': 'Rig'\}"),
+        ("vrpn://h/Rig", r"name the tracker in bodies, as \{'alpha': 'Rig'\}"),
         ("vrpn://h?sensor=-1", "sensor is '-1' and must be a whole number from 0"),
         ("vrpn://h?sensor=", "sensor is ''"),
         ("vicon://h?sensor=1", "sensor is for vrpn:// only"),

@@ -227,7 +227,7 @@ def test_a_refused_recalibration_keeps_the_calibration_in_force() -> None:
 
     with capture:
         calibrate(0.0)
-        with pytest.raises(UsageError, match="let it stand still"):
+        with pytest.raises(UsageError, match="keep the drone still"):
             calibrate(0.1)
         sources[0](RawFrame(monotonic_ns(), {"body": ((0.5, 0.0, 0.0), turned)}))
         pose = capture.pose("alpha")

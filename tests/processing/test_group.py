@@ -41,7 +41,7 @@ def test_children_are_summed_started_anew_and_ended() -> None:
         before = group.pids
         os.kill(before[0], signal.SIGKILL)
         wait_until(lambda: total(group) == 6 and group.pids[0] != before[0], "another one took its place")
-        assert told == ["worker 1 was killed by signal 9: the others have its share until it is restarted"]
+        assert told == ["worker 1 was killed by signal 9: the others process its share until it restarts"]
         pids = group.pids
     assert all(gone(pid) for pid in pids)
 

@@ -79,7 +79,7 @@ def test_a_bad_file_is_told(folder: Path, text: str, words: str) -> None:
 
 def test_a_class_that_is_no_processor(folder: Path) -> None:
     (folder / "bad.py").write_text("class A: ...\n")
-    with pytest.raises(UsageError, match="A is no processor: it has no method process"):
+    with pytest.raises(UsageError, match="A is not a processor: it has no method process"):
         load_processor("bad.py:A")
 
 
@@ -91,9 +91,9 @@ def test_a_class_that_is_no_processor(folder: Path) -> None:
             UsageError,
             "there is no file nowhere.py: give a Python file with a class with a method process",
         ),
-        ("detector", UsageError, "'detector' names no processor: give module:Class, file.py:Class or file.py"),
-        (":Detector", UsageError, "names no processor"),
-        ("no_such_module:Detector", UsageError, "there is no module no_such_module here or where Python looks"),
+        ("detector", UsageError, "'detector' is not a processor: give module:Class, file.py:Class or file.py"),
+        (":Detector", UsageError, "is not a processor"),
+        ("no_such_module:Detector", UsageError, "there is no module no_such_module here or on Python's path"),
         ("broken_module:Detector", FileFormatError, "module broken_module: ZeroDivisionError"),
         ("lacking_module:Detector", FileFormatError, "module lacking_module: No module named 'not_there_at_all'"),
     ],

@@ -48,8 +48,8 @@ def test_several_together() -> None:
     both = together([one, two])
     assert both is not None
     assert (both.processes, both.parts, both.results, both.results_hz, both.age_s) == (2, 2, 7, 3.0, 0.1)
-    assert "2 of 2 processes at work" in str(both)
-    assert str(both).endswith("errors 0  not sendable 1  not sent 2")
+    assert "2 of 2 processes working" in str(both)
+    assert str(both).endswith("errors 0  unsendable 1  unsent 2")
     assert together([one]) is one
     assert together([]) is None
 

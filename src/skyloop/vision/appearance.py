@@ -202,7 +202,7 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Return whether a place clearly shows a look-alike; an exact twin is told by continuous tracking instead."""
+    """Return whether a place clearly shows a look-alike; an exact twin is distinguished only by tracking."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 

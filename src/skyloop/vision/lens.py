@@ -102,8 +102,8 @@ def undistort(
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
         intrinsics: Intrinsics of the camera; None takes the frame's.
-            balance: From 0, which shows only valid pixels, to 1, which shows everything that the camera saw, with black
-                around it.
+        balance: From 0, which shows only valid pixels, to 1, which shows everything that the camera saw, with black
+            around it.
 
     Returns:
         The image of an ideal pinhole camera, and that camera's intrinsics.
