@@ -252,7 +252,7 @@ def test_what_makes_no_sense_is_refused() -> None:
             FlyThroughGates(drone, [GateKind("grey", (100, 100, 100))])
         with pytest.raises(UsageError, match="give a Course"):
             FlyThroughGates(drone, settings=CourseSettings())
-        with pytest.raises(UsageError, match="not by GateSettings"):
+        with pytest.raises(UsageError, match="not GateSettings"):
             FlyThroughGates(drone, RACE_TRACK, settings=GateSettings())
         with pytest.raises(UnknownNameError, match="bottom"):
             LandOnMarker(drone)
@@ -274,7 +274,7 @@ def test_a_course_is_that_of_a_world_by_the_names_of_its_gates() -> None:
     assert course.start == RACE_TRACK.start
     with pytest.raises(UsageError, match="has no gate 1, gate 2"):
         course_in(geometry_of(load_world("empty")))
-    with pytest.raises(UsageError, match="each needs one"):
+    with pytest.raises(UsageError, match="each gate needs one place"):
         replace(RACE_TRACK, places=RACE_TRACK.places[:1])
     with pytest.raises(UsageError, match="has no start"):
         course_in(msgspec.structs.replace(geometry_of(load_world("race0")), starts=()))

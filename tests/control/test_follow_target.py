@@ -126,7 +126,7 @@ def test_what_makes_no_sense_is_refused() -> None:
     detector = simulated_detector()
     box = (100.0, 50.0, 40.0, 90.0)
     bad: list[tuple[dict[str, Any], str]] = [
-        ({"class_name": "person"}, "a detector is needed"),
+        ({"class_name": "person"}, "needs a detector"),
         ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
         ({"box": box, "mode": None}, "mode is None"),
         ({"box": box, "detector": 7}, "detector is 7 and must have detect"),

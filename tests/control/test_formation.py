@@ -68,8 +68,8 @@ def test_a_shape_is_turned_and_moved() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda: line(0, 1.0), "at least one place"),
-        (lambda: line(2.5, 1.0), "at least one place"),  # type: ignore[arg-type]
+        (lambda: line(0, 1.0), "at least one position"),
+        (lambda: line(2.5, 1.0), "at least one position"),  # type: ignore[arg-type]
         (lambda: line(2, 0.0), "spacing_m is 0.0"),
         (lambda: circle(2, math.nan), "spacing_m is nan"),
         (lambda: vee(2, 1.0, angle=0.5), "angle is 0.5"),
@@ -78,9 +78,9 @@ def test_a_shape_is_turned_and_moved() -> None:
         (lambda: placed(line(2, 1.0), at=(0, 0, math.inf)), "three finite coordinates"),
         (lambda: places([(1, 2)]), r"shape \(n, 3\)"),
         (lambda: places([(1, 2, math.nan)]), "finite"),
-        (lambda: places("here"), "no array of places"),
+        (lambda: places("here"), "not an array of positions"),
         (lambda: assign(line(3, 1.0), line(2, 1.0)), "3 drones have only 2 places"),
-        (lambda: assign(line(2, 1.0), line(MOST + 1, 1.0)), "more than the 200"),
+        (lambda: assign(line(2, 1.0), line(MOST + 1, 1.0)), "at most 200"),
     ],
 )
 def test_what_makes_no_formation(wrong: Callable[[], object], words: str) -> None:

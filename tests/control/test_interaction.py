@@ -86,7 +86,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         interaction_matrix(np.zeros((2, 3)), np.ones(2))
     with pytest.raises(UsageError, match="above 0"):
         interaction_matrix(np.zeros((2, 2)), np.array([1.0, 0.0]))
-    with pytest.raises(UsageError, match="two points"):
+    with pytest.raises(UsageError, match="two or more points"):
         servo(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), FORWARD, 1.0)
     with pytest.raises(UsageError, match="tilted too far"):
         levelled(np.array([[0.0, 0.0]]), FORWARD, 0.0, math.pi / 2)

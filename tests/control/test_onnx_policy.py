@@ -172,7 +172,7 @@ def test_names_may_be_given_where_the_file_has_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"picture": "image"}, "must have one picture"),
+        ({"picture": "image"}, "must have one image"),
         ({"more": ["noise"]}, "the inputs .*noise"),
         ({"size": (1, 3, "height", 16)}, "must take float32"),
         ({"size": (1, 3, 5000, 16)}, "at most 4096"),

@@ -227,7 +227,7 @@ def test_the_same_place_twice_is_no_way() -> None:
 
 def test_what_it_cannot_do_is_said() -> None:
     with rehearse("sim://?world=empty&cameras=none&position=none") as drone:
-        with pytest.raises(UsageError, match=r"does not report its position: .*give the controller a source"):
+        with pytest.raises(UsageError, match=r"does not report its position: .*give the controller a position source"):
             FollowPath(drone, Circle((0, 0, 1), 0.5)).run(seconds=1.0)
         with pytest.raises(UsageError, match="no waypoint"):
             Waypoints(drone, [])

@@ -283,9 +283,9 @@ def test_the_head_and_the_ground_tell_the_range_of_a_person_whose_feet_are_not_s
 
 def test_a_filter_that_was_not_started_says_so() -> None:
     estimator, camera = TargetEstimator(), camera_at()
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator.at(0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator.update(view_of(camera, np.array([4.0, 0.0, 0.0])), camera, 0)
 
 

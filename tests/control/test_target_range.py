@@ -256,9 +256,9 @@ def test_a_box_in_another_direction_is_refused() -> None:
 
 def test_a_filter_that_was_not_started_says_so() -> None:
     view, camera = Watching(PERSON).view(0.0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator_of(None, None).at(0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator_of(None, None).update(view, camera, 0)
 
 

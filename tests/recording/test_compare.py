@@ -38,7 +38,7 @@ def test_a_timid_controller(flight: Path, other_flight: Path) -> None:
     assert fields["forward"].seconds == pytest.approx(1.1, abs=0.06)
     assert found.same_action == 1.0
     assert found.part_at_s == pytest.approx(0.51, abs=0.02)  # with the first velocity
-    assert found.aligned == "by their clock, which is the same"
+    assert found.aligned == "by their common clock"
     assert compare(Recording.open(flight), Recording.open(other_flight), part=0.3).part_at_s is None
 
 
@@ -78,7 +78,7 @@ def test_a_replay_knows_where_it_is(tmp_path: Path, flight: Path) -> None:
 def test_flights_that_have_nothing_in_common_begin_with_their_first_command(tmp_path: Path, flight: Path) -> None:
     path = write_flight(tmp_path / "other.mcap", Plan(shift_ns=50_000 * MS, gain=0.5))
     found = compare(Recording.open(flight), Recording.open(path))
-    assert found.aligned == "both begin with their first command"
+    assert found.aligned == "both start at their first command"
     assert found.new.times_s[0] == pytest.approx(found.old.times_s[0])
     assert found.same_action == 1.0
 

@@ -233,7 +233,7 @@ def test_a_full_disk_is_told_and_the_flight_goes_on(fly: Fly, tmp_path: Path) ->
         files.until(lambda: engine.status.state is RecorderState.PAUSED, "the pause")
         drone.takeoff()
         assert drone.feedback(max_age_s=1.0).state.airborne
-        files.until(lambda: any("stands still" in (entry.text or "") for entry in logs), "the log entry")
+        files.until(lambda: any("recording paused" in (entry.text or "") for entry in logs), "the log entry")
         disk.room = 10**9
         files.until(lambda: engine.status.state is RecorderState.RECORDING, "the next file")
         engine.stop()
@@ -347,10 +347,10 @@ def test_wrong_options(fly: Fly, tmp_path: Path, options: dict[str, Any], match:
 
 def test_wrong_paths_and_drones(fly: Fly, tmp_path: Path) -> None:
     drone = fly()
-    with pytest.raises(UsageError, match="is no folder"):
+    with pytest.raises(UsageError, match="is not a folder"):
         skyloop.record(drone, tmp_path / "nowhere" / "f.mcap")
     (tmp_path / "f.mcap").write_text("precious")
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         skyloop.record(drone, tmp_path / "f")
     for wrong in (7, [], [None]):
         with pytest.raises(UsageError, match="must be a drone"):

@@ -117,7 +117,7 @@ def test_a_file_that_is_none_is_one_clear_line(log: Log, tmp_path: Path, command
     path.write_bytes(b"RIFF....AVI ")
     ended = log(command, path)
     assert (ended.code, ended.out) == (2, "")
-    assert "is no MCAP file: it begins with b'RIFF....'" in ended.err
+    assert "is not an MCAP file: it begins with b'RIFF....'" in ended.err
 
 
 @pytest.mark.parametrize("command", ["info", "report", "export", "compare", "recover"])

@@ -163,7 +163,7 @@ def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path
     with pytest.raises(FileFormatError, match="is empty"):
         Recording.open(path)
     path.write_bytes(b"\x00\x00\x00\x18ftypmp42")
-    with pytest.raises(FileFormatError, match="is no MCAP file: it begins with"):
+    with pytest.raises(FileFormatError, match="is not an MCAP file: it begins with"):
         Recording.open(path)
     path.write_bytes(flight.read_bytes()[:20])
     with pytest.raises(FileFormatError, match="ends before its first sample"):
@@ -173,7 +173,7 @@ def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path
         writer.start()
         writer.register_channel("/camera", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(FileFormatError, match=r"no recording of Skyloop's \(its topics: /camera\)"):
+    with pytest.raises(FileFormatError, match=r"not a Skyloop recording \(its topics: /camera\)"):
         Recording.open(path)
     with pytest.raises(UsageError, match="Is a directory"):
         Recording.open(tmp_path)

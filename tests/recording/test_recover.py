@@ -95,7 +95,7 @@ def test_nothing_is_overwritten(log: Log, cut: Path, tmp_path: Path) -> None:
     target.write_text("mine")
     ended = log("recover", cut, "-o", target)
     assert ended.code == 2
-    assert "exists already: choose another name" in ended.err
+    assert "already exists: choose another name" in ended.err
     assert target.read_text() == "mine"
     assert not list(tmp_path.glob("*.part"))
 

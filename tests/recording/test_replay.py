@@ -304,14 +304,14 @@ def test_a_replay_is_recorded_beside_the_old_commands_and_compared(tmp_path: Pat
     old = {item.value.native.get("replay.asked") for item in first.items("flight", (Channel.FEEDBACK,))}
     assert {"takeoff", "velocity", "land"} <= old
     same = compare(first, second)
-    assert same.aligned.startswith("by their clock")
+    assert same.aligned.startswith("by their common clock")
     assert same.part_at_s is None
     assert same.same_action == 1.0
     assert all(field.rms == 0.0 for field in same.fields)
     other = compare(first, bolder)
     assert other.part_at_s == pytest.approx(0.5, abs=0.15)
     assert max(field.rms for field in other.fields) > 0.1
-    assert compare(Recording.open(flight), first).aligned.startswith("by their clock")
+    assert compare(Recording.open(flight), first).aligned.startswith("by their common clock")
     # And a recording of a replay is a recording: it can be replayed itself.
     assert len(flown(tmp_path / "0.mcap").frames) >= 15
 

@@ -21,7 +21,7 @@ from skyloop.recording import foxglove as schemas
 from skyloop.recording import foxglove_access as module
 from skyloop.recording import layout, taps
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.foxglove_access import MAX_HEAD, OriginDoor, ParameterDesk, hidden_host
+from skyloop.recording.foxglove_access import MAX_HEAD, OriginGuard, ParameterAccess, hidden_host
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Picture
 from tests.recording.live.conftest import WAIT_S, Fly
@@ -299,7 +299,7 @@ def test_a_view_that_only_looks_on_writes_nothing_and_says_why(fly: Fly, show: S
         assert answer["value"] == before == drone.config["limits.tilt"]
         viewer.until(lambda one: one.status)
         assert viewer.status == [
-            "alpha/limits.tilt was not written: this view only looks on: start it with --write to write parameters"
+            "alpha/limits.tilt was not written: this view is read-only: start it with --write to write parameters"
         ]
 
 
@@ -341,13 +341,13 @@ def test_parameters_are_written_where_that_was_asked_for(lent: Drone, show: Show
     ],
 )
 def test_what_can_not_be_written_is_refused_with_the_reason(lent: Drone, name: str, value: object, why: str) -> None:
-    written = ParameterDesk([lent], 31).write(name, value)
+    written = ParameterAccess([lent], 31).write(name, value)
     assert why in written.refused
     assert written.value == (lent.config["limits.tilt"] if name == "alpha/limits.tilt" else None)
 
 
 def test_whole_numbers_are_written_as_the_parameter_s_type(lent: Drone) -> None:
-    desk = ParameterDesk([lent], 31)
+    desk = ParameterAccess([lent], 31)
     whole = [each for each in lent.config.parameters() if each.type.value == "float" and not each.read_only]
     taken = next(each for each in whole if (each.minimum or 0) <= 1 <= (each.maximum or 1))
     assert desk.write(f"alpha/{taken.name}", 1).value == 1.0
@@ -398,7 +398,7 @@ def test_no_page_of_another_origin_gives_orders(lent: Drone, show: Show, origin:
 
 
 def test_a_door_ends_who_says_too_much_or_nothing() -> None:
-    door = OriginDoor("127.0.0.1", 0)
+    door = OriginGuard("127.0.0.1", 0)
     try:
         with socket.create_connection(("127.0.0.1", door.port), timeout=WAIT_S) as page:
             page.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * MAX_HEAD)
