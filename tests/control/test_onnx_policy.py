@@ -126,7 +126,8 @@ def test_it_hovers_while_it_does_not_know_what_the_policy_needs(drone: Recorder,
     pilot.on_frame(frame(1_100_000_000, []))
     assert len(drone.velocities) == 1
     pilot.on_frame(frame(1_200_000_000, [], known=False))
-    assert drone.told[-1] == ("policy: the drone does not report all values that the policy needs: hovering", Severity.WARNING)
+    missing = "policy: the drone does not report all values that the policy needs: hovering"
+    assert drone.told[-1] == (missing, Severity.WARNING)
 
 
 def test_it_hovers_where_the_state_is_from_long_before_the_picture(

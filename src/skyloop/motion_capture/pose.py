@@ -178,9 +178,7 @@ def calibrate(
             poor.
     """
     if len(poses) < MIN_POSES:
-        raise UsageError(
-            f"a calibration needs at least {MIN_POSES} poses, got {len(poses)}: is the body tracked?"
-        )
+        raise UsageError(f"a calibration needs at least {MIN_POSES} poses, got {len(poses)}: is the body tracked?")
     mean = mean_quaternion([pose.quaternion for pose in poses])
     spread_m = _spread(np.array([pose.position_m for pose in poses]))
     angles = [_angle(mean, pose.quaternion) for pose in poses]

@@ -151,7 +151,7 @@ class FileWriter:
     def _run(self) -> None:
         try:
             self._work()
-        except Exception as error:  # noqa: BLE001  (whatever it was, the state must not say that this still records)
+        except Exception as error:  # noqa: BLE001  (the state must never say that this still records)
             self._fail(error)
 
     def _work(self) -> None:

@@ -88,8 +88,7 @@ def compare(
 ) -> Comparison:
     """Compare the commands requested by applications (or those applied), without the proxies' own.
 
-    A recording of a replay knows which moment of the old flight each of its own is; otherwise both start at their first
-    command.
+    A recording of a replay maps its times to the old flight; otherwise both recordings start at their first command.
 
     Args:
         old: The older recording.

@@ -55,7 +55,7 @@ def export_mp4(
 
     H.264 is copied as recorded, without decoding, if nothing is drawn into the frames. If its size or another parameter
     changes, a new file starts: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing ones are left out.
-    Everything else is encoded into one file; damaged frames, and frames whose size differs from the first, are left out.
+    Everything else is encoded into one file, without damaged frames and frames whose size differs from the first.
 
     Args:
         recording: The recording.
