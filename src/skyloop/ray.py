@@ -193,7 +193,7 @@ class _Actor:
             worker.run(math.inf)
         except SkyloopError as error:
             self._trouble = str(error)
-        except BaseException as error:  # noqa: BLE001  (nobody else learns of it: the status shows that it has ended)
+        except BaseException as error:  # noqa: BLE001  (otherwise the error is lost: the status shows that it has ended)
             self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:

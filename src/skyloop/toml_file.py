@@ -1,4 +1,4 @@
-"""Read TOML files into msgspec structs, with errors that say where in the file, what was given, and what is allowed."""
+"""Read TOML files into msgspec structs, with errors that give the place in the file, the value and the allowed ones."""
 
 from __future__ import annotations
 

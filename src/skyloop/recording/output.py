@@ -1,4 +1,4 @@
-"""One MCAP file of a recording. Committed data stays readable, whatever happens later."""
+"""One MCAP file of a recording. Committed data stays readable in any event."""
 
 from __future__ import annotations
 

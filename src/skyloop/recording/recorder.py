@@ -163,8 +163,8 @@ def record(
         encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
             ``"auto"`` keeps the vehicle's H.264 if it sends that, and otherwise encodes as JPEG.
         quality: JPEG quality, 1 to 100 (best).
-        rotate_mb: Start a new file after this many megabytes (``flight-0001.mcap``, …), each complete in itself, H.264 at
-            a key frame; None does not.
+        rotate_mb: Start a new file after this many megabytes (``flight-0001.mcap``, …), each self-contained, H.264 at a
+            key frame; None does not.
         rotate_s: The same after this many seconds.
         min_free_mb: Free space to leave on the disk: below it no frames are recorded, below a quarter of it nothing.
         buffer_mb: Amount of data that can wait for a slow disk before frames are dropped.

@@ -439,7 +439,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # with too much content, the order decides what is left out: use a scan
+    return not found.damaged  # with too much content, the order decides which parts are skipped: use a scan
 
 
 def _header_end(file: IO[bytes]) -> int:

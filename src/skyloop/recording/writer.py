@@ -275,7 +275,7 @@ class FileWriter:
 
     def _open(self) -> None:
         number = len(self.files) + 1
-        # Nobody chose the name of a file after a pause: it must not overwrite anything.
+        # The user did not choose the name of a file after a pause: it must not overwrite anything.
         overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
         first = number == 1 and not self._options.rotates
         path = self._path if first else self._next_free(number, overwrite)
