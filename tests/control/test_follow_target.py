@@ -129,7 +129,7 @@ def test_invalid_arguments_are_refused() -> None:
         ({"class_name": "person"}, "needs a detector"),
         ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
         ({"box": box, "mode": None}, "mode is None"),
-        ({"box": box, "detector": 7}, "detector is 7 and must have detect"),
+        ({"box": box, "detector": 7}, "detector is 7 and needs a detect"),
         ({"box": (math.nan, 1, 20, 20)}, "must consist of finite numbers"),
         ({"box": (1, 2, 3)}, "must be x, y, width and height"),
         ({"box": "here"}, "must be x, y, width and height"),

@@ -1,4 +1,4 @@
-"""The examples of behaviours, each run whole, in simulated time."""
+"""The examples of behaviours, each run completely in simulated time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Run = Callable[[str], str]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs an example as it is, but for time, which is simulated; returns what it printed."""
+    """Runs an example unchanged, except for simulated time; returns its output."""
 
     def connect(target: str) -> AbstractContextManager[Drone]:
         return rehearse(target)
@@ -31,7 +31,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, module.__name__, module)  # where dataclasses look for it
+        monkeypatch.setitem(sys.modules, module.__name__, module)  # dataclasses look it up there
         spec.loader.exec_module(module)
         monkeypatch.setattr(skyloop, "connect", connect)
         module.main()

@@ -1,4 +1,4 @@
-"""How workers do, in figures and words."""
+"""Workers' statistics, in figures and words."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_several_together() -> None:
 
 
 @pytest.mark.parametrize("parts", [0, 2])
-def test_a_worker_without_a_part_is_not_at_work(parts: int) -> None:
+def test_a_worker_without_a_part_is_not_working(parts: int) -> None:
     one = Status(processor="d", camera="front", parts=parts, workers=2)
     both = together([one, Status(processor="d", camera="front", parts=2, workers=2)])
     assert both is not None
