@@ -64,7 +64,7 @@ def yard(folder: Path, options: str = "") -> Iterator[Drone]:
 
 
 def truth(frame: Frame) -> tuple[float, float]:
-    """Return distance and bearing from the vehicle to the walker, who is still on the first leg."""
+    """Return distance and bearing from the vehicle to the walker on the first leg."""
     assert frame.feedback is not None
     native = frame.feedback.native
     assert native is not None
@@ -341,7 +341,7 @@ def test_frames_that_stop_after_one_stamped_ahead_are_noticed() -> None:
 @pytest.mark.usefixtures("_no_age")
 @pytest.mark.parametrize(("camera", "phase"), [("front", TargetPhase.FOLLOWING), ("bottom", TargetPhase.LOOKING)])
 def test_the_behaviour_uses_the_results_of_a_processor(camera: str, phase: TargetPhase) -> None:
-    """Only results of its own camera: a box in another camera's frame is elsewhere."""
+    """Only results of the same camera count: a box in another camera's frame is elsewhere."""
     drone = Recorder()
     pilot = FollowTarget(drone, class_name="person", detector="detect")  # type: ignore[arg-type]
     one = {"box": list(the_box()), "score": 0.9, "class_id": 0, "class_name": "person"}

@@ -1,4 +1,4 @@
-"""Extract an image file from its message, whatever the message holds."""
+"""Extract an image file from any message."""
 
 from __future__ import annotations
 

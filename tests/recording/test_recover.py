@@ -1,4 +1,4 @@
-"""``skyloop log recover``: readable data is saved with an index; the damaged file is left alone."""
+"""``skyloop log recover``: readable data is saved with an index; the damaged file stays unchanged."""
 
 from __future__ import annotations
 

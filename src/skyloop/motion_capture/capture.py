@@ -193,7 +193,7 @@ class MotionCapture:
         end of its ``with`` block, stops the calls.
 
         Args:
-            function: Called on its own thread; poses overtaken by newer ones are dropped and counted.
+            function: Called on a separate thread; poses overtaken by newer ones are dropped and counted.
             depth: How many poses can wait for it, such as one per body.
             inline: Call it on the receiving thread instead, with every pose. It must be quick and must not block.
 
@@ -209,7 +209,7 @@ class MotionCapture:
         Returns and raises like :meth:`on_pose`.
 
         Args:
-            function: Called on its own thread; up to 256 events wait for it.
+            function: Called on a separate thread; up to 256 events wait for it.
             inline: Call it on the thread that detected the change instead.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)

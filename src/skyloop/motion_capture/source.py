@@ -310,7 +310,7 @@ FIRST_S: Final = 10.0  #: the same before its first frame
 
 
 class ChildSource:
-    """Runs :func:`main` in a child process and passes each frame on, on its own thread.
+    """Runs :func:`main` in a child process and forwards each frame on a separate thread.
 
     Replaces a child that ends or falls silent, until :meth:`close`.
     """

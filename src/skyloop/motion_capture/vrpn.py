@@ -261,7 +261,7 @@ class SensorSelection:
 
 
 class VrpnSource:
-    """Receives from a VRPN server and passes each frame on, on its own thread.
+    """Receives from a VRPN server and forwards each frame on a separate thread.
 
     Replaces a connection that ends, falls silent or carries data other than VRPN, until :meth:`close`. Backlog in the
     socket counts as one frame: the newest pose of each body.

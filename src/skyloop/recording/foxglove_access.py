@@ -52,7 +52,7 @@ class ParameterAccess:
             drones: Observed drones, with different names.
             priority: Priority of writes, 0 (the highest) to 31; None forbids writing.
             on_change: Called with the name and value of each parameter at first and after each change, once
-                :meth:`follow` was called, on its own thread.
+                :meth:`follow` was called, on a separate thread.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority

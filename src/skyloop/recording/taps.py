@@ -369,7 +369,7 @@ def encoder(options: Options) -> Encode:
 
 
 class Parameters:
-    """Records all parameters at the start, then each change, on its own thread."""
+    """Records all parameters at the start, then each change, on a separate thread."""
 
     def __init__(self, drone: Drone, put: Callable[[Parameter], None]) -> None:
         self._drone = drone
