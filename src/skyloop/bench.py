@@ -69,7 +69,7 @@ FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
 #: The channels, and the periods [s] of the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
-LARGEST: Final = (1920, 1080)
+LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
 
 _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
@@ -163,7 +163,7 @@ def spread(times_ns: Sequence[float]) -> Spread:
 CAMERA: Final = "bench"
 USUAL_CAMERA: Final = CameraInfo(CAMERA, 320, 240, 15.0)
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
-_UNIT_M_S: Final = 2.0**-46
+_UNIT_M_S: Final = 2.0**-46  # per nanosecond: 2**40 ns stay below 2 cm/s
 
 
 def stamped(sent_ns: int) -> float:
@@ -403,11 +403,11 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
     BARE: (BareVehicle, BareApplication),
     SKYLOOP: (Vehicle, Application),
 }
-_TURN_S: Final = 5.0
+_TURN_S: Final = 5.0  # duration of a turn of one kind of hand-over
 _WARM_UP_S: Final = 0.4  # at the start of a turn, not counted: threads, slots and discovery of a new connection
 _SETTLE_S: Final = 0.3  # for the last samples of a turn to arrive
-_AHEAD_NS: Final = 50_000_000
-_ANSWERS_WITHIN_S: Final = 30.0
+_AHEAD_NS: Final = 50_000_000  # lead of the start time, so that both processes can start together
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process, beyond the turn
 _GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
@@ -619,7 +619,7 @@ FRAMES_PER_S: Final = 30.0  #: per camera; the drones fly for one period between
 #: A multiple of all periods in steps, so that every batch does the same work.
 BATCH_STEPS: Final = 100
 LEAST_ROUNDS: Final = 3  #: even if the time is short
-_TAKE_OFF_S: Final = 5.0
+_TAKE_OFF_S: Final = 5.0  # simulated time before measuring
 #: Circles of half a metre, fast enough that the front camera's images are blurred by the rotation.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
 

@@ -68,8 +68,8 @@ _TICK: Final = Fraction(1, 1_000_000)  # time base of the encoder's rate control
 #: How much of a second's data a stream may send at once: the size of a key frame. A slow link has to carry it before
 #: the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3
-_FALLS: Final = 12  # below this share of its maximum rate, a single image occupies the link for too long
+_GROWS: Final = 3  # greatest increase of a rate that will change
+_FALLS: Final = 12  # below 1/12 of its maximum rate, a single image occupies the link for too long
 _KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
 #: The colours of PAL television, with 16 to 235 from black to white: what FFmpeg converts to, and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"

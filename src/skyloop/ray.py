@@ -19,7 +19,7 @@ from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopE
 from skyloop.processing import Code, Settings, Status, Worker, load_processor
 
 _ASK_S: Final = 10.0  #: time for an actor to return its status
-_LOOK_S: Final = 0.1
+_LOOK_S: Final = 0.1  # how often to check whether all actors have started
 _START_S: Final = 60.0  #: time for Ray to place and start all actors
 #: Environment variables of this program with which a worker finds the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
-_LONGEST_STEP_S = 0.2
+_LONGEST_STEP_S = 0.2  # a longer gap between frames moves the station along the arc by no more
 _LOOKING: Colour = (120, 190, 255)
 _SEEN: Colour = (64, 220, 100)
 

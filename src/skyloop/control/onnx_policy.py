@@ -34,8 +34,8 @@ MEMORY: Final = "memory"
 NEXT_MEMORY: Final = "next_memory"  #: output that becomes the memory for the next image
 STATE_NAMES: Final = "skyloop.state"  #: metadata key: names of the state's numbers, a JSON list
 ACTION_NAMES: Final = "skyloop.action"  #: metadata key: names of the action's numbers
-_MOST_SIDE: Final = 4096
-_MOST_MEMORY: Final = 2**20
+_MOST_SIDE: Final = 4096  # limit of an input image [px]
+_MOST_MEMORY: Final = 2**20  # limit of a memory, in numbers
 _PURPOSE: Final = "flying by an ONNX file"
 
 

@@ -96,7 +96,7 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
 
 
 Array = NDArray[np.float64]
-_DIFFERENCE_S = 0.01
+_DIFFERENCE_S = 0.01  # step of the numerical derivative, to each side
 
 #: Lengths, speeds, accelerations and times in this range divide without under- or overflow.
 _LEAST: Final = 1e-6

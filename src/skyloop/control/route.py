@@ -36,9 +36,9 @@ Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Point = tuple[Metres, Metres]
 SETTLE_S: Final = 1.0  #: extra time of a leg for getting under way and coming to rest
-LOOK_S: Final = 3.0
-PHOTO_S: Final = 1.0
-DESCENT_M_S: Final = 0.4
+LOOK_S: Final = 3.0  #: estimated duration of a look
+PHOTO_S: Final = 1.0  #: estimated duration of a photo
+DESCENT_M_S: Final = 0.4  #: assumed landing speed, for the estimate
 SLACK_M: Final = 0.15  #: same as the proxy's
 
 

@@ -43,13 +43,13 @@ TURN_S: Final = 15.0  #: longest wait for a turn
 PHOTO_S: Final = 5.0  #: longest wait for a photo
 SLOWEST: Final = 3.0  #: a leg may take this many times its duration at full speed
 EXTRA_S: Final = 20.0  #: plus this time; then the route pauses
-_NEAR_RAD: Final = 0.12
+_NEAR_RAD: Final = 0.12  # yaw error at which a look is done
 ENDED: Final = "a failsafe took over: this program sent nothing for a while, or a link was lost"
 TAKEN: Final = "another command of this program replaced it"
 PHOTOS: Final = "photos"  #: default folder of photos
 LOG: Final = "route"  #: log name of the progress
 WAYPOINTS: Final = "waypoints"  #: log name of the remaining waypoints, for maps
-_QUALITY: Final = 92
+_QUALITY: Final = 92  # of JPEG
 _LOG_S: Final = 4.0  #: maps drop places logged more than 10 s ago
 
 

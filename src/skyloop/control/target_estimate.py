@@ -28,15 +28,15 @@ from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
 
-_NEAREST_M: Final = 0.3
+_NEAREST_M: Final = 0.3  # least range
 _RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning: gusts, and a wrong drag constant
 _LATE_S: Final = 0.5  # later boxes are useless
 _ADAPTING: Final = 0.3  # weight of one box in the average surprise
 _USUAL: Final = 1.5  # surprise up to this counts as noise
-_MOST_SURPRISE: Final = 4.0
+_MOST_SURPRISE: Final = 4.0  # limit of a single box in the average
 _STRAIGHT_S: Final = 4.0  # longest straight prediction of an unseen target
 _GONE_S: Final = 0.2  # a target unseen for longer, and for more than one or two images, is hidden
-_GONE_INTERVALS: Final = 2.5
+_GONE_INTERVALS: Final = 2.5  # ... measured in intervals between boxes
 _BEFORE_S: Final = 0.2  # this long before the last sighting, the occluder had not begun to cut off the box
 _GATE: Final = 4.0  # standard deviations of the azimuth
 _EDGE_GATE: Final = 3.0  # standard deviations of an edge: beyond it the edge is hidden or belongs to another thing

@@ -41,8 +41,8 @@ Array = NDArray[np.float64]
 _SEEN: Final[Colour] = (64, 220, 100)
 _LOST: Final[Colour] = (255, 180, 60)
 _OTHER: Final[Colour] = (150, 150, 150)
-_TRACE_S: Final = 4.0
-_TRACE_EACH_S: Final = 0.2
+_TRACE_S: Final = 4.0  # length of the drawn track
+_TRACE_EACH_S: Final = 0.2  # between points of the drawn track
 _FEET_M: Final = 0.08  # below the body's centre; heights above the ground are measured from there
 
 

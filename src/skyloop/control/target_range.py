@@ -132,9 +132,9 @@ class RangeEstimator(TargetEstimator):
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
         # Boxes from a resting vehicle carry no information: the hypothesis of least motion would slowly win.
         stirred = self._stir(steady, since_s) / _STIRRED_M
-        told = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
+        weight = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
-        self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
+        self._weights = self._weights * np.exp(-0.5 * worse * weight * within(since_s / _TOGETHER_S, 0.0, 1.0))
         self._drop()
         self._judge(self.at(self.seen_ns))
         return True
@@ -237,9 +237,9 @@ class RangeEstimator(TargetEstimator):
         if self._known:
             self._known = share < _UNKNOWN or len(self._guesses) == 1
         else:
-            told = self._size_known or self.traits.on_ground
+            sure = self._size_known or self.traits.on_ground
             moved = self._stirred_m > _BASELINE * state.range_m
-            self._known = share < _UNKNOWN if told else moved and share < _KNOWN
+            self._known = share < _UNKNOWN if sure else moved and share < _KNOWN
 
 
 def _off_climb(camera: Camera) -> float:

@@ -26,7 +26,7 @@ _CUT: Final = 0.07
 _BESIDE: Final = 0.75  # of the image's size, from the optical axis; 0.5 is the edge
 _STEEPEST: Final = 0.15  # cosine of the elevation; a thing nearly straight above or below has no azimuth
 _TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
-_YAW_RAD: Final = 0.006
+_YAW_RAD: Final = 0.006  # error of the yaw at the capture
 _UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival: encoding, network and decoding
 
 

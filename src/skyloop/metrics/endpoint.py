@@ -148,7 +148,7 @@ PATH: Final = "/metrics"
 MAX_SCRAPES: Final = 8  #: at a time; a further connection closes the one that has waited longest without a request
 ANSWER_S: Final = 1.0  #: a scrape is never closed for a new connection before this time
 DEADLINE_S: Final = 10.0  #: longest duration of a connection, from its first byte to its last
-_POLL_S: Final = 0.1
+_POLL_S: Final = 0.1  # how often the server thread checks whether to stop
 _log = logging.getLogger(__name__)
 
 #: Reads the values of one thing now.

@@ -131,10 +131,10 @@ def scipy_types() -> Any:
     return transform
 
 
-REST_S: Final = 2.0
-MAX_SPREAD_M: Final = 0.005
-MAX_SPREAD_RAD: Final = math.radians(1.0)
-MIN_POSES: Final = 20
+REST_S: Final = 2.0  #: how long poses are collected for a calibration
+MAX_SPREAD_M: Final = 0.005  #: of the poses of a drone at rest: more means motion or poor tracking
+MAX_SPREAD_RAD: Final = math.radians(1.0)  #: the same for their rotation
+MIN_POSES: Final = 20  #: for a calibration
 
 
 @dataclass(frozen=True, slots=True)

@@ -204,10 +204,10 @@ def record(
 # The recorder's process -----------------------------------------------------------------------------------------
 
 
-START_S: Final = 20.0
+START_S: Final = 20.0  #: time for the child to start recording
 _END_S: Final = 15.0  # time to write received samples before the child is terminated
-_HARDER_S: Final = 3.0
-_TELL_S: Final = 0.25
+_HARDER_S: Final = 3.0  # after terminating the child, before killing it
+_TELL_S: Final = 0.25  # period of the child's status reports
 _NICE: Final = 5  # the flight has priority
 _log = logging.getLogger(__name__)
 

@@ -47,8 +47,8 @@ from skyloop.recording.translation import Path as Trail
 TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
 _MOST_SERIES: Final = 64  # limit of series and drawing sources, because applications choose their names
-_PATH_EVERY_NS: Final = 1_000_000_000
-_FRUSTUM_M: Final = 0.3
+_PATH_EVERY_NS: Final = 1_000_000_000  # between points of a path
+_FRUSTUM_M: Final = 0.3  # drawn size of a camera
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _STATE: Final[dict[str, tuple[str, ...]]] = {
     "attitude": ("roll [rad]", "pitch [rad]", "yaw [rad]"),

@@ -30,13 +30,13 @@ from skyloop.recording.translation import Picture
 from skyloop.recording.view import Source
 
 PORT: Final = 9876  #: of Rerun's viewer
-_START_S: Final = 20.0
+_START_S: Final = 20.0  # time for the viewer to listen
 _AHEAD: Final = 8 * MB  #: bytes that the viewer can be behind
-_PATIENCE_S: Final = 0.5
-_ASK_NS: Final = nanoseconds(1.0)
-_LAST_S: Final = 5.0
-_LOOK_S: Final = 0.1
-_SETTLED_S: Final = 1.0
+_PATIENCE_S: Final = 0.5  # how long to wait for a slow viewer before dropping samples
+_ASK_NS: Final = nanoseconds(1.0)  # how often to check whether the viewer keeps up
+_LAST_S: Final = 5.0  # time for the viewer to accept the rest at the end
+_LOOK_S: Final = 0.1  # how often to check whether the viewer listens
+_SETTLED_S: Final = 1.0  # how long it must listen to count as started
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
 

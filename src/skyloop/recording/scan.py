@@ -45,7 +45,7 @@ FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
 _LONGEST: Final = 1 << 32  #: a longer record counts as damage
-MAX_NAME: Final = 16
+MAX_NAME: Final = 16  #: bytes of a compression's name
 
 #: Exceptions that reading a damaged record can raise.
 Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError, RecursionError)

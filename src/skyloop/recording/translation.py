@@ -28,9 +28,9 @@ from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
 from skyloop.recording.output import Message
 
-_SEQUENCES: Final = 1 << 32
+_SEQUENCES: Final = 1 << 32  # MCAP's sequence numbers have 32 bits
 _PLACES: Final = 400  #: greatest number of places of a path; beyond it, remove every second one
-_PATH_EVERY_NS: Final = 1_000_000_000
+_PATH_EVERY_NS: Final = 1_000_000_000  # between messages of a path
 
 
 class Picture:

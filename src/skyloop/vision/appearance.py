@@ -50,14 +50,14 @@ _ASIDE: Final = 0.12  # offset between neighbouring strips, of the box's width
 _HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as shares of the height
 _SIZE: Final = (24, 24)  # of the stored patch, whatever the target's shape
 _GRADIENTS: Final = 7  # the first channels of the features
-_COLOUR_WEIGHT: Final = 1.2
+_COLOUR_WEIGHT: Final = 1.2  # how fast the similarity falls with the colour distance
 _KEPT: Final = 12  # appearances kept, and as many look-alikes
 _NEW_BELOW: Final = 0.9  # an appearance more similar to a known one is not added
 _SEARCHED_PX: Final = 16.0  # side of the target in the shrunk search image
 _LEAST_MATCH: Final = 0.35  # correlation of a place worth a look
 _WORTH_NUDGING: Final = 0.2  # similarity from which to refine a place; a fifth of the size aside it is higher
 _NUDGE: Final = 0.08  # step of the refinement, of the target's size
-_GROWTH: Final = (0.9, 1.1)
+_GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:

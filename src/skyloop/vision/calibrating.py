@@ -32,12 +32,12 @@ _MARKER_SHARE = 0.74  # marker's side, as a share of a square's side
 _LEAST_CORNERS = 8  # corners of a ChArUco board needed in an image
 Model = Literal["pinhole", "fisheye"]
 
-LEAST_VIEWS: Final = 6
+LEAST_VIEWS: Final = 6  #: needed for a calibration
 GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
 _WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
 _WORST_PX: Final = 0.3  # ... and above this
 _NEW_SHARE: Final = 0.08  # of the image's width: a view is new only if its corners moved at least this far
-_STEPS: Final = (60, 1e-8)
+_STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

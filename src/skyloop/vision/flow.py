@@ -24,9 +24,9 @@ from skyloop.vision.planar import checked
 Array = NDArray[np.float64]
 
 _MOST: Final = 80  # corners tracked
-_ENOUGH: Final = 8
+_ENOUGH: Final = 8  # corners needed for a position
 _REFILL: Final = 50  # detect new corners when fewer remain
-_APART_PX: Final = 12
+_APART_PX: Final = 12  # least distance between corners
 _RETURN_PX: Final = 0.7  # a corner tracked forward and back must return within this distance
 _LOWEST_M: Final = 0.15  # closer to the ground there is nothing to track
 

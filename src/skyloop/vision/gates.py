@@ -32,10 +32,10 @@ _FARTHEST_M: Final = 8.0  # anything further away is more likely a patch of the 
 _SIDE_SHARE: Final = 0.15  # share of each side left out at both ends, because corners look round
 _FILLED: Final = 0.6  # of the four-sided hull: a thing of the same colour behind the gate may reach into the hole
 _OFF_PX: Final = 1.5  # greatest root mean square distance of the edge from its four sides
-_LEAST_HEIGHT_PX: Final = 20
+_LEAST_HEIGHT_PX: Final = 20  # of a pole
 _SLIM: Final = 3.0  # least ratio of a pole's height to its width
-_ABOVE_PX: Final = 6
-_COLOURFUL: Final = 100  # of 255
+_ABOVE_PX: Final = 6  # searched above a pole for something that hides its top
+_COLOURFUL: Final = 100  # saturation, of 255
 _LEAST_SHARE: Final = 0.8  # least share of a pole's rows that are one piece; two overlapping poles are not
 
 

@@ -34,7 +34,7 @@ _GREY: Final = 114  # padding of letterboxed images, as in the training of YOLO 
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's, for RF-DETR
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
 _SIDE: Final = 640  # default side of a network that takes any size
-_MOST_SIDE: Final = 4096
+_MOST_SIDE: Final = 4096  # limit of an input image [px]
 _MOST: Final = 1000  # best boxes compared with one another
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 

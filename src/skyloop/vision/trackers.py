@@ -36,24 +36,24 @@ Spectrum = NDArray[np.complex64]
 _AREA_PX: Final = 128.0**2  # size of the sampled patch around the target
 _CONTEXT: Final = 1.5  # margin added to width and height, times the root of the target's area
 _RATE: Final = 0.02  # learning rate per image
-_SCALE_RATE: Final = 0.02
+_SCALE_RATE: Final = 0.02  # learning rate of the size per image
 _REGULARISATION: Final = 0.02  # of the mean energy of the spectrum
 _SPREAD: Final = 0.08  # width of the peak, as a share of the target's size
-_SCALES: Final = 17
-_SCALE_STEP: Final = 1.03
+_SCALES: Final = 17  # sizes tried per image
+_SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
 _SCALE_SPREAD: Final = 1.0  # steps
-_SCALE_AREA_PX: Final = 32.0**2
+_SCALE_AREA_PX: Final = 32.0**2  # size of the sampled patch of each size
 _SMALLEST: Final = 0.2  # times the initial size
 _LARGEST: Final = 6.0  # times the initial size
-_LEAST_PX: Final = 4.0
+_LEAST_PX: Final = 4.0  # smallest side of a target
 _GRID: Final = 10  # points along each side
-_WINDOW: Final = (11, 11)
-_LEVELS: Final = 3
+_WINDOW: Final = (11, 11)  # of Lucas-Kanade [px]
+_LEVELS: Final = 3  # of its image pyramid
 _AROUND: Final = (9, 9)  # pixels of a point's surroundings to compare
 _ENOUGH: Final = 6  # points needed
 _RETURN_PX: Final = 5.0  # a larger median return distance is a failure
 _SPREAD_PX: Final = 0.35  # of the box's smaller side: a larger spread of the displacements is a failure
-_SMALLEST_PX: Final = 6.0
+_SMALLEST_PX: Final = 6.0  # a smaller box is a failure
 
 
 class _Filter:

@@ -30,7 +30,7 @@ TAUGHT: Final = "action"  #: name of logged arrays: the taught action for an ima
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
 _GAP_S: Final = 0.5  #: an episode ends after this long without an image or a state
-_SHORTEST_S: Final = 1.0
+_SHORTEST_S: Final = 1.0  # shorter episodes are left out
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
