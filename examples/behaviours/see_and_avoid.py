@@ -291,8 +291,8 @@ class SeeAndAvoid(Behaviour):
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             distance_m: Distance to fly ahead.
             colour: Red, green, blue of the obstacles, 0 to 255.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the colour has no hue.

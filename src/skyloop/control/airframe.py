@@ -343,8 +343,8 @@ class VelocityLaw(AirframeLaw):
         """Initialise the law.
 
         Args:
-            limits: Of the set-points.
-            *needs: What it can't fly without.
+            limits: Limits of the set-points.
+            *needs: Parts that the law can't fly without.
         """
         super().__init__(*needs)
         self._limiter = SetpointLimiter(limits)
@@ -428,7 +428,7 @@ class TurningSearch:
         """Compute the set-point.
 
         Args:
-            yaw: Of the vehicle [rad].
+            yaw: Yaw of the vehicle [rad].
             altitude: Above the ground [m]; None keeps the height.
 
         Returns:

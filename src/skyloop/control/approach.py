@@ -59,15 +59,15 @@ class ApproachMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             distance_m: Distance at which to stop; replaces that of ``settings``.
             near_m: Acceptance radius of distance and height together.
             near_rad: Acceptance angle to each side of the marker's normal.
             hold_s: How long the vehicle must stay within both.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults, with ``aside_rad`` 0.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.
 
         Raises:
             UsageError: A number is not finite and above 0.
@@ -105,7 +105,7 @@ class OrbitMarker(FollowMarker):
     Starts on the side from which it sees the marker and runs until stopped.
 
     Attributes:
-        turns: How often it has reached an end of the arc.
+        turns: Number of times that it reached an end of the arc.
     """
 
     name = "orbit"
@@ -127,14 +127,14 @@ class OrbitMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             radius_m: Distance from it; replaces that of ``settings``.
             reach_rad: Half angle of the arc to each side of the marker's normal, at most 1.1.
             rate_rad_s: Angular rate around the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults, with ``aside_rad`` 0.05.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.05.
 
         Raises:
             UsageError: A number is out of its range.
@@ -189,12 +189,12 @@ class OrbitPlace(FollowPath):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             centre: x, y and the height to fly at [m], world axes.
-            radius_m: Of the circle.
+            radius_m: Radius of the circle.
             look: Whether the vehicle faces ``"in"``, to the centre, or ``"out"``.
-            speed_m_s: Along the circle.
+            speed_m_s: Speed along the circle.
             laps: Number of laps, counter-clockwise.
-            settings: Of the path law; None are the defaults.
-            source: Of positions; None is the vehicle's own feedback.
+            settings: Settings of the path law; None are the defaults.
+            source: Position source; None is the vehicle's own feedback.
 
         Raises:
             UsageError: An argument is out of its range.
@@ -222,7 +222,7 @@ class LandOnMarker(Behaviour):
     vehicle must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
 
     Attributes:
-        marker_id: Which marker.
+        marker_id: Id of the marker.
     """
 
     name = "landing"
@@ -242,11 +242,11 @@ class LandOnMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
             camera: A camera that looks down.
-            settings: Of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
+            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.

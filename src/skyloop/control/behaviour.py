@@ -56,7 +56,7 @@ class Behaviour(Controller):
         Args:
             drone: The drone to fly.
             law: Computes the set-points.
-            camera: Whose frames to use; None is the vehicle's first camera.
+            camera: Camera to use; None is the vehicle's first camera.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -149,7 +149,7 @@ class Behaviour(Controller):
 
         Args:
             text: The result; follows the behaviour's name in the event's text.
-            severity: How important it is.
+            severity: Severity of the event.
         """
         self.done = True
         self.emit(text, severity)
@@ -161,7 +161,7 @@ class Behaviour(Controller):
 
         Args:
             text: Follows the behaviour's name and a colon.
-            severity: How important it is.
+            severity: Severity of the event.
         """
         self.drone.emit(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
 

@@ -422,7 +422,7 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
     """Return the distance of the closest pass [m], the time to it [s] and the unit vector to the side to pass on, (2,).
 
     Args:
-        here: From the other to the vehicle, (2,) [m].
+        here: Offset from the other to the vehicle, (2,) [m].
         moving: The vehicle's velocity relative to the other's, (2,) [m/s].
     """
     square = float(moving @ moving)

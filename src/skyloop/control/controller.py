@@ -67,8 +67,8 @@ class Controller:
     while a callback runs replaces the one that is waiting.
 
     Attributes:
-        camera: Whose frames :meth:`on_frame` gets; None is the vehicle's first camera.
-        processors: Whose results :meth:`on_result` gets; None is all processors.
+        camera: Camera of :meth:`on_frame`; None is the vehicle's first camera.
+        processors: Processors of :meth:`on_result`; None is all.
         result_max_age_s: Results older than this are skipped; None skips none.
         drone: The drone to fly.
     """

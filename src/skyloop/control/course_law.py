@@ -101,8 +101,8 @@ class CourseLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            gates: In order.
-            widths_m: Of their openings.
+            gates: Gates in order.
+            widths_m: Widths of their openings.
             poles: Other obstacles.
             start: The vehicle's map position at the first feedback; its yaw is the map's.
             settings: None are the defaults.

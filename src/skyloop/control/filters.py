@@ -31,7 +31,7 @@ class LowPass(Generic[Signal]):
 
         Args:
             time_constant_s: 0 or more.
-            value: To start from; None starts from the first sample.
+            value: Initial value; None starts from the first sample.
 
         Raises:
             UsageError: The time constant is negative or not finite.
@@ -87,7 +87,7 @@ class Complementary:
 
         Args:
             time_constant_s: Over times shorter than this the rate dominates, over longer ones the measured angle.
-            angle: To start from; None starts from the first measurement.
+            angle: Initial angle; None starts from the first measurement.
 
         Raises:
             UsageError: The time constant is negative or not finite.
@@ -126,7 +126,7 @@ class Median:
         """Initialise the filter.
 
         Args:
-            length: How many samples to keep; 1 or more.
+            length: Number of samples to keep; 1 or more.
 
         Raises:
             UsageError: The length is not a whole number of at least 1.

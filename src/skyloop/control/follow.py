@@ -72,7 +72,7 @@ class FollowLaw(VelocityLaw):
     Attributes:
         mode: As of the last step.
         station_rad: Wanted angle around the marker, from its normal, counter-clockwise from above.
-        station_rate_rad_s: How fast that changes.
+        station_rate_rad_s: Rate of that angle.
         off_m: Error of distance and height together, as of the last step; None while searching.
         aside_rad: The vehicle's actual angle, as ``station_rad``; None while the marker's normal is unknown.
     """
@@ -190,7 +190,7 @@ class TargetFilter:
         Args:
             position: Shape (3,) [m].
             deviation_m: Standard deviation of each component.
-            at_ns: When it was measured.
+            at_ns: Time of the measurement.
         """
         newest = self._filter.newest
         if newest is None or self._jumped(position, deviation_m, at_ns):
@@ -274,7 +274,7 @@ class FollowMarker(Behaviour):
     Annotates every frame with the markers seen.
 
     Attributes:
-        marker_id: Which marker is followed.
+        marker_id: Id of the followed marker.
         score: Quality of the pursuit.
     """
 
@@ -295,11 +295,11 @@ class FollowMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.

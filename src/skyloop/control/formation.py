@@ -41,7 +41,7 @@ def line(n: int, spacing_m: float) -> Places:
     """Return a line abreast, the first drone at the left end.
 
     Args:
-        n: How many drones.
+        n: Number of drones.
         spacing_m: Between neighbours.
 
     Raises:
@@ -55,7 +55,7 @@ def column(n: int, spacing_m: float) -> Places:
     """Return a column, one drone behind the other, the first ahead.
 
     Args:
-        n: How many drones.
+        n: Number of drones.
         spacing_m: Between neighbours.
 
     Raises:
@@ -69,7 +69,7 @@ def circle(n: int, spacing_m: float) -> Places:
     """Return a circle, the first drone ahead and the others counter-clockwise after it.
 
     Args:
-        n: How many drones.
+        n: Number of drones.
         spacing_m: Between neighbours, along the chord.
 
     Raises:
@@ -85,7 +85,7 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
     """Return a V like that of geese: the first drone ahead, the others behind it, alternately left and right.
 
     Args:
-        n: How many drones.
+        n: Number of drones.
         spacing_m: Between neighbours on one leg.
         angle: Between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
 
@@ -104,7 +104,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
     """Return a grid of rows, the first drone ahead and left.
 
     Args:
-        n: How many drones.
+        n: Number of drones.
         spacing_m: Between neighbours in a row and between rows.
         columns: Drones in a row; None makes the grid as square as possible.
 

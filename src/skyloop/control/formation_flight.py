@@ -95,7 +95,7 @@ class Formation:
         Args:
             slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
             speed_m_s: Greatest speed of the drone with the longest path.
-            yaw: Of all drones [rad]; None leaves it free.
+            yaw: Yaw of all drones [rad]; None leaves it free.
             timeout_s: Drones not at their slot by then have failed; None allows ten seconds more than planned.
 
         Returns:
@@ -133,7 +133,7 @@ class Formation:
         """Keep each drone at its current position; then hover.
 
         Args:
-            seconds: How long.
+            seconds: Duration.
 
         Raises:
             UsageError: A drone can't be flown by its position, or none is active.
@@ -161,7 +161,7 @@ class Formation:
             leader: The leader's name.
             offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False``
                 east, north and up of it.
-            seconds: How long.
+            seconds: Duration.
             lead: Returns the leader's action at each tick, sent together with the followers' set-points; None: another
                 client flies the leader.
             turn: Whether offsets and yaw turn with the leader.

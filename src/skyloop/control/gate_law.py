@@ -111,7 +111,7 @@ class GateLaw(VelocityLaw):
         """Forget the gate and search for another.
 
         Args:
-            turning: Which way to search first; positive is counter-clockwise.
+            turning: Direction to search first; positive is counter-clockwise.
         """
         self.phase = GatePhase.SEARCHING
         self.forget()

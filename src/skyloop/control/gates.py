@@ -51,7 +51,7 @@ class Course:
     """A course with a map of its gates and poles: x, y, z [m], yaw as the vehicle's own.
 
     Attributes:
-        gates: In order.
+        gates: Gates in order.
         places: Places of the gates.
         poles: Other obstacles.
         pole_colour: Red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour.
@@ -130,7 +130,7 @@ class FlyThroughGates(Behaviour):
     direction, then searches for it again. The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
-        passed: How many gates were flown through.
+        passed: Number of gates flown through.
     """
 
     name = "gates"
@@ -149,7 +149,7 @@ class FlyThroughGates(Behaviour):
         Args:
             drone: The drone to fly.
             gates: The gates in order, or a course with a map.
-            camera: Whose frames to use; None is the vehicle's first camera.
+            camera: Camera to use; None is the vehicle's first camera.
             settings: :class:`CourseSettings` with a map, else :class:`GateSettings`; None are the defaults.
 
         Raises:

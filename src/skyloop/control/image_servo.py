@@ -90,13 +90,13 @@ class ImageServoLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            camera: How the camera is mounted.
+            camera: The camera, with its mounting.
             wanted: Wanted places of the points in the level camera, (n, 2) in the plane at z = 1.
             depth_m: Distance of the points from the camera at the goal.
             settings: None are the defaults.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         mounting_rotation(camera)  # raises here rather than in flight
         s = self.settings = settings or ServoSettings()
@@ -182,12 +182,12 @@ class ImageServo(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             distance_m: Wanted distance, straight in front of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
             camera: A camera that looks forward; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the camera does not look forward.
@@ -369,7 +369,7 @@ class FlowHover(Behaviour):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             camera: A camera that looks down.
-            settings: Of the law; None are the defaults.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.

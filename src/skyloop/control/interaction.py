@@ -53,7 +53,7 @@ def camera_twist(camera: CameraInfo) -> Array:
     mounted ahead of the centre swings when the vehicle turns.
 
     Raises:
-        UsageError: The camera does not say how it is mounted.
+        UsageError: The camera's mounting is unknown.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -70,9 +70,9 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
     Args:
         points: The points as the camera sees them, (n, 2).
-        camera: How it is mounted.
-        roll: Of the vehicle [rad].
-        pitch: Of the vehicle [rad].
+        camera: The camera, with its mounting.
+        roll: Roll of the vehicle [rad].
+        pitch: Pitch of the vehicle [rad].
 
     Raises:
         UsageError: A point would not be in front of a level camera.
@@ -94,7 +94,7 @@ def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gai
         points: The points in the level camera, (n, 2), two or more.
         wanted: Their wanted places, (n, 2).
         depths_m: Shape (n,), above 0.
-        camera: How it is mounted.
+        camera: The camera, with its mounting.
         gain: [1/s]
 
     Returns:

@@ -58,9 +58,9 @@ class TurnEstimate:
         at_ns: The time.
         position: (3,) [m].
         velocity: (3,) [m/s].
-        turn_rate: Of the horizontal velocity, counter-clockwise from above [rad/s].
+        turn_rate: Turn rate of the horizontal velocity, counter-clockwise from above [rad/s].
         extra: Horizontal acceleration on top of the turn's, (2,) [m/s²].
-        covariance: Of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
+        covariance: Covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
     """
 
     at_ns: int
@@ -223,7 +223,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
         """Initialise the filter.
 
         Args:
-            dimensions: Of the position; 1 or more.
+            dimensions: Dimensions of the position; 1 or more.
             intensity_m2_s3: White noise of the acceleration: within a second the velocity wanders by its root.
             speed_m_s: Initial standard deviation of each velocity component.
             gate: Refuse measurements more than this many standard deviations off (Mahalanobis distance); ``math.inf``

@@ -38,7 +38,7 @@ def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.
         own: The number.
         limits: As in ``drone.config``; a missing name limits nothing.
         name: Name of the limit.
-        less: By how much to stay below the limit.
+        less: Margin to stay below the limit.
     """
     limit = limits.get(name)
     return own if isinstance(limit, bool) or not isinstance(limit, int | float) else min(own, limit - less)

@@ -254,7 +254,7 @@ class OnnxPolicy(Behaviour):
         Args:
             drone: The drone to fly.
             path: The ONNX file; see :class:`PolicyNetwork`.
-            camera: Whose frames to use; None is the camera named in the file.
+            camera: Camera to use; None is the camera named in the file.
             state: Names of the state's numbers, if the file does not give them.
             action: ``velocity`` or ``attitude``, if the file does not give it.
             threads: CPU threads for one image.

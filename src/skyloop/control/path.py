@@ -42,7 +42,7 @@ class MotionProfile:
         Args:
             stretches: Length [m] and greatest speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches
                 of at most :data:`SHORTEST_M` take no time.
-            acceleration_m_s2: For speeding up and slowing down; above 0.
+            acceleration_m_s2: Acceleration and deceleration; above 0.
 
         Raises:
             UsageError: A stretch would never end, because its speed limit is 0.
@@ -189,8 +189,8 @@ class Polyline(_Profiled):
 
         Args:
             points: At least two that differ, each (3,) [m].
-            speed_m_s: Along the legs.
-            acceleration_m_s2: At start and end, at stops, and across the arcs.
+            speed_m_s: Speed along the legs.
+            acceleration_m_s2: Acceleration at start and end, at stops, and across the arcs.
             corner_m: Where an arc starts before its corner, at most half a leg; on the arc the vehicle is no faster
                 than its acceleration allows. 0 stops at each corner.
 
@@ -256,12 +256,12 @@ class Circle(_Profiled):
 
         Args:
             centre: x, y, z [m].
-            radius_m: Of the circle.
-            speed_m_s: Along the circle.
+            radius_m: Radius of the circle.
+            speed_m_s: Speed along the circle.
             laps: Number of laps.
             begin_rad: Start on the circle, counter-clockwise from east.
             clockwise: Direction, seen from above.
-            acceleration_m_s2: At start and end.
+            acceleration_m_s2: Acceleration at start and end.
 
         Raises:
             UsageError: A number is out of its range.
@@ -310,7 +310,7 @@ class Lemniscate(_Profiled):
             speed_m_s: Greatest speed, reached in the centre.
             laps: Number of laps.
             yaw_rad: Turns the figure counter-clockwise.
-            acceleration_m_s2: At start and end.
+            acceleration_m_s2: Acceleration at start and end.
 
         Raises:
             UsageError: A number is out of its range.

@@ -71,7 +71,7 @@ class Predicted:
     """The motion when a set-point sent now takes effect; horizontal axes with x along yaw 0.
 
     Attributes:
-        at_ns: That time.
+        at_ns: Time at which it takes effect.
         moved: Distance moved since the last feedback, (2,) [m].
         velocity: (2,) [m/s].
         push: Acceleration by the air, (2,) [m/s²].

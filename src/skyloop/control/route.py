@@ -220,7 +220,7 @@ class Conditions:
         altitude_m: Greatest height above the ground.
         battery_warn: Charge below which the vehicle warns.
         battery_land: Charge below which the vehicle lands.
-        flight_time_s: How long a full battery lasts.
+        flight_time_s: Flight time of a full battery.
     """
 
     space: Space = field(default_factory=Space)

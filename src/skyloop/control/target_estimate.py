@@ -107,7 +107,7 @@ class TargetState:
         range_m: Horizontal distance from the camera that saw it last.
         range_deviation_m: Standard deviation along the line of sight.
         range_known: Whether the range is good enough to fly by; False while it is only a guess.
-        margin_m: How much nearer it may be: extra distance for the vehicle to keep; 0 for a target on the ground.
+        margin_m: Extra distance to keep, because the target may be nearer; 0 for a target on the ground.
     """
 
     at_ns: int

@@ -368,8 +368,8 @@ class FollowTarget(Behaviour):
             height_m: The target's height, if known, to estimate its distance; otherwise the height of its class. With
                 neither, the drone only turns until its own motion has revealed the range.
             traits: Complete prior knowledge about the target, instead of ``height_m``.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera.

@@ -172,7 +172,7 @@ class Scene:
     """The detected things.
 
     Attributes:
-        objects: By number.
+        objects: Things by number.
         kept: Numbers of things never forgotten, however long hidden.
         dormant: Numbers of things not matched with detections; their return is decided elsewhere.
         traits: Traits by class, for new things.

@@ -36,7 +36,7 @@ class Camera:
 
     Attributes:
         position: In odometry axes, with the height above the ground, if known, as the third, (3,) [m].
-        rotation: From optical axes to odometry axes, (3, 3).
+        rotation: Rotation from optical axes to odometry axes, (3, 3).
         intrinsics: Intrinsics of the image.
         size: Width and height of the image [px].
         yaw_rad: Standard deviation of its yaw at the capture.
@@ -66,20 +66,20 @@ class Camera:
         """Place a camera.
 
         Args:
-            mounting: How it is mounted.
+            mounting: The camera, with its mounting.
             feedback: The vehicle's state at the capture.
             body: Position of the vehicle, (3,) [m]; the third is its height above the ground, if known.
-            intrinsics: In pixels of the image.
+            intrinsics: Intrinsics, in pixels of the image.
             size: Width and height of the image [px].
-            rates_rad_s: Of yaw and of tilt, for a vehicle whose images and attitude have no common clock: the faster it
-                turns, the less certain is its attitude at the capture.
+            rates_rad_s: Rates of yaw and tilt, for a vehicle whose images and attitude have no common clock: the faster
+                it turns, the less certain is its attitude at the capture.
             risen_m: Climb by the vehicle's integrated velocity [m]; None: unknown.
 
         Returns:
             None while the attitude is unknown.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
             return None
@@ -115,7 +115,7 @@ class BoxView:
     """The directions of a box's middle and edges.
 
     Attributes:
-        azimuth: Of the middle, counter-clockwise from x of odometry axes [rad].
+        azimuth: Azimuth of the middle, counter-clockwise from x of odometry axes [rad].
         bottom: Tangent of the lower edge's elevation; None if the image cuts it off.
         top: The same of the upper edge.
         below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; else None.

@@ -194,7 +194,7 @@ class MotionCapture:
 
         Args:
             function: Called on a separate thread; poses overtaken by newer ones are dropped and counted.
-            depth: How many poses can wait for it, such as one per body.
+            depth: Number of poses that can wait for it, such as one per body.
             inline: Call it on the receiving thread instead, with every pose. It must be quick and must not block.
 
         Raises:

@@ -372,7 +372,7 @@ class Tally:
         """Count a published result.
 
         Args:
-            age_s: From the frame's capture until now [s].
+            age_s: Time since the frame's capture [s].
             took_s: Duration of ``process`` [s].
         """
         self.results += 1

@@ -174,7 +174,7 @@ class OriginGuard:
 
     Args:
         host: Address to listen on.
-        port: To listen on; 0 takes a free one.
+        port: Port to listen on; 0 takes a free one.
 
     Attributes:
         port: The port.

@@ -250,9 +250,9 @@ def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
     """Return the share of the cells of a grid over the image that hold a corner, 0 to 1.
 
     Args:
-        views: Of one camera.
-        width: Of the images [px].
-        height: Of the images [px].
+        views: Views of one camera.
+        width: Width of the images [px].
+        height: Height of the images [px].
     """
     cells = np.zeros(GRID, dtype=bool)
     for view in views:
@@ -269,8 +269,8 @@ def calibrate(
 
     Args:
         views: At least 6, with the board at different places and tilts.
-        width: Of the images [px].
-        height: Of the images [px].
+        width: Width of the images [px].
+        height: Height of the images [px].
         model: ``"pinhole"`` or ``"fisheye"``.
         camera: The camera's name, stored in the calibration.
 

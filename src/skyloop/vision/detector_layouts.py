@@ -73,8 +73,8 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
 
     Args:
         outputs: Outputs by name, of one run on any image.
-        width: Of the network's input [px].
-        height: Of the network's input [px].
+        width: Width of the network's input [px].
+        height: Height of the network's input [px].
         classes: Number of known class names; None: none.
 
     Raises:
@@ -137,8 +137,8 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
     Args:
         layout: Layout of the outputs.
         outputs: Outputs by name.
-        width: Of the network's input [px].
-        height: Of the network's input [px].
+        width: Width of the network's input [px].
+        height: Height of the network's input [px].
 
     Raises:
         FileFormatError: The outputs don't have the shapes of this layout.

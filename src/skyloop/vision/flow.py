@@ -42,10 +42,10 @@ class GroundTracker:
         """Initialise the tracker.
 
         Args:
-            camera: How the camera is mounted.
+            camera: The camera, with its mounting.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
             MissingExtraError: OpenCV is not installed.
         """
         self._cv: Any = opencv("optical flow")

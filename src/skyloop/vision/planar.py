@@ -67,7 +67,7 @@ class PlanarSighting:
         """Return its centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
         return mounting_rotation(camera) @ self.position_m + offset
@@ -76,7 +76,7 @@ class PlanarSighting:
         """Return the unit vector out of its face in body axes, shape (3,).
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         return mounting_rotation(camera) @ self.normal
 
