@@ -18,7 +18,7 @@ def main(target: str = "sim://?world=platform&cameras=bottom&fps=15", seconds: f
             print(landing.run(seconds=float(seconds)))
         print("landed on the platform" if landing.landed else f"not landed: {landing.phase}")
         truth = drone.feedback().native or {}
-        if "truth.target.x" in truth:  # the simulator tells where both really are
+        if "truth.target.x" in truth:  # the simulator's true positions of both
             x, y, marker_x, marker_y = (
                 float(str(truth[f"truth.{name}"])) for name in ("x", "y", "target.x", "target.y")
             )

@@ -32,7 +32,7 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
     except OSError as error:
         raise FileFormatError(f"{what} {path} can't be read: {error.strerror or error}") from None
     if len(content) > most:
-        raise FileFormatError(f"{what} {path} is larger than the limit of {most} bytes")
+        raise FileFormatError(f"{what} {path} is larger than {most} bytes, the limit")
     return content
 
 

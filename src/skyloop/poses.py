@@ -82,7 +82,7 @@ def target_in_world(
 def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
     """Return the rotation from a camera's optical axes to body axes, shape (3, 3); needs no extra.
 
-    Raises :class:`UsageError` if the camera does not say how it is mounted.
+    Raises :class:`UsageError` if the camera's mounting is unknown.
     """
     if camera.rotation is None:
         raise UsageError(f"camera {camera.name!r} does not say how it is mounted: give its CameraInfo a rotation")

@@ -172,7 +172,7 @@ class _Actor:
             self._begin(task)
         except SkyloopError as error:
             self._trouble = str(error)
-        except Exception as error:  # noqa: BLE001  (the user's class may raise anything when it is made)
+        except Exception as error:  # noqa: BLE001  (the user's class may raise anything)
             self._trouble = f"{task.kind.__name__}() raised {error!r}"
 
     def _begin(self, task: _Order) -> None:

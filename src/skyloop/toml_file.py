@@ -156,7 +156,7 @@ def _tables(info: inspect.Type) -> list[inspect.StructType]:
 
 
 def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
-    """Return type and requiredness of each key of a table; of several kinds take the one that the table names."""
+    """Return each key's type and whether it is required; of several kinds take the one that the table names."""
     kinds = _tables(info)
     tag = kinds[0].tag_field
     fields: dict[str, tuple[inspect.Type, bool]] = {}

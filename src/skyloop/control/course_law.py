@@ -168,7 +168,7 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the next gate; ignore one where that gate can't be.
+        """Update with a sighting of the next gate; ignore it if that gate can't be there.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].

@@ -227,7 +227,7 @@ class Formation:
         found = self.drones.feedback(max_age_s=MAX_AGE_S)
         if not found:
             aside = "; ".join(f"{name}: {error}" for name, error in self.drones.errors.items())
-            raise UsageError(f"no drone of this swarm is active ({aside}): readmit them with readmit()")
+            raise UsageError(f"no drone of this swarm is active ({aside}): take them back with readmit()")
         problems = [f"{name}: {lacking(sample)}" for name, sample in found.items() if lacking(sample)]
         problems += [
             f"{name}: it is {sample.state.value}, take off first"

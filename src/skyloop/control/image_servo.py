@@ -356,8 +356,8 @@ class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, by a camera that looks down.
 
     Needs the vehicle's attitude and height, uses nothing else of its feedback, and flies by attitude. Without sight of
-    the ground it lets the vehicle hover as it can, which may drift, and emits a warning; it then holds the
-    position at which it sees the ground again.
+    the ground the vehicle hovers by its own means, perhaps drifting, and a warning is emitted; the behaviour then
+    holds the position at which it sees the ground again.
     """
 
     name = "flow hover"

@@ -110,7 +110,7 @@ class View:
     def _try_step(self, *, ending: bool) -> None:
         try:
             self.step(time.monotonic_ns(), ending=ending)
-        except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
+        except Exception:  # noqa: BLE001  (a view that ended would show a frozen image of a flying drone)
             _log.exception("the view continues after an error")
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:

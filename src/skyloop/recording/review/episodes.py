@@ -314,7 +314,7 @@ class Film:
                 at += 1
         for _ in wanted[at:]:  # their images are missing at the end of a truncated file
             if image is None:
-                raise FileFormatError(f"{recording.path}: no picture of {camera} can be decoded")
+                raise FileFormatError(f"{recording.path}: no image of {camera} can be decoded")
             self.repeated += 1
             self._encode(image, recording.path)
 
