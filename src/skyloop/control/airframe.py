@@ -34,7 +34,7 @@ STALE_S: Final = 0.5  #: older values count as unknown; after a longer gap the o
 #: Drag of a small quadrotor at a few metres a second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
 #: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
-_HISTORY_S: Final = 3.0  # of the motion kept
+_HISTORY_S: Final = 3.0  # how much motion to keep
 _SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples, whose yaw differences say little
 _EXTRAPOLATE_S: Final = 0.3  # longest extrapolation of a motion
 _TILTING_S: Final = 0.3  # time over which the tilt rate is measured

@@ -36,8 +36,8 @@ _APPROACH_HORIZON_S = 3.0  # give way to a target that will pass sooner than thi
 _CONFIDENT_SIGMA_M = 0.35  # a position with at most this deviation counts as certain
 _UNCERTAIN_M = 1.0  # largest extra clearance from a person whose position is uncertain
 _KEEP_SIDE_S = 1.0  # after giving way to one side, stay on that side for this long
-_HEAD_ON_SHARE = 0.2  # of the clearance: within it a pass is head-on, and either side will do
-_SWEEP_BACK_SHARE = 0.4  # of the sweep: how far it goes to the side away from the target's motion
+_HEAD_ON_SHARE = 0.2  # share of the clearance: within it a pass is head-on, and either side will do
+_SWEEP_BACK_SHARE = 0.4  # share of the sweep that goes away from the target's motion
 _HEIGHT_REACHED_M = 0.1  # this close to a parallax height, head for the other one
 _ALONG_M_S = 0.4  # a slower target has no direction of motion to be behind or beside of
 
@@ -71,7 +71,7 @@ class ChaseLaw:
         self.phase = TargetPhase.LOOKING
         self.off_m: float | None = None
         self.held_by = ""
-        self._heading: float | None = None  # of the target's last motion
+        self._heading: float | None = None  # heading of the target's last motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
         self._previous_position: Array | None = None  # in odometry axes, at the last step
         self._begin: Array | None = None  # start, in world axes; None until the position is known

@@ -83,7 +83,7 @@ class Controller:
         self._stopped = threading.Event()
         self._ended = False  # for good
         self._inbox: Mailboxes | None = None
-        self._checks: _Checks | None = None  # of the newest run
+        self._checks: _Checks | None = None  # checks of the newest run
 
     # Callbacks to override ------------------------------------------------------------------------------------------
 

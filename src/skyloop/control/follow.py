@@ -86,7 +86,7 @@ class FollowLaw(VelocityLaw):
         #: Wanted angle around the marker, from its normal, counter-clockwise from above [rad], and its rate [rad/s].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0
-        self.off_m: float | None = None  #: of distance and height together, as of the last step; None while searching
+        self.off_m: float | None = None  #: error of distance and height, as of the last step; None while searching
         self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
         self._target = TargetFilter()
         self._face: Array | None = None  # the marker's normal, horizontal part, odometry axes

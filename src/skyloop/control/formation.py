@@ -27,7 +27,7 @@ class Approach(NamedTuple):
     """The closest approach of several drones.
 
     Attributes:
-        distance_m: Between the two that come closest; infinite for fewer than two drones.
+        distance_m: Distance of the two closest drones; infinite for fewer than two drones.
         first: Index of one of them.
         second: Index of the other.
     """
@@ -42,7 +42,7 @@ def line(n: int, spacing_m: float) -> Places:
 
     Args:
         n: Number of drones.
-        spacing_m: Between neighbours.
+        spacing_m: Distance between neighbours.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -56,7 +56,7 @@ def column(n: int, spacing_m: float) -> Places:
 
     Args:
         n: Number of drones.
-        spacing_m: Between neighbours.
+        spacing_m: Distance between neighbours.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -70,7 +70,7 @@ def circle(n: int, spacing_m: float) -> Places:
 
     Args:
         n: Number of drones.
-        spacing_m: Between neighbours, along the chord.
+        spacing_m: Distance between neighbours, along the chord.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -86,8 +86,8 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
 
     Args:
         n: Number of drones.
-        spacing_m: Between neighbours on one leg.
-        angle: Between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
+        spacing_m: Distance between neighbours on one leg.
+        angle: Angle between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
 
     Raises:
         UsageError: An argument is out of its range.
@@ -105,7 +105,7 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
 
     Args:
         n: Number of drones.
-        spacing_m: Between neighbours in a row and between rows.
+        spacing_m: Distance between neighbours in a row and between rows.
         columns: Drones in a row; None makes the grid as square as possible.
 
     Raises:

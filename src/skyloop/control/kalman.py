@@ -30,7 +30,7 @@ _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 _SEEN = np.eye(2, 7)  # the measured part of the state
 _STEP_S = 0.1  # longest step of a prediction; within a step the acceleration keeps its direction
 _STRAIGHT_RAD = 1e-4  # below this angle the transition uses its series expansion
-_HEIGHT_INTENSITY_M2_S3 = 0.01  # of the height's random acceleration
+_HEIGHT_INTENSITY_M2_S3 = 0.01  # random acceleration of the height
 _CLIMB_M_S = 0.3  # initial standard deviation of the vertical velocity
 
 

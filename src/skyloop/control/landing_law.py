@@ -37,7 +37,7 @@ _KEPT_S = 2.0  # history of estimates, to check how well the marker's motion was
 _MOST_REFUSED = 4  # after this many sightings in a row outside the gate, the filter restarts
 _CONTRADICTED = 2  # after this many, a touch-down is aborted
 _LATEST_S = 0.1  # longest extrapolation of the turn rate from the feedback at a frame
-_REACTION_S = 0.25  # time in which the vehicle removes a velocity error; the touch-down point drifts by it
+_REACTION_S = 0.25  # a velocity error shifts the touch-down point for this long; then the vehicle has removed it
 _JUST = 0.999  # margin below a limit: turning a velocity into body axes may round it up
 _MOVES_M_S = 0.1  # a slower target has no direction that could turn
 _FRESH_S = 0.2  # greatest age of the motion for which a touch-down counts
@@ -63,7 +63,7 @@ class _Relative:
     target: TurnEstimate
     offset: Array  #: (3,) [m], from the vehicle's centre
     velocity: Array  #: (2,) [m/s]
-    height: float  #: of the feet over the marker [m]
+    height: float  #: height of the feet over the marker [m]
     touching_off: float  #: distance by which a touch-down now would miss [m]
 
 

@@ -66,7 +66,7 @@ class LandingSettings:
     #: Turn the image's longer side along the motion of a marker faster than this, to see it for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
-    long_side_rad: float = math.pi / 2  #: of the image, from forward, counter-clockwise from above
+    long_side_rad: float = math.pi / 2  #: from forward, counter-clockwise from above
 
     fresh_s: float = 0.35  #: continue without a sighting for this long
     recovering_s: float = 4.0  #: follow the unseen marker's predicted position for this long, then search

@@ -29,7 +29,7 @@ from skyloop.messages.geometry import rotation_from_euler
 
 Array = NDArray[np.float64]
 
-_STEP_S = 0.01  # of the prediction
+_STEP_S = 0.01  # step of the prediction
 _LONGEST_GAP_S = 0.25  # after a longer gap the intervening motion is unknown
 _LONGEST_PREDICTION_S = 0.5  # beyond the last feedback
 _KEPT_SETPOINTS = 64  # newest set-points sent

@@ -49,7 +49,7 @@ TAKEN: Final = "another command of this program replaced it"
 PHOTOS: Final = "photos"  #: default folder of photos
 LOG: Final = "route"  #: log name of the progress
 WAYPOINTS: Final = "waypoints"  #: log name of the remaining waypoints, for maps
-_QUALITY: Final = 92  # of JPEG
+_QUALITY: Final = 92  # JPEG quality
 _LOG_S: Final = 4.0  #: maps drop places logged more than 10 s ago
 
 

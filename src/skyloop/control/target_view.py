@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _CUT_PX: Final = 2.0  # a box closer than this to the image's edge, and than this share of its size, may be cut off
 _CUT: Final = 0.07
-_BESIDE: Final = 0.75  # of the image's size, from the optical axis; 0.5 is the edge
+_BESIDE: Final = 0.75  # in image sizes from the optical axis; 0.5 is the edge
 _STEEPEST: Final = 0.15  # cosine of the elevation; a thing nearly straight above or below has no azimuth
 _TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
 _YAW_RAD: Final = 0.006  # error of the yaw at the capture

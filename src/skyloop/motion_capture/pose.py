@@ -132,7 +132,7 @@ def scipy_types() -> Any:
 
 
 REST_S: Final = 2.0  #: how long poses are collected for a calibration
-MAX_SPREAD_M: Final = 0.005  #: of the poses of a drone at rest: more means motion or poor tracking
+MAX_SPREAD_M: Final = 0.005  #: spread of poses at rest: more means motion or poor tracking
 MAX_SPREAD_RAD: Final = math.radians(1.0)  #: the same for their rotation
 MIN_POSES: Final = 20  #: for a calibration
 

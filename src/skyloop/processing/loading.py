@@ -15,7 +15,7 @@ from skyloop.control.loading import load_module
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 
 _WANTED: Final = "a class with a method process(self, frame)"
-_DIGITS: Final = 16  #: of the hash of the code
+_DIGITS: Final = 16  #: digits of the code's hash
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,8 +153,8 @@ class End(msgspec.Struct, frozen=True):
     reason: str  #: ``closed``, or ``rotated`` if another file follows
     ended_unix_ns: int
     written: dict[str, int]  #: messages in *this file*, by topic
-    dropped: dict[str, dict[str, int]] = {}  #: by drone and channel: received but dropped by the recorder
-    missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received, from gaps in the numbers
+    dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
+    missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel, from gaps in their numbers
 
 
 def to_metadata(record: msgspec.Struct) -> dict[str, str]:
@@ -222,8 +222,8 @@ class ResultRecord(msgspec.Struct, frozen=True):
     worker: int
     number: int
     camera: str
-    seq: int  #: of the frame
-    captured_ns: int  #: of the frame
+    seq: int  #: sequence number of the frame
+    captured_ns: int  #: capture of the frame
     made_ns: int  #: completion of the result, on the proxy's clock
     took_ns: int
     value: Any = None

@@ -158,8 +158,8 @@ class Status(msgspec.Struct, frozen=True):
     bytes: int = 0  #: in all files
     messages: int = 0
     waiting: int = 0  #: bytes received but not written yet
-    dropped: dict[str, dict[str, int]] = {}  #: by drone and channel: received but dropped
-    missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received
+    dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
+    missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel
 
 
 class RecorderEvent(msgspec.Struct, frozen=True):

@@ -361,7 +361,7 @@ class Course:
         self.newest_ns = 0
         self.shift_ns = shift_ns
         self._doubted_ns: int | None = None  # an implausible time: accepted if the next one agrees
-        self._log_ns = 0  # of the newest sample
+        self._log_ns = 0  # log time of the newest sample
 
     def follow(self, value: Any, log_ns: int = 0) -> int:
         """Return the time of the next sample in the order of the file, recorded at ``log_ns`` (0: unknown)."""

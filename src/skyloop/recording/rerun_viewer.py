@@ -29,7 +29,7 @@ from skyloop.recording.taps import check_names
 from skyloop.recording.translation import Picture
 from skyloop.recording.view import Source
 
-PORT: Final = 9876  #: of Rerun's viewer
+PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time for the viewer to listen
 _AHEAD: Final = 8 * MB  #: bytes that the viewer can be behind
 _PATIENCE_S: Final = 0.5  # how long to wait for a slow viewer before dropping samples

@@ -77,7 +77,7 @@ __all__ = [
 class Piece:
     """A chunk, or a run of messages outside chunks."""
 
-    offset: int  #: of the chunk's data, or of the run's first record
+    offset: int  #: offset of the chunk's data, or of the run's first record
     size: int  #: in the file
     start_ns: int = 0  #: log time of its first and last message; 0 if unknown
     end_ns: int = 0
@@ -386,7 +386,7 @@ _FOOTER: Final = struct.Struct("<QQI")  #: start of the summary and of its offse
 _TAIL: Final = FRAME.size + _FOOTER.size + len(MAGIC)
 _DATA_END: Final = FRAME.size + 4
 _INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes of the following map
-_INDEX_SIZES: Final = struct.Struct("<QQ")  #: of a chunk's data, packed and unpacked
+_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, packed and unpacked
 _U64: Final = struct.Struct("<Q")
 _U32: Final = struct.Struct("<I")
 

@@ -20,7 +20,7 @@ BEAT_S: Final = 0.02  #: period of polling the backlog, so that receiving thread
 _BATCH: Final = MB  # bytes to show before asking the screen for its sources again
 _LIMIT: Final = 16 * MB  # bytes that can wait for a slow screen; older images are useless to a viewer
 _RESERVE: Final = 16 * MB  # bytes beyond that for samples that must not be dropped
-_QUALITY: Final = 80  # of JPEG: these images are viewed, not kept
+_QUALITY: Final = 80  # JPEG quality: these images are viewed, not kept
 _LOOK_NS: Final = nanoseconds(1.0)  # how often to check the streams
 NICENESS: Final = 5
 

@@ -41,14 +41,14 @@ _PATIENCE: Final = 10  # images without verification before the whole image is s
 _TRIAL: Final = 3  # images in which a found place must be verified
 _LEARN_EACH: Final = 5  # learn at most every this many images
 _LOOK_AROUND_EACH: Final = 15  # look for look-alikes every this many images
-_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # of the target's last size, searched in turn, one per image
+_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # shares of the target's last size, searched one per image
 
 # Score, and share of such boxes with an overlap of at least a half: `python -m benchmarks.tracking_street`.
 _CONFIDENCE: Final = ((0.45, 0.857), (0.55, 0.946), (0.65, 0.974), (0.75, 0.986), (0.85, 0.986), (0.95, 0.989))
 _PLACES: Final = 5  # strips across a box in which its colours are sampled
 _ASIDE: Final = 0.12  # offset between neighbouring strips, of the box's width
 _HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as shares of the height
-_SIZE: Final = (24, 24)  # of the stored patch, whatever the target's shape
+_SIZE: Final = (24, 24)  # stored patch, regardless of the target's shape
 _GRADIENTS: Final = 7  # the first channels of the features
 _COLOUR_WEIGHT: Final = 1.2  # how fast the similarity falls with the colour distance
 _KEPT: Final = 12  # appearances kept, and as many look-alikes

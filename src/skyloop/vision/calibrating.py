@@ -36,7 +36,7 @@ LEAST_VIEWS: Final = 6  #: needed for a calibration
 GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
 _WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
 _WORST_PX: Final = 0.3  # ... and above this
-_NEW_SHARE: Final = 0.08  # of the image's width: a view is new only if its corners moved at least this far
+_NEW_SHARE: Final = 0.08  # share of the image's width: a view is new only if its corners moved at least this far
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
@@ -46,7 +46,7 @@ class BoardView:
 
     points: Array  #: (n, 3) on the board [m]
     pixels: Array  #: (n, 2) in the image
-    name: str = ""  #: of the image, for messages
+    name: str = ""  #: name of the image, for messages
 
     @property
     def centre(self) -> Array:
@@ -66,7 +66,7 @@ class Board:
     rows: int = 5
     square_m: float = 0.033  #: side of a printed square: measure it
     kind: Kind = "charuco"
-    dictionary: str = "4x4_50"  #: of a ChArUco board's markers
+    dictionary: str = "4x4_50"  #: dictionary of a ChArUco board's markers
 
     def __post_init__(self) -> None:
         for name, least in (("columns", 3), ("rows", 3)):
@@ -223,7 +223,7 @@ class Collector:
     def __init__(self, width: int, height: int) -> None:
         """Initialise an empty collection for images of one size [px]."""
         self.views: list[BoardView] = []
-        self.size = (width, height)  #: of the images
+        self.size = (width, height)  #: width and height of the images [px]
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
@@ -319,7 +319,7 @@ class _Fit(NamedTuple):
     rms: float
     matrix: Array
     distortion: Array
-    errors: Array  # of each view [px], RMS
+    errors: Array  # RMS error of each view [px]
     fx_deviation: float | None
 
 

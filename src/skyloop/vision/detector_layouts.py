@@ -42,7 +42,7 @@ RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
 #: Layouts with overlapping boxes, which need suppression.
 SUPPRESSED: Final = frozenset({Layout.YOLO5, Layout.YOLO8, Layout.YOLOX, Layout.YOLOX_DECODED})
 
-_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # of the grids of YOLOX models [px]
+_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # grids of YOLOX models [px]
 _FEW: Final = 1000  # queries of a network without suppression: 100 to 900, mostly 300
 
 Array = NDArray[np.generic]

@@ -24,18 +24,18 @@ from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, re
 Rgb = tuple[int, int, int]
 
 _HUE_DEG: Final = 16.0  # tolerance on each side of the colour's own hue
-_SATURATION: Final = 0.5  # of the colour's own saturation: covers paint in light and shade
-_LEAST_SATURATION: Final = 80  # of 255: a colour with less is too grey to distinguish
-_LEAST_VALUE: Final = 35  # of 255: darker pixels have no reliable hue
+_SATURATION: Final = 0.5  # share of the colour's own saturation: covers paint in light and shade
+_LEAST_SATURATION: Final = 80  # 0 to 255: a colour with less is too grey to distinguish
+_LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # smaller openings say little about the distance
 _FARTHEST_M: Final = 8.0  # anything further away is more likely a patch of the same colour
 _SIDE_SHARE: Final = 0.15  # share of each side left out at both ends, because corners look round
-_FILLED: Final = 0.6  # of the four-sided hull: a thing of the same colour behind the gate may reach into the hole
+_FILLED: Final = 0.6  # least share of the four-sided hull: a thing of the same colour behind the gate may reach into the hole
 _OFF_PX: Final = 1.5  # greatest root mean square distance of the edge from its four sides
-_LEAST_HEIGHT_PX: Final = 20  # of a pole
+_LEAST_HEIGHT_PX: Final = 20  # least height of a pole
 _SLIM: Final = 3.0  # least ratio of a pole's height to its width
 _ABOVE_PX: Final = 6  # searched above a pole for something that hides its top
-_COLOURFUL: Final = 100  # saturation, of 255
+_COLOURFUL: Final = 100  # saturation, 0 to 255
 _LEAST_SHARE: Final = 0.8  # least share of a pole's rows that are one piece; two overlapping poles are not
 
 

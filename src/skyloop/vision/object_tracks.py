@@ -106,7 +106,7 @@ class TrackedObject:
     id: int  #: from 1; never reused
     detection: Detection  #: the last detection, with its box
     box: Box  #: x, y, width, height [px], filtered; predicted while the object is not seen
-    velocity: tuple[float, float]  #: of the box's centre, right and down [px/s]
+    velocity: tuple[float, float]  #: velocity of the box's centre, right and down [px/s]
     seen: bool  #: whether the object was detected in this image
     age_s: float  #: since it was first detected [s]
     unseen_s: float  #: since it was last detected [s]

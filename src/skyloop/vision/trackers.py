@@ -37,7 +37,7 @@ _AREA_PX: Final = 128.0**2  # size of the sampled patch around the target
 _CONTEXT: Final = 1.5  # margin added to width and height, times the root of the target's area
 _RATE: Final = 0.02  # learning rate per image
 _SCALE_RATE: Final = 0.02  # learning rate of the size per image
-_REGULARISATION: Final = 0.02  # of the mean energy of the spectrum
+_REGULARISATION: Final = 0.02  # share of the spectrum's mean energy
 _SPREAD: Final = 0.08  # width of the peak, as a share of the target's size
 _SCALES: Final = 17  # sizes tried per image
 _SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
@@ -47,12 +47,12 @@ _SMALLEST: Final = 0.2  # times the initial size
 _LARGEST: Final = 6.0  # times the initial size
 _LEAST_PX: Final = 4.0  # smallest side of a target
 _GRID: Final = 10  # points along each side
-_WINDOW: Final = (11, 11)  # of Lucas-Kanade [px]
-_LEVELS: Final = 3  # of its image pyramid
+_WINDOW: Final = (11, 11)  # window of Lucas-Kanade [px]
+_LEVELS: Final = 3  # levels of its image pyramid
 _AROUND: Final = (9, 9)  # pixels of a point's surroundings to compare
 _ENOUGH: Final = 6  # points needed
 _RETURN_PX: Final = 5.0  # a larger median return distance is a failure
-_SPREAD_PX: Final = 0.35  # of the box's smaller side: a larger spread of the displacements is a failure
+_SPREAD_PX: Final = 0.35  # share of the box's smaller side: a larger spread of the displacements is a failure
 _SMALLEST_PX: Final = 6.0  # a smaller box is a failure
 
 
@@ -104,7 +104,7 @@ class CorrelationTracker(Tracker):
         """
         self._cv: Any = opencv("tracking")
         self._lost_below, self._learn_above = lost_below, learn_above
-        self._centre: NDArray[np.float64] = np.zeros(2)  # of the target [px]
+        self._centre: NDArray[np.float64] = np.zeros(2)  # the target's centre [px]
 
     def shift(self, right: float, down: float) -> None:
         """Search for the target shifted by this much to the right and down in the next image [px]."""
@@ -121,7 +121,7 @@ class CorrelationTracker(Tracker):
         self._scale_sampled = _in_cells(self._size, _SCALE_AREA_PX)
         columns, rows = self._sampled[0] // CELL, self._sampled[1] // CELL
         self._window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1]).astype(np.float32)
-        cells = np.array([columns, rows]) * self._size / self._around  # of the target
+        cells = np.array([columns, rows]) * self._size / self._around  # the target's size in cells
         wanted = np.outer(_peak(rows, _SPREAD * cells[1] + 0.5), _peak(columns, _SPREAD * cells[0] + 0.5))
         self._filter = _Filter(np.asarray(np.fft.rfft2(wanted), np.complex64), _RATE)
         self._steps = _SCALE_STEP ** (np.arange(_SCALES) - _SCALES // 2)

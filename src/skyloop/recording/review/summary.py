@@ -55,8 +55,8 @@ class Summary:
 
     rows: tuple[Row, ...]
     seconds: float
-    dropped: dict[str, dict[str, int]]  #: by drone and channel: dropped by the recorder
-    missed: dict[str, dict[str, int]]  #: by drone and channel: never reached the recorder
+    dropped: dict[str, dict[str, int]]  #: samples dropped by the recorder, by drone and channel
+    missed: dict[str, dict[str, int]]  #: samples that never reached the recorder, by drone and channel
     events: dict[str, int]  #: number by severity
     notes: tuple[str, ...] = ()  #: problems of the file, in words
 

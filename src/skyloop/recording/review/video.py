@@ -211,7 +211,7 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 # Copying --------------------------------------------------------------------------------------------------------
 
 
-TIME_BASE: Final = Fraction(1, 90_000)  #: of the files: the usual video clock
+TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual video clock
 MAX_FILES: Final = 50  #: encode a stream that changes more often instead
 _LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step: 31 bits hold less than seven hours
 _USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration of the last image
