@@ -25,7 +25,7 @@ from skyloop.vision.object_tracks import Detection
 
 Floats = NDArray[np.float32]
 
-_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # scale of L, a, b: light changes L most
+_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b: light changes L most
 _OTHER: Final = 10.0  # unlikeness from which it is another thing; of the same thing mostly below 0.5, at times 3
 _OTHER_AGAIN: Final = 3.0  # the same for a thing unseen for a moment
 _MOMENT_S: Final = 0.3  # after which _OTHER_AGAIN applies
