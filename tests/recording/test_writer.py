@@ -432,5 +432,5 @@ def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path) -> None:
     options = Options(min_free_mb=40)
     path = tmp_path / "f.mcap"
     writer = FileWriter(path, options, Backlog(MB), [], [], CLOCK, lambda *_: None, opener=disk.open, free=disk.free)
-    with pytest.raises(UsageError, match="has 9 MB left, and recording leaves 40 MB free"):
+    with pytest.raises(UsageError, match="has 9 MB left, but recording keeps 40 MB free"):
         writer.start()
