@@ -165,7 +165,7 @@ def test_files_round_trip(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "not a calibration"),
+        ("", "not a camera calibration"),
         ("{}", "missing required field"),
         ('{"width": 0, "height": 480, "model": "pinhole", "fx": 1, "fy": 1, "cx": 0, "cy": 0}', "width"),
         ('{"width": 640, "height": 480, "model": "mirror", "fx": 1, "fy": 1, "cx": 0, "cy": 0}', "mirror"),
