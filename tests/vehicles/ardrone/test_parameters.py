@@ -154,7 +154,7 @@ def test_what_a_drone_may_say_besides() -> None:
 
 def test_texts_that_a_parameter_cannot_be() -> None:
     entry = entries_of(DRONES[2], 2)["camera.active"]
-    with pytest.raises(DecodeError, match="no number of"):
+    with pytest.raises(DecodeError, match="not the number of one of"):
         entry.from_text("7")
     assert not taken(entry, "1", "bottom")
 
