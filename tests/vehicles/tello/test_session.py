@@ -354,7 +354,7 @@ def test_a_firewall_is_thought_of_when_answers_come_and_no_state() -> None:
     rig.bench.logic.state_string = lambda: None  # type: ignore[method-assign]
     rig.run(2.5)
     assert rig.sink.link_state is LinkState.LOST
-    assert "though it answers: does a firewall of this host let UDP port 8890 in?" in rig.sink.links[-1][1]
+    assert "though it answers: does a firewall of this host block UDP port 8890?" in rig.sink.links[-1][1]
 
 
 def test_a_link_that_breaks_in_flight_is_found_again_and_resumes_nothing() -> None:
