@@ -157,7 +157,7 @@ def test_pixels_with_transparency_become_blue_green_red() -> None:
 
 
 def test_other_pixels_are_refused() -> None:
-    with pytest.raises(DecodeError, match="encoding '32FC1' are not read, only bgr8"):
+    with pytest.raises(DecodeError, match="encoding '32FC1' are not supported, only bgr8"):
         pixels_of(image("32FC1", 4))
     short = image("bgr8", 3)
     short.height = 3

@@ -42,7 +42,7 @@ def test_names_are_below_the_namespace_unless_they_begin_with_a_slash() -> None:
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        ("ros2://1robot", "is no namespace"),
+        ("ros2://1robot", "is not a namespace"),
         ("ros2://robot?image=front-image", "option image is 'front-image'"),
         ("ros2://robot?image=&odom=", "give one of them"),
         ("ros2://robot?takeoff=takeoff&ground=1", "does not leave the ground"),
@@ -149,7 +149,7 @@ class FakeRobot:
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
         if not self.offers:
-            raise DriverError(f"nobody offers the service {service}")
+            raise DriverError(f"no node offers the service {service}")
         self.called.append(service)
         self.answer = answered
 
@@ -208,7 +208,7 @@ def test_a_refused_take_off_is_told_and_over() -> None:
     assert rig.tell() is FlightState.LANDED
     assert "refused /robot/takeoff: propellers blocked" in rig.sink.events[-1].text
     rig.robot.offers = False
-    with pytest.raises(DriverError, match="nobody offers"):
+    with pytest.raises(DriverError, match="no node offers"):
         rig.session.command(Takeoff())
     assert rig.tell() is FlightState.LANDED
 
@@ -223,7 +223,7 @@ def test_a_robot_that_is_not_landed_stops(answer: str) -> None:
     if rig.robot.offers:
         rig.session.command(Land())
     else:
-        with pytest.raises(DriverError, match="nobody offers"):
+        with pytest.raises(DriverError, match="no node offers"):
             rig.session.command(Land())
     if answer == "refused":
         rig.answer(False, "not now")
@@ -373,7 +373,7 @@ def test_the_link_is_lost_with_a_reason_and_found_again() -> None:
     rig.session.tick()
     rig.session.tick()
     assert [state for state, _ in rig.sink.links] == [LinkState.LOST]
-    assert "nothing came on /robot/odom and /robot/image_raw for 1.5 s" in rig.sink.links[0][1]
+    assert "no messages on /robot/odom and /robot/image_raw for 1.5 s" in rig.sink.links[0][1]
     assert "ROS_DOMAIN_ID" in rig.sink.remedy
     rig.tell()
     assert rig.sink.link_state is LinkState.UP
@@ -388,7 +388,7 @@ def test_a_robot_whose_services_nobody_offers_is_degraded() -> None:
     rig.clock.advance(6.0)
     rig.tell()
     rig.tell()
-    assert rig.sink.links == [(LinkState.DEGRADED, "nobody offers the service /robot/takeoff")]
+    assert rig.sink.links == [(LinkState.DEGRADED, "no node offers the service /robot/takeoff")]
     assert "correct its name" in rig.sink.remedy
     rig.robot.offers = True
     rig.tell()
@@ -409,11 +409,11 @@ def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> 
     for _ in range(2):
         rig.session.on_info(info)
     assert [event.text for event in rig.sink.events] == [
-        "the camera's pixels have a skew of 0.4 px, which is left out: calibrate without it"
+        "the camera's pixels have a skew of 0.4 px, which is ignored: calibrate without it"
     ]
     info.distortion_model, info.d = "equidistant", [0.1] * 8
     rig.session.on_info(info)
-    assert "intrinsics can't be used: a lens of the model 'equidistant' has 4" in rig.sink.events[-1].text
+    assert "intrinsics can't be used: lens model 'equidistant' has at most 4" in rig.sink.events[-1].text
     rig.session.on_image(image(rig.system()))
     assert rig.sink.frames[-1].intrinsics is None, "and no exception in the application"
     rig.sink.events.clear()
@@ -457,7 +457,7 @@ def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -
         rig.session.on_image(image(rig.system()))
         rig.session.tick()
     assert rig.sink.links[-1][0] is LinkState.DEGRADED
-    assert "nothing came on /robot/odom for 1." in rig.sink.links[-1][1]
+    assert "no messages on /robot/odom for 1." in rig.sink.links[-1][1]
     assert len(rig.sink.links) == 2, "told once"
     assert rig.robot.sent[-1] == Velocity()
     assert sum(each != Velocity() for each in rig.robot.sent) < 25

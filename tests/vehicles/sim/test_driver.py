@@ -71,7 +71,7 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
         ("sim://?wrld=room", "did you mean 'world'"),
         ("sim://room", "did you mean sim://[?]world=room"),
         ("sim://?cameras=front,botom", "no simulated camera named 'botom'; did you mean 'bottom'"),
-        ("sim://?cameras=front,front", "names one twice"),
+        ("sim://?cameras=front,front", "names a camera twice"),
         ("sim://?speed=0", "option speed"),
         ("sim://?native=atitude", "no action named 'atitude'; did you mean 'attitude'"),
         ("sim://?native=hover", "leaves no set-point"),

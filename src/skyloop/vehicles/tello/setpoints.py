@@ -110,7 +110,7 @@ class SetpointController:
         self.full = Scale()
         self.limits = Scale()
         self.receiving = False  #: whether the drone's state arrives
-        #: After an abandoned stop or landing, until the next command: send nothing, so that it lands by itself (15 s).
+        #: After an abandoned stop or landing, until the next command: silence makes it land after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
