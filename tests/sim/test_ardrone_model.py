@@ -140,7 +140,7 @@ def test_a_link_without_jitter_changes_no_time() -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("0.0 1.0\n0.1\n", "line 2: a time and a value are wanted, not '0.1'"),
+        ("0.0 1.0\n0.1\n", "line 2: expected a time and a value, got '0.1'"),
         ("0.0 1.0\n0.1 north\n", "line 2"),
         ("0.1 1.0\n0.0 1.0\n", "times that don't fall"),
         ("0.1 nan\n0.2 1.0\n", "finite numbers"),

@@ -280,5 +280,5 @@ def test_an_address_names_the_vehicle(name: str, vehicle: VehicleParameters) -> 
 
 
 def test_vehicles_with_and_without_rotors_do_not_mix() -> None:
-    with pytest.raises(UsageError, match="simulations of their own"):
+    with pytest.raises(UsageError, match="need separate simulations"):
         Simulation(HALL, 2, parameters=[RACER, VehicleParameters()])
