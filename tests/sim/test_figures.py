@@ -74,7 +74,7 @@ def test_what_a_figure_can_not_be_is_refused(line: str, wrong: str) -> None:
 
 
 def test_a_path_out_of_the_world_and_light_out_of_range_are_refused() -> None:
-    with pytest.raises(FileFormatError, match="outside of the room"):
+    with pytest.raises(FileFormatError, match="outside the room"):
         parse_world(OUTSIDE + PERSON.replace("[1, 0, 0]", "[9, 0, 0]"))
     with pytest.raises(FileFormatError, match="amplitude"):
         parse_world(OUTSIDE + "[light]\namplitude = 1.5\n")

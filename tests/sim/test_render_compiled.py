@@ -147,7 +147,7 @@ def test_a_process_that_ends_begins_to_compile_no_other_function(monkeypatch: py
 @pytest.mark.parametrize(
     ("error", "problem", "told"),
     [
-        (ImportError("No module named 'numba'"), "Numba is not there: No module named 'numba'", 0),
+        (ImportError("No module named 'numba'"), "Numba is not installed: No module named 'numba'", 0),
         (RuntimeError("cannot cache function\nmore"), "Numba can't compile here: cannot cache function", 1),
         (ValueError(), "Numba can't compile here: ValueError()", 1),
     ],

@@ -136,7 +136,7 @@ class _Frames:
 
 
 class CameraPipeline(_Frames):
-    """Renders each camera's newest exposure on its own thread, and delivers each frame when it is due.
+    """Renders each camera's newest exposure on a separate thread, and delivers each frame when it is due.
 
     Creating the scene takes some tenths of a second: start the pipeline when the first frame is requested.
     """

@@ -1,7 +1,7 @@
 """Collisions of drones with the floor, solids and one another: contact, bounce and friction.
 
-Every few steps, a broad phase finds everything within each drone's reach until the next one. In between only those
-pairs are checked: as arrays if there are many, one at a time if there are few.
+Every few steps, a broad phase finds everything within each drone's reach until the next one. The steps until
+then check only those pairs: as arrays if there are many, one at a time if there are few.
 """
 
 from __future__ import annotations

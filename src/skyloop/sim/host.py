@@ -67,7 +67,7 @@ class SimHost:
             drones: Their number.
 
         Raises:
-            UsageError: The world has no place for so many drones.
+            UsageError: The world has no room for this many drones.
             UnknownNameError: There is no such world.
             FileFormatError: The world's file is invalid.
         """

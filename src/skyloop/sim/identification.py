@@ -98,7 +98,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class SpeedEstimate:
-    """A first-order model of the recorded drone's estimate of its own speed.
+    """A first-order model of the recorded drone's speed estimate.
 
     Attributes:
         lag_s: Time constant [s].

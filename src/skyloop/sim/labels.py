@@ -25,7 +25,7 @@ from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import FigureTarget, TargetState, World
 
-CLASS_NAMES = ("person", "car", "box")  #: of labels; boards and platforms have classes of their own outside this list
+CLASS_NAMES = ("person", "car", "box")  #: of labels; boards and platforms have their own classes, outside this list
 _CLEAR_M = 0.35  # between a camera and solids
 _LONGEST_STEP_S = 20.0  # between two pictures of ``pictures``; tracks keep only 60 s
 

@@ -73,7 +73,7 @@ class Simulation:
 
         Raises:
             UsageError: An argument is out of its range, some vehicles have rotors and others not, or the world has no
-                room for so many drones.
+                room for this many drones.
         """
         if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
             raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
