@@ -190,7 +190,7 @@ def test_it_is_of_one_application_alone(flight: Path) -> None:
     try:
         with (
             open_drone(dial, app="first", scheduler=way.scheduler, on_exit="hover"),
-            pytest.raises(LinkError, match="in step with one application, and that one is connected"),
+            pytest.raises(LinkError, match="in step with one application, which is already connected"),
         ):
             open_drone(dial, app="second", timeout_s=0.5)
     finally:

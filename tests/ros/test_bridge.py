@@ -303,7 +303,7 @@ def test_stamped_velocities_of_others_or_of_long_ago_are_ignored(rig: Rig) -> No
     send("alpha_1/base_link", 2.0)
     assert not any(isinstance(each, Velocity) for each in rig.vehicle.applied)
     assert any("must be alpha_1/base_link" in line for line in rig.commands.logger.lines)
-    assert any("2 s old, 0.5 s are allowed" in line for line in rig.commands.logger.lines)
+    assert any("2 s old; the limit is 0.5 s" in line for line in rig.commands.logger.lines)
     send("alpha_1/base_link", 0.1)
     until(lambda: any(isinstance(each, Velocity) and each.left == 0.3 for each in rig.vehicle.applied), "a velocity")
 

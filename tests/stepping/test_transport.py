@@ -164,7 +164,7 @@ def test_the_proxy_ends_a_connection_and_itself(
 
 
 def test_started_twice(server: SteppedServer, proxy: ServerSide) -> None:
-    with pytest.raises(UsageError, match="served already"):
+    with pytest.raises(UsageError, match="already being served"):
         server.start(proxy)
 
 
