@@ -139,9 +139,7 @@ class SteppedServer(TransportServer):
         if server is None:
             raise LinkError("the replay has ended")
         if self._client is not None:
-            raise LinkError(
-                "a replay with speed=max is in step with one application, which is already connected"
-            )
+            raise LinkError("a replay with speed=max is in step with one application, which is already connected")
         self._number += 1
         peer = Peer(self._number, "this process")
         client = self._client = SteppedClient(self, self._executor, peer, handler)
