@@ -1,4 +1,4 @@
-"""The handshake of one key, the reading of all, and the line of exchanges."""
+"""The handshake for one key, the reading of all keys, and the queue of exchanges."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DUMP = b"control:outdoor = TRUE\ngeneral:num_version_soft = 2.4.8\n\0"
 
 
 class Desk:
-    """A configurator with the time and what became of the exchanges."""
+    """A configurator with the time and the results of its exchanges."""
 
     def __init__(self) -> None:
         self.configurator = Configurator()
@@ -53,7 +53,7 @@ def test_the_handshake() -> None:
     assert desk.says(0.03) == []
 
 
-def test_an_acknowledgement_of_before_is_cleared_first() -> None:
+def test_an_earlier_acknowledgement_is_cleared_first() -> None:
     desk = Desk()
     desk.configurator.on_acknowledge(True)
     desk.submit(Write("control:outdoor", "TRUE"))
@@ -72,7 +72,7 @@ def test_a_config_without_acknowledgement_is_repeated() -> None:
     assert desk.results == ["the drone did not acknowledge a:b"]
 
 
-def test_ids_stand_right_before_the_config() -> None:
+def test_ids_are_sent_right_before_the_config() -> None:
     desk = Desk()
     desk.configurator.ids = Ids("00000001", "00000002", "00000003")
     desk.submit(Write("a:b", "1"))
@@ -89,7 +89,7 @@ def test_reading_everything() -> None:
     assert desk.says(0.1) == []
     assert desk.says(0.25) == [SEND_ALL], "the command may be lost"
     assert not desk.configurator.dump_received(DUMP[:9])
-    assert desk.says(0.3) == [], "something came: it is not asked for again"
+    assert desk.says(0.3) == [], "data arrived: no further request"
     assert desk.configurator.dump_received(DUMP[9:])
     assert desk.configurator.values == {"control:outdoor": "TRUE", "general:num_version_soft": "2.4.8"}
     assert desk.results == [None]
@@ -122,7 +122,7 @@ def test_a_dump_that_fails_is_tried_again_until_the_deadline(reason: str) -> Non
     assert desk.results[1] == f"the drone's configuration could not be read: {reason}"
 
 
-def test_an_endless_dump_is_broken_off() -> None:
+def test_an_endless_dump_is_aborted() -> None:
     desk = Desk()
     desk.submit(Read())
     desk.says()
@@ -144,7 +144,7 @@ def test_exchanges_wait_for_one_another() -> None:
     assert desk.says() == [("CONFIG", ("c:c", "3"))]
 
 
-def test_abandoning_fails_everything_and_forgets_what_was_read() -> None:
+def test_abandoning_fails_all_exchanges_and_forgets_the_configuration() -> None:
     desk = Desk()
     desk.configurator.values = {"a:a": "1"}
     desk.submit(Write("a:a", "1"))
@@ -155,7 +155,7 @@ def test_abandoning_fails_everything_and_forgets_what_was_read() -> None:
     assert not desk.configurator.busy
 
 
-def test_an_exchange_may_follow_from_the_end_of_another() -> None:
+def test_an_exchange_may_be_submitted_at_the_end_of_another() -> None:
     desk = Desk()
     desk.configurator.submit(Exchange(iter(()), ns(99), lambda failure: desk.submit(Write("after:it", "1"))))
     desk.submit(Write("in:line", "1"))
@@ -169,11 +169,11 @@ def test_an_exchange_may_follow_from_the_end_of_another() -> None:
     ("soft", "board", "version"),
     [("1.7.4", "17", 1), ("2.4.8", "33", 2), ("1.11.5", "17", 1), ("3.0", "", 2), ("", "17", 1), ("x", "33", 2)],
 )
-def test_the_version_by_what_the_drone_says(soft: str, board: str, version: int) -> None:
+def test_the_version_from_the_configuration(soft: str, board: str, version: int) -> None:
     assert version_of({"general:num_version_soft": soft, "general:num_version_mb": board}) == version
 
 
-def test_a_drone_that_says_nothing_of_its_version() -> None:
+def test_a_drone_without_a_version() -> None:
     assert version_of({}) is None
     assert version_of({"general:num_version_soft": "0.9"}) is None
 

@@ -1,4 +1,4 @@
-"""The control port as the driver meets it: refusing, slow, broken off, and as it should be."""
+"""The control port from the driver's side: refusing, slow, interrupted, and working."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DUMP = b"control:outdoor = TRUE\n\0"
 
 
 class Desk:
-    """A client, who serves it, and the drone's end of the connection."""
+    """A client with its server loop, and the drone's end of the connection."""
 
     def __init__(self, *, listening: bool = True) -> None:
         self.server = socket.create_server(("127.0.0.1", 0))
@@ -39,7 +39,7 @@ class Desk:
         self.client.follow(self.configurator, self.now_ns)
 
     def serve(self) -> None:
-        """Wait until the connection wants to be served, and do it."""
+        """Wait until the connection is ready, and serve it."""
         assert self.selector.select(5.0)
         self.client.serve(self.configurator)
 
@@ -72,15 +72,15 @@ def test_a_dump_in_pieces(desk: Desk) -> None:
         desk.serve()
         assert desk.results == [None]
         assert desk.configurator.values == {"control:outdoor": "TRUE"}
-        assert drone.recv(1) == b"", "the connection is let go"
+        assert drone.recv(1) == b"", "the connection is closed"
 
 
-def test_a_connection_that_ends_early_is_made_again(desk: Desk) -> None:
+def test_a_connection_that_ends_early_is_retried(desk: Desk) -> None:
     desk.connected().close()
     desk.serve()
     assert "the connection ended early" in desk.configurator.trouble
     desk.follow()
-    assert not desk.selector.get_map(), "not at once"
+    assert not desk.selector.get_map(), "not immediately"
     desk.now_ns += RETRY_NS
     with desk.connected() as drone:
         drone.sendall(DUMP)
@@ -92,7 +92,7 @@ def test_a_connection_that_ends_early_is_made_again(desk: Desk) -> None:
 def test_a_port_that_refuses() -> None:
     desk = Desk(listening=False)
     desk.follow()
-    if not desk.configurator.trouble:  # it may be known at once, or a moment later
+    if not desk.configurator.trouble:  # the refusal may show at once or a moment later
         desk.serve()
     assert "Connection refused" in desk.configurator.trouble
     assert f"TCP port {desk.client._port}" in desk.configurator.trouble
@@ -106,15 +106,15 @@ def test_a_drone_without_an_address_yet(desk: Desk) -> None:
     assert not desk.selector.get_map()
 
 
-def test_a_connection_that_is_not_wanted_any_more_is_let_go(desk: Desk) -> None:
+def test_a_connection_is_closed_when_no_longer_needed(desk: Desk) -> None:
     with desk.connected() as drone:
         desk.configurator.abandon("gone")
         desk.follow()
         assert drone.recv(1) == b""
-    desk.client.serve(desk.configurator)  # a late event does nothing
+    desk.client.serve(desk.configurator)  # a late event has no effect
 
 
-def test_a_later_dump_gets_a_connection_of_its_own(desk: Desk) -> None:
+def test_a_later_dump_gets_a_new_connection(desk: Desk) -> None:
     with desk.connected() as old:
         desk.configurator.abandon("gone")
         desk.read()

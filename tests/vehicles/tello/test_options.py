@@ -1,4 +1,4 @@
-"""What ``tello://`` addresses ask for, and what makes no sense."""
+"""Valid and invalid ``tello://`` addresses."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_all_options() -> None:
         ("tello://d?concealed=31", "from 0 to 30"),
     ],
 )
-def test_what_makes_no_sense_is_refused(address: str, said: str) -> None:
+def test_invalid_addresses_are_refused(address: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         TelloDriver(parse_uri(address))
 
