@@ -128,7 +128,7 @@ def test_an_endless_dump_is_aborted() -> None:
     desk.says()
     desk.configurator.dump_opened()
     assert desk.configurator.dump_received(b"x" * (MAX_DUMP + 1))
-    assert "no end" in desk.configurator.trouble
+    assert "without an end mark" in desk.configurator.trouble
 
 
 def test_exchanges_wait_for_one_another() -> None:

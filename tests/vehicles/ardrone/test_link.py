@@ -202,7 +202,7 @@ def test_no_drone() -> None:
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
         assert "no navdata from 127.0.0.1" in sink.links[-1][1]
         assert driver.failsafe(Land()), "the drone may receive it"
-        with pytest.raises(ParameterError, match="not read yet"):
+        with pytest.raises(ParameterError, match="not been read yet"):
             driver.set_parameter("limits.tilt", 0.1)
 
 

@@ -444,7 +444,7 @@ def test_jpeg_is_passed_on_unchanged() -> None:
     assert frame.encoding is Encoding.JPEG
     rig.session.on_image(Message(header=stamp(rig.system()), format="png", data=b"\x89PNG"))
     rig.session.on_image(Message(header=stamp(rig.system()), format="jpeg", data=b"\xff\xd8\x00"))
-    assert ["'png'" in rig.sink.events[0].text, "how large" in rig.sink.events[1].text] == [True, True]
+    assert ["'png'" in rig.sink.events[0].text, "its size" in rig.sink.events[1].text] == [True, True]
     assert not rig.sink.problems
 
 
