@@ -108,7 +108,7 @@ def test_its_capabilities_are_those_of_the_firmwares_driver() -> None:
 
 def test_opening_without_the_program_names_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "/nowhere")
-    with pytest.raises(UsageError, match="SKYLOOP_ARDUCOPTER is '/nowhere', which is no program"):
+    with pytest.raises(UsageError, match="SKYLOOP_ARDUCOPTER is '/nowhere', which is not a program"):
         made(ARDUPILOT).open(RecordingSink())
 
 

@@ -153,7 +153,7 @@ def test_programs_are_found_by_variable_or_on_the_path(tmp_path: Path, monkeypat
     program = tmp_path / "testware"
     program.write_text("")
     monkeypatch.setenv("SKYLOOP_TESTWARE", str(program))
-    with pytest.raises(UsageError, match=r"SKYLOOP_TESTWARE is '.*', which is no program"):
+    with pytest.raises(UsageError, match=r"SKYLOOP_TESTWARE is '.*', which is not a program"):
         find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.")
     program.chmod(0o755)
     assert find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.") == str(program)
