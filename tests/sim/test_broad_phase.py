@@ -70,11 +70,11 @@ TOUGH = VehicleParameters(crash_speed_m_s=100.0, restitution=0.9)
 
 
 def crowd(
-    commands: list[AnyAction], world: str, drones: int, seed: int, look_steps: int, few_pairs: int
+    commands: list[AnyAction], world: str, drones: int, seed: int, phase_steps: int, few_pairs: int
 ) -> tuple[list[VehicleTruth], list[Occurrence]]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collisions, "LOOK_STEPS", look_steps)
-        patch.setattr(collisions, "LOOK_STEPS_OF_FEW", look_steps)
+        patch.setattr(collisions, "BROAD_PHASE_STEPS", phase_steps)
+        patch.setattr(collisions, "BROAD_PHASE_STEPS_OF_FEW", phase_steps)
         patch.setattr(collisions, "FEW_PAIRS", few_pairs)
         limits = Limits(tilt_rad=0.6, climb_m_s=2.0, speed_m_s=6.0)
         simulation = Simulation(load_world(world, seed), drones, seed=seed, parameters=TOUGH, limits=limits)
@@ -100,7 +100,7 @@ def crowd(
 def test_a_crowd_flies_as_if_all_pairs_were_checked_in_every_step(
     commands: list[AnyAction], world: str, drones: int, seed: int
 ) -> None:
-    rarely = crowd(commands, world, drones, seed, collisions.LOOK_STEPS, collisions.FEW_PAIRS)
+    rarely = crowd(commands, world, drones, seed, collisions.BROAD_PHASE_STEPS, collisions.FEW_PAIRS)
     assert rarely == crowd(commands, world, drones, seed, 1, 0)
 
 

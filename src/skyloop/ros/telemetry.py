@@ -64,8 +64,8 @@ class Telemetry:
 
     def publish(self, feedback: Feedback) -> None:
         """Publish one sample. Runs on the drone's own thread."""
-        self._tell(self._state, feedback.state.value)
-        self._tell(self._pilot, feedback.owner or "")
+        self._publish_text(self._state, feedback.state.value)
+        self._publish_text(self._pilot, feedback.owner or "")
         stamp_ns = self._time.stamp_ns(feedback.captured_ns)
         if stamp_ns is None or feedback.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
             return
@@ -121,7 +121,7 @@ class Telemetry:
         if known:
             self._static.publish(encode_transforms(known))
 
-    def _tell(self, publisher: Any, text: str) -> None:
+    def _publish_text(self, publisher: Any, text: str) -> None:
         """Publish a text if it differs from the last one."""
         if self._told.get(publisher) != text:
             from std_msgs.msg import String

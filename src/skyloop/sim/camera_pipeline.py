@@ -21,7 +21,7 @@ from skyloop.sim.world import World
 _LONGEST_WAIT_S: Final = 0.5
 #: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that picks
 #: frames by its own count always finds one in time.
-SPARE: Final = 1.25
+RATE_MARGIN: Final = 1.25
 
 
 class Screen(Protocol):
@@ -82,7 +82,7 @@ class Camera:
         """
         if not fps:
             return False
-        enough = fps * SPARE
+        enough = fps * RATE_MARGIN
         self._limiter.max_hz = enough if enough < self.model.fps else math.inf
         return self._limiter.in_time(captured_ns)
 

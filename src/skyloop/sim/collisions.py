@@ -24,7 +24,7 @@ _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or nothing w
 _PASSES = 6
 _TOUCH_M = 1e-9  # overlaps up to this count as touching: rounding leaves some that no push removes
 #: Steps between two broad phases. With few drones a broad phase costs relatively more and its result covers less.
-LOOK_STEPS, LOOK_STEPS_OF_FEW = 15, 30
+BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
 _SLACK_M = 0.03  # extra reach in a broad phase, for drones that are pushed
 #: Up to this many pairs are faster to check one at a time.
 FEW_PAIRS = 6
@@ -99,12 +99,12 @@ class Collisions:
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # each drone's last position clear of all fixed objects
-        self._look_steps = LOOK_STEPS_OF_FEW if few(len(parameters)) else LOOK_STEPS
-        self._span_m = _span(bodies.most_acceleration_m_s2, self._look_steps)
+        self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
+        self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # the step of the next broad phase
         self._reach = np.zeros(len(parameters))  # how far each drone can move until then
-        self._strayed = [0.0 for _ in parameters]  # additional movement from pushes and impacts
-        self._look_around(0)
+        self._extra_reach = [0.0 for _ in parameters]  # additional movement from pushes and impacts
+        self._run_broad_phase(0)
         self._next = 0
 
     def resolve(self, step: int) -> Contacts | None:
@@ -116,7 +116,7 @@ class Collisions:
             self._meet_floor(self._on_floor.nonzero()[0], contacts)
         looked = step >= self._next
         if looked:
-            self._look_around(step)
+            self._run_broad_phase(step)
         elif self._near.moving:
             self._solids.move((step + 1) * STEP_S)
         if len(self._near.one) or self._near.solids:
@@ -128,7 +128,7 @@ class Collisions:
 
     def _narrow(self, step: int, contacts: Contacts) -> None:
         if len(self._near.one) and self._meet_drones((self._next - step) * STEP_S, contacts):
-            self._look_around(step)
+            self._run_broad_phase(step)
         left_s = (self._next - step) * STEP_S
         for drone in self._within_solids():
             if self._meet_solids(drone, left_s, contacts):
@@ -141,14 +141,14 @@ class Collisions:
 
     # The broad phase -------------------------------------------------------------------------------------------
 
-    def _look_around(self, step: int) -> None:
+    def _run_broad_phase(self, step: int) -> None:
         """Find everything within each drone's reach until the next broad phase."""
         solids, position, velocity = self._solids, self._bodies.position, self._bodies.velocity
         if solids.moving:
             solids.move((step + 1) * STEP_S)
-        self._next = step + self._look_steps
-        seconds = self._look_steps * STEP_S
-        self._strayed = [0.0] * len(self._strayed)
+        self._next = step + self._broad_phase_steps
+        seconds = self._broad_phase_steps * STEP_S
+        self._extra_reach = [0.0] * len(self._extra_reach)
         np.sqrt((velocity * velocity).sum(axis=0), out=self._reach)
         np.multiply(self._reach, seconds, out=self._reach)
         np.add(self._reach, self._span_m + _SLACK_M, out=self._reach)
@@ -181,10 +181,10 @@ class Collisions:
             room_high=self._high.take(walled, axis=1),
         )
 
-    def _strays(self, drone: int, metres: float) -> bool:
-        """Return whether a drone that may move this much further leaves the reach of the last broad phase."""
-        self._strayed[drone] += metres
-        return self._strayed[drone] > _SLACK_M
+    def _extend_reach(self, drone: int, metres: float) -> bool:
+        """Extend a drone's possible movement; return whether it leaves the reach of the last broad phase."""
+        self._extra_reach[drone] += metres
+        return self._extra_reach[drone] > _SLACK_M
 
     # The floor -------------------------------------------------------------------------------------------------
 
@@ -257,7 +257,7 @@ class Collisions:
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
         self._x[drone], self._y[drone], self._z[drone] = x, y, z
-        return self._strays(drone, math.dist(start, (x, y, z)) + carried * left_s)
+        return self._extend_reach(drone, math.dist(start, (x, y, z)) + carried * left_s)
 
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a wedged drone: pushing it out of one object leads into another.
@@ -320,7 +320,7 @@ class Collisions:
         """Separate overlapping drones; return whether one may leave the broad phase's reach in the remaining time."""
         strayed = False
         for one, other in self._close_pairs():
-            if self._part(one, other, left_s, contacts):
+            if self._separate(one, other, left_s, contacts):
                 strayed = True
         return strayed
 
@@ -337,7 +337,7 @@ class Collisions:
         which = close.nonzero()[0]
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
-    def _part(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
+    def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
         """Separate two drones; return whether one may leave the broad phase's reach in the remaining time."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
@@ -375,7 +375,7 @@ class Collisions:
             if into > _STILL_M_S:
                 contacts.impacts += [(one, into, "another drone"), (other, into, "another drone")]
         further = depth + change * left_s
-        return self._strays(one, further * mine + up) | self._strays(other, further * theirs + up)
+        return self._extend_reach(one, further * mine + up) | self._extend_reach(other, further * theirs + up)
 
 
 def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, N, N, N]:

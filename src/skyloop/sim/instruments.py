@@ -141,7 +141,7 @@ def pressure_pa(height_m: float) -> float:
 #: Distance from a point along a unit vector, both in world axes, to the first solid; infinite without one.
 Ranging = Callable[[Vec3, Vec3], float]
 
-_AHEAD = 256  # number of samples with noise drawn in one call
+_NOISE_BLOCK = 256  # number of samples with noise drawn in one call
 _WANDER_STEPS = 100  # biases change at 10 Hz
 _LEAST_FLOW_M = 0.08  # closer than this, the image is out of focus
 _GPS_VERTICAL = 1.7  # factor of the vertical error over the horizontal one
@@ -313,7 +313,7 @@ def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[
     """Yield standard normal numbers endlessly, ``count`` at a time."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
     while True:
-        yield from map(tuple, generator.standard_normal((_AHEAD, count)).tolist())
+        yield from map(tuple, generator.standard_normal((_NOISE_BLOCK, count)).tolist())
 
 
 def _wandering(

@@ -162,7 +162,7 @@ def test_texts_without_a_value() -> None:
 # Commands --------------------------------------------------------------------------------------------------------
 
 
-class Desk:
+class Bench:
     """Commands with a controller, and their messages."""
 
     def __init__(self, condition: Condition | None, version: int | None = 2) -> None:
@@ -183,22 +183,22 @@ class Desk:
 
 @pytest.mark.parametrize("version", [None, 1, 2])
 def test_commands_fit_their_own_description(version: int | None) -> None:
-    for parameter in Desk(GROUND, version).commands.parameters(version):
+    for parameter in Bench(GROUND, version).commands.parameters(version):
         assert not mismatch(parameter, parameter.value)
 
 
 def test_flat_trim_on_the_ground() -> None:
-    desk = Desk(GROUND)
-    assert desk.write("ardrone.flat_trim", True) is True
-    assert desk.parameter("ardrone.flat_trim").value is True
-    assert desk.write("ardrone.flat_trim", False) is False
-    assert desk.said == [(("FTRIM", ()), 3)]
+    bench = Bench(GROUND)
+    assert bench.write("ardrone.flat_trim", True) is True
+    assert bench.parameter("ardrone.flat_trim").value is True
+    assert bench.write("ardrone.flat_trim", False) is False
+    assert bench.said == [(("FTRIM", ()), 3)]
 
 
 def test_calibration_in_the_air() -> None:
-    desk = Desk(AIR)
-    desk.write("ardrone.calibrate_magnetometer", True)
-    assert desk.said == [(("CALIB", (0,)), 3)]
+    bench = Bench(AIR)
+    bench.write("ardrone.calibrate_magnetometer", True)
+    assert bench.said == [(("CALIB", (0,)), 3)]
 
 
 @pytest.mark.parametrize(
@@ -213,30 +213,30 @@ def test_calibration_in_the_air() -> None:
     ],
 )
 def test_commands_forbidden_in_a_state(name: str, value: Value, condition: Condition | None, says: str) -> None:
-    desk = Desk(condition)
-    before = desk.parameter(name).value
+    bench = Bench(condition)
+    before = bench.parameter(name).value
     with pytest.raises(ParameterError, match=says) as caught:
-        desk.write(name, value)
+        bench.write(name, value)
     assert caught.value.code == Refusal.WRONG_STATE
-    assert desk.said == []
-    assert desk.parameter(name).value == before
+    assert bench.said == []
+    assert bench.parameter(name).value == before
 
 
 def test_lights() -> None:
-    desk = Desk(GROUND)
-    desk.write("leds.frequency", 4.0)
-    desk.write("leds.duration", 5.0)
-    assert desk.write("leds.animation", "snake_green_red") == "snake_green_red"
-    assert desk.write("leds.animation", "none") == "none"
-    assert desk.said == [(("LED", (4, 4.0, 5)), 3)]
+    bench = Bench(GROUND)
+    bench.write("leds.frequency", 4.0)
+    bench.write("leds.duration", 5.0)
+    assert bench.write("leds.animation", "snake_green_red") == "snake_green_red"
+    assert bench.write("leds.animation", "none") == "none"
+    assert bench.said == [(("LED", (4, 4.0, 5)), 3)]
 
 
 def test_flight_animations_are_sent_once() -> None:
-    desk = Desk(AIR)
-    desk.write("ardrone.flight_animation", "flip_left")
-    desk.write("ardrone.flight_animation", "yaw_shake")
-    desk.write("ardrone.flight_animation", "none")
-    assert desk.said == [(("ANIM", (18, 15)), 1), (("ANIM", (8, 2000)), 1)]
+    bench = Bench(AIR)
+    bench.write("ardrone.flight_animation", "flip_left")
+    bench.write("ardrone.flight_animation", "yaw_shake")
+    bench.write("ardrone.flight_animation", "none")
+    assert bench.said == [(("ANIM", (18, 15)), 1), (("ANIM", (8, 2000)), 1)]
 
 
 def test_numbers_of_animations() -> None:
@@ -247,21 +247,21 @@ def test_numbers_of_animations() -> None:
 
 
 def test_commands_missing_on_an_ardrone_1() -> None:
-    names = {parameter.name for parameter in Desk(GROUND, 1).commands.parameters(1)}
+    names = {parameter.name for parameter in Bench(GROUND, 1).commands.parameters(1)}
     assert "ardrone.calibrate_magnetometer" not in names
     assert "ardrone.absolute_control" not in names
-    assert "flip_left" not in Desk(GROUND, 1).parameter("ardrone.flight_animation").choices
+    assert "flip_left" not in Bench(GROUND, 1).parameter("ardrone.flight_animation").choices
 
 
 def test_absolute_control() -> None:
-    desk = Desk(AIR)
-    assert desk.setpoints.reference_rad is None
-    desk.write("ardrone.absolute_heading", math.pi)
-    assert desk.setpoints.reference_rad is None
-    desk.write("ardrone.absolute_control", True)
-    assert desk.setpoints.reference_rad == math.pi
-    desk.write("ardrone.absolute_control", False)
-    assert desk.setpoints.reference_rad is None
+    bench = Bench(AIR)
+    assert bench.setpoints.reference_rad is None
+    bench.write("ardrone.absolute_heading", math.pi)
+    assert bench.setpoints.reference_rad is None
+    bench.write("ardrone.absolute_control", True)
+    assert bench.setpoints.reference_rad == math.pi
+    bench.write("ardrone.absolute_control", False)
+    assert bench.setpoints.reference_rad is None
 
 
 @pytest.mark.parametrize(
@@ -276,7 +276,7 @@ def test_absolute_control() -> None:
     ],
 )
 def test_commands_check_their_own_values(name: str, value: Value, code: Refusal) -> None:
-    desk = Desk(GROUND)
+    bench = Bench(GROUND)
     with pytest.raises(ParameterError) as caught:
-        desk.commands.write(desk.parameter(name), value)
+        bench.commands.write(bench.parameter(name), value)
     assert caught.value.code == code

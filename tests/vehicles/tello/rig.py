@@ -34,7 +34,7 @@ class Rig:
         self.on = True
         self.deaf = False  # it receives nothing, but sends
         self.mute = False  # it receives, but sends nothing
-        self.said: list[str] = []
+        self.sent: list[str] = []
         self._chance = random.Random(7)
         self._lost = lost
         self._told = 0
@@ -54,7 +54,7 @@ class Rig:
             if condition():
                 return steps * 0.02
             self.step()
-        raise AssertionError(f"not within {within_s} s: {self.sink.links[-3:]}, {self.sink.newest}, {self.said[-10:]}")
+        raise AssertionError(f"not within {within_s} s: {self.sink.links[-3:]}, {self.sink.newest}, {self.sent[-10:]}")
 
     def ready(self) -> None:
         self.until(lambda: self.session.ready, 8.0)
@@ -65,7 +65,7 @@ class Rig:
         session, board = self.session, self.bench.logic
         if self.now_ns >= session.due_ns:
             for datagram in session.poll(self.now_ns):
-                self.said.append(datagram.decode())
+                self.sent.append(datagram.decode())
                 if self.on and not self.deaf and not self._is_lost():
                     board.receive(datagram, PILOT)
         answers, self._told = self.bench.answers[self._told :], len(self.bench.answers)
@@ -92,9 +92,9 @@ class Rig:
         self._told = 0
         self.on = True
 
-    def take_said(self) -> list[str]:
-        said, self.said = self.said, []
-        return said
+    def take_sent(self) -> list[str]:
+        sent, self.sent = self.sent, []
+        return sent
 
     @property
     def feedback(self) -> Feedback:

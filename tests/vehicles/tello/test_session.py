@@ -56,15 +56,15 @@ def test_sticks_are_sent_twenty_times_a_second_and_new_ones_at_once() -> None:
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
-    rig.take_said()
+    rig.take_sent()
     rig.run(2.0)
-    sticks = [text for text in rig.take_said() if text.startswith("rc")]
+    sticks = [text for text in rig.take_sent() if text.startswith("rc")]
     assert set(sticks) == {"rc 0 0 0 0"}
     assert 30 <= len(sticks) <= 45
     rig.do(Velocity(left=0.3))
     rig.step()
     rig.step()
-    assert "rc -30 0 0 0" in rig.take_said()
+    assert "rc -30 0 0 0" in rig.take_sent()
 
 
 def test_a_drone_flown_by_another_program_gets_no_sticks_before_we_take_it() -> None:
@@ -73,18 +73,18 @@ def test_a_drone_flown_by_another_program_gets_no_sticks_before_we_take_it() -> 
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith(("rc", "land", "stop"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "land", "stop"))]
     rig.do(Hover())
     rig.run(0.2)
-    assert "rc 0 0 0 0" in rig.take_said()
+    assert "rc 0 0 0 0" in rig.take_sent()
     rig.do(Land())
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
     rig.run(1.0)
-    rig.take_said()
+    rig.take_sent()
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(1.0)
-    assert not [text for text in rig.said if text.startswith("rc")], "nor the next flight"
+    assert not [text for text in rig.sent if text.startswith("rc")], "nor the next flight"
 
 
 def test_nothing_moves_a_landed_drone() -> None:
@@ -93,7 +93,7 @@ def test_nothing_moves_a_landed_drone() -> None:
     rig.do(Velocity(forward=1.0))
     rig.do(Hover())
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith("rc")]
+    assert not [text for text in rig.sent if text.startswith("rc")]
 
 
 def test_a_drone_that_does_not_take_off_is_reported() -> None:
@@ -102,12 +102,12 @@ def test_a_drone_that_does_not_take_off_is_reported() -> None:
     rig.deaf = True
     rig.do(Takeoff())
     rig.run(9.0)
-    assert rig.said.count("takeoff") in (5, 6)
+    assert rig.sent.count("takeoff") in (5, 6)
     assert "no_takeoff" in rig.reasons
     assert rig.state is FlightState.LANDED
-    rig.take_said()
+    rig.take_sent()
     rig.run(3.0)
-    assert "takeoff" not in rig.said
+    assert "takeoff" not in rig.sent
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.5, 0.9])
@@ -117,7 +117,7 @@ def test_a_take_off_withdrawn_before_it_shows_is_landed(after_s: float, lost: fl
     rig = Rig(lost=lost)
     rig.ready()
     rig.do(Takeoff())
-    rig.until(lambda: "takeoff" in rig.said, 1.0)
+    rig.until(lambda: "takeoff" in rig.sent, 1.0)
     rig.run(after_s)
     assert rig.state is FlightState.LANDED
     rig.do(Land())
@@ -127,9 +127,9 @@ def test_a_take_off_withdrawn_before_it_shows_is_landed(after_s: float, lost: fl
     rig.run(15.0)
     assert rig.bench.flight is FlightState.LANDED
     assert rig.state is FlightState.LANDED
-    rig.take_said()
+    rig.take_sent()
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith(("rc", "land", "takeoff"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "land", "takeoff"))]
 
 
 def test_a_drone_that_falls_over_during_its_take_off_is_not_restarted() -> None:
@@ -139,10 +139,10 @@ def test_a_drone_that_falls_over_during_its_take_off_is_not_restarted() -> None:
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.TAKING_OFF, 4.0)
     rig.bench.logic.receive(b"emergency", PILOT)
-    rig.take_said()
+    rig.take_sent()
     rig.until(lambda: rig.state is FlightState.LANDED, 5.0)
     rig.run(8.0)
-    assert "takeoff" not in rig.said
+    assert "takeoff" not in rig.sent
     assert rig.reasons.count("no_takeoff") == 1
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
@@ -166,9 +166,9 @@ def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> No
     assert rig.state is FlightState.TAKING_OFF
     rig.until(lambda: rig.state is FlightState.HOVERING, 2.0)
     assert "no_takeoff" not in rig.reasons
-    rig.take_said()
+    rig.take_sent()
     rig.run(1.0)
-    assert "rc 0 0 0 0" in rig.said
+    assert "rc 0 0 0 0" in rig.sent
 
 
 def test_a_refused_take_off_is_reported() -> None:
@@ -207,9 +207,9 @@ def test_an_emergency_stop_is_kept_until_the_reset(lost: float) -> None:
     rig.do(Hover())
     rig.run(3.0)
     assert rig.state is FlightState.EMERGENCY
-    rig.take_said()
+    rig.take_sent()
     rig.run(5.0)
-    assert "emergency" not in rig.said
+    assert "emergency" not in rig.sent
     rig.do(ResetEmergency())
     rig.until(lambda: rig.state is FlightState.LANDED, 1.0)
     rig.do(Takeoff())
@@ -238,18 +238,18 @@ def test_a_stop_that_never_shows_is_abandoned_and_reported_and_the_drone_lands()
     rig.on = False
     rig.run(2.0)
     rig.do(EmergencyStop())
-    rig.take_said()
+    rig.take_sent()
     rig.run(9.8)
-    assert rig.take_said().count("emergency") > 75, "also to a silent drone"
+    assert rig.take_sent().count("emergency") > 75, "also to a silent drone"
     rig.run(0.6)
     assert rig.reasons.count("stop_given_up") == 1
-    rig.take_said()
+    rig.take_sent()
     rig.on = True
     rig.until(lambda: rig.state is FlightState.HOVERING, 5.0)
-    assert "emergency" not in rig.said, "it must not fall minutes later"
+    assert "emergency" not in rig.sent, "it must not fall minutes later"
     rig.until(lambda: rig.state is FlightState.LANDED, 30.0)
     assert rig.bench.flight is FlightState.LANDED
-    assert not [text for text in rig.said if text.startswith(("rc", "wifi?", "land", "emergency"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "wifi?", "land", "emergency"))]
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
 
@@ -267,7 +267,7 @@ def test_after_an_abandoned_stop_the_drone_can_land_and_a_reset_is_allowed() -> 
     rig.do(ResetEmergency())
     rig.do(Hover())
     rig.run(6.0)
-    assert "wifi?" in rig.said, "a command makes us keep it awake again"
+    assert "wifi?" in rig.sent, "a command makes us keep it awake again"
     rig.do(Land())
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
@@ -324,11 +324,11 @@ def test_attitude_is_a_share_of_the_stick() -> None:
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
-    rig.take_said()
+    rig.take_sent()
     applied = rig.do(Attitude(roll=0.1, pitch=-0.9, climb=5.0, yaw_rate=0.875))
     assert applied == Attitude(roll=0.1, pitch=-0.2, climb=1.0, yaw_rate=0.875)
     rig.run(0.1)
-    assert rig.said[-1] == "rc 50 -100 100 -50"
+    assert rig.sent[-1] == "rc 50 -100 100 -50"
 
 
 # Link loss and recovery --------------------------------------------------------------------------------------------
@@ -340,7 +340,7 @@ def test_an_absent_drone_is_reported_and_retried() -> None:
     rig.run(2.5)
     assert [state for state, _ in rig.sink.links] == [LinkState.CONNECTING, LinkState.LOST]
     assert "no state from drone, UDP port 8889" in rig.sink.links[-1][1]
-    assert 4 <= rig.said.count("command") <= 6
+    assert 4 <= rig.sent.count("command") <= 6
     with pytest.raises(DriverError, match="no data from"):
         rig.do(Takeoff())
     rig.on = True
@@ -367,13 +367,13 @@ def test_a_link_restored_in_flight_resumes_nothing() -> None:
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 1.2)
-    rig.take_said()
+    rig.take_sent()
     rig.run(1.0)
-    assert set(rig.take_said()) == {"command", "rc 0 0 0 0"}  # it may receive us
+    assert set(rig.take_sent()) == {"command", "rc 0 0 0 0"}  # it may receive us
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
     rig.until(lambda: rig.state is FlightState.HOVERING, 3.0)  # in the air, by its motors
-    assert "rc 0 30 0 0" not in rig.said
+    assert "rc 0 30 0 0" not in rig.sent
 
 
 def test_a_landing_continues_while_the_drone_is_silent() -> None:
@@ -384,9 +384,9 @@ def test_a_landing_continues_while_the_drone_is_silent() -> None:
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
     rig.do(Land())
-    rig.take_said()
+    rig.take_sent()
     rig.run(2.9)
-    assert rig.said.count("land") in (2, 3)
+    assert rig.sent.count("land") in (2, 3)
     rig.on = True
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 12.0)
     rig.until(lambda: rig.state is FlightState.LANDED, 4.0)
@@ -403,16 +403,16 @@ def test_a_landing_of_a_lost_drone_expires() -> None:
     for _ in range(8):  # a pilot that still wants it sends it again
         rig.do(Land())
         rig.run(1.0)
-    assert rig.take_said().count("land") >= 5
+    assert rig.take_sent().count("land") >= 5
     rig.run(3.0)
     assert rig.reasons.count("landing_given_up") == 1
-    rig.take_said()
+    rig.take_sent()
     rig.run(60.0)
-    assert not [text for text in rig.take_said() if text.startswith(("land", "rc"))], "without commands it lands"
+    assert not [text for text in rig.take_sent() if text.startswith(("land", "rc"))], "without commands it lands"
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(0.5)
-    assert "land" not in rig.said
+    assert "land" not in rig.sent
 
 
 def unheard() -> Rig:
@@ -431,15 +431,15 @@ def test_a_silent_drone_is_left_to_its_automatic_landing() -> None:
     """``command`` and level sticks once kept it in the air until its battery was empty."""
     rig = unheard()
     rig.run(3.1)
-    assert "rc 0 0 0 0" in rig.take_said(), "it does not continue with the earlier sticks"
+    assert "rc 0 0 0 0" in rig.take_sent(), "it does not continue with the earlier sticks"
     for _ in range(50):
         rig.session.command(Hover(), rig.now_ns, new=False)  # the library's own
         rig.session.command(Velocity(forward=0.3), rig.now_ns)  # a program that continues
         rig.run(0.5)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     assert rig.bench.flight is FlightState.LANDED
     rig.run(6.0)
-    assert set(rig.take_said()) == {"command"}, "it may have been switched off and on"
+    assert set(rig.take_sent()) == {"command"}, "it may have been switched off and on"
     rig.mute = False
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(3.0)
@@ -466,13 +466,13 @@ def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float)
 def test_a_persons_command_reaches_a_silent_drone(asked_s: float) -> None:
     rig = unheard()
     rig.run(asked_s)
-    rig.take_said()
+    rig.take_sent()
     rig.do(Hover())
     rig.run(0.2)
-    assert "rc 0 0 0 0" in rig.take_said()
+    assert "rc 0 0 0 0" in rig.take_sent()
     rig.do(Land())
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 8.0)
-    assert "land" in rig.said
+    assert "land" in rig.sent
 
 
 def test_a_stop_reaches_a_drone_in_its_automatic_landing() -> None:
@@ -502,11 +502,11 @@ def test_an_automatic_hover_leaves_a_drone_alone_after_an_abandoned_stop() -> No
     rig.do(EmergencyStop())
     rig.run(11.0)
     rig.deaf = False
-    rig.take_said()
+    rig.take_sent()
     for _ in range(8):  # it lands, and is kept awake on the ground
         rig.session.command(Hover(), rig.now_ns, new=False)
         rig.run(0.5)
-    assert not [text for text in rig.said if text.startswith(("rc", "wifi?"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "wifi?"))]
     rig.session.command(Land(), rig.now_ns, new=False)
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
@@ -521,11 +521,11 @@ def test_after_an_abandoned_stop_the_version_is_not_requested() -> None:
     rig.run(2.0)
     rig.do(EmergencyStop())
     rig.run(10.4)
-    rig.take_said()
+    rig.take_sent()
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
     rig.until(lambda: rig.bench.flight is FlightState.LANDING, 3.0)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     rig.do(Hover())
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
 
@@ -537,11 +537,11 @@ def test_a_drone_left_in_the_air_by_another_program_lands() -> None:
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(1.0)
-    rig.take_said()
+    rig.take_sent()
     rig.until(lambda: rig.state is FlightState.LANDED, 25.0)
-    assert not rig.said
+    assert not rig.sent
     rig.run(5.0)
-    assert set(rig.said) == {"wifi?"}, "on the ground it is kept awake"
+    assert set(rig.sent) == {"wifi?"}, "on the ground it is kept awake"
 
 
 def test_a_drone_found_in_the_air_without_answers_is_not_asked_forever() -> None:
@@ -552,9 +552,9 @@ def test_a_drone_found_in_the_air_without_answers_is_not_asked_forever() -> None
     rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
     rig.on = rig.deaf = True
     rig.run(6.0)
-    assert "sdk?" in rig.take_said()
+    assert "sdk?" in rig.take_sent()
     rig.run(5.0)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     rig.deaf = False
     rig.do(Hover())
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
@@ -615,13 +615,13 @@ def test_video_is_requested_until_it_arrives() -> None:
     rig.session._video_ns = lambda: came_ns[0]
     rig.ready()
     rig.run(5.0)
-    assert rig.said.count("streamon") in (2, 3)
+    assert rig.sent.count("streamon") in (2, 3)
     assert rig.bench.logic.streaming
-    rig.take_said()
+    rig.take_sent()
     for _ in range(100):
         came_ns[0] = rig.now_ns
         rig.step()
-    assert "streamon" not in rig.said
+    assert "streamon" not in rig.sent
 
 
 # Reports -----------------------------------------------------------------------------------------------------------

@@ -177,7 +177,7 @@ def _doubled(model: CameraModel) -> CameraModel:
     return model.scaled(2.0)
 
 
-_SPARE = 61  # rows and pixels of noise beyond the picture's size, so that each frame uses another part
+_NOISE_MARGIN = 61  # rows and pixels of noise beyond the picture's size, so that each frame uses another part
 _BLUR_FROM_PX = 0.8  # a shorter blur is invisible
 
 
@@ -192,7 +192,7 @@ class SensorEffects:
         self._seed = seed
         rng = np.random.default_rng([seed, model.width, model.height])
         self._gain = _gain(model)
-        shape = (model.height + _SPARE, (model.width + _SPARE) * 3)
+        shape = (model.height + _NOISE_MARGIN, (model.width + _NOISE_MARGIN) * 3)
         noise = np.rint(rng.standard_normal(shape, dtype=np.float32) * np.float32(model.noise_sigma))
         # Saturated addition and subtraction of two byte pictures costs a tenth of one signed addition.
         self._brighter = np.clip(noise, 0, 255).astype(np.uint8)
@@ -218,7 +218,7 @@ class SensorEffects:
         if self._gain is not None:
             cv2.multiply(picture, self._gain, dst=picture, scale=1.0 / 128.0)
         if model.noise_sigma > 0.0:
-            row, column = np.random.default_rng([self._seed, number]).integers(0, _SPARE, 2)
+            row, column = np.random.default_rng([self._seed, number]).integers(0, _NOISE_MARGIN, 2)
             part = slice(row, row + model.height), slice(3 * column, 3 * (column + model.width))
             flat = picture.reshape(model.height, model.width * 3)
             cv2.add(flat, self._brighter[part], dst=flat)

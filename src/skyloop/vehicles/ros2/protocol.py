@@ -101,7 +101,7 @@ class RobotSession:
         self._pending: _Pending | None = None
         self._up: bool | None = False if options.ground else None  # by the services; on the ground: driving
         self._refused = ""  # the reason for a refused take-off
-        self._complained: set[str] = set()
+        self._warned: set[str] = set()
 
     # From the robot --------------------------------------------------------------------------------------------------
 
@@ -125,10 +125,10 @@ class RobotSession:
             self._intrinsics = intrinsics_of(message)
         except DecodeError as error:
             self._intrinsics = None
-            self._complain(f"the camera's intrinsics can't be used: {error}")
+            self._warn_once(f"the camera's intrinsics can't be used: {error}")
         skew = skew_of(message)
         if skew and self._intrinsics is not None:
-            self._complain(f"the camera's pixels have a skew of {skew:g} px, which is ignored: calibrate without it")
+            self._warn_once(f"the camera's pixels have a skew of {skew:g} px, which is ignored: calibrate without it")
 
     def on_image(self, message: Any) -> None:
         """Publish a frame, decoded only as far as necessary."""
@@ -146,10 +146,10 @@ class RobotSession:
                 pixels, encoding = pixels_of(message)
                 size = (int(message.width), int(message.height))
         except DecodeError as error:
-            self._complain(f"an image can't be decoded: {error}")
+            self._warn_once(f"an image can't be decoded: {error}")
             return
         if size != (width, height):
-            self._complain(f"images are {size[0]}×{size[1]}: write width={size[0]}&height={size[1]} into the address")
+            self._warn_once(f"images are {size[0]}×{size[1]}: write width={size[0]}&height={size[1]} into the address")
             return
         self._sink.frame(
             camera, pixels, captured_ns, width=width, height=height, encoding=encoding, intrinsics=self._intrinsics
@@ -321,10 +321,10 @@ class RobotSession:
             feedback = Feedback(captured_ns=self._captured_ns, state=self._state, **self._fields, **self._battery)
         self._sink.feedback(feedback)
 
-    def _complain(self, text: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Emit a warning, once for each text."""
-        if text not in self._complained and len(self._complained) < 8:
-            self._complained.add(text)
+        if text not in self._warned and len(self._warned) < 8:
+            self._warned.add(text)
             self._sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="image")
 
 

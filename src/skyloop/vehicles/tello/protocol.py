@@ -298,7 +298,7 @@ class TelloSession(VehicleSession):
         self._check_silence(now_ns)
         self.due_ns = now_ns + TICK_NS
         texts = []
-        alone = self._lands_by_itself(now_ns)
+        alone = self._left_to_land(now_ns)
         if self._received_ns is None and not alone and now_ns - self._entered_ns >= ENTER_NS:
             self._entered_ns = now_ns
             texts.append(ENTER)
@@ -320,7 +320,7 @@ class TelloSession(VehicleSession):
             self._sent_ns = now_ns
         return [text.encode("ascii") for text in texts]
 
-    def _lands_by_itself(self, now_ns: int) -> bool:
+    def _left_to_land(self, now_ns: int) -> bool:
         """Return whether to send only landings and stops, so that a lost drone lands without further commands."""
         if not self.setpoints.flies_unheard or now_ns - self._lost_ns < KEPT_NS:
             return False
@@ -360,7 +360,7 @@ class TelloSession(VehicleSession):
         missing = self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS
         if missing and self.conversation.idle and not self._is_silent(now_ns):
             self._asked_video_ns = now_ns
-            self.conversation.ask(Request("streamon", _whatever))
+            self.conversation.ask(Request("streamon", _ignore_reply))
 
     def _describe_silence(self, since: str, why: str) -> str:
         if self._answered:
@@ -404,7 +404,7 @@ class TelloSession(VehicleSession):
         self.ready, self._deaf = True, 0
         self.conversation.ask(Request("sn?", self._on_serial))
         for text in self.remembered.values():
-            self.conversation.ask(Request(text, _whatever))
+            self.conversation.ask(Request(text, _ignore_reply))
         self._set_link_state(LinkState.UP)
 
     def _on_serial(self, reply: str | None) -> None:
@@ -412,5 +412,5 @@ class TelloSession(VehicleSession):
             self.serial = reply
 
 
-def _whatever(_reply: str | None) -> None:
+def _ignore_reply(_reply: str | None) -> None:
     """Ignore the answer: the drone's state or video shows the effect of the command."""

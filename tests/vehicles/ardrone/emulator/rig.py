@@ -68,7 +68,7 @@ class RecordingVehicle:
     def set_limits(self, limits: Limits) -> None:
         self.limits = limits
 
-    def take_told(self) -> list[AnyAction]:
+    def take_commands(self) -> list[AnyAction]:
         told, self.told = self.told, []
         return told
 

@@ -70,11 +70,11 @@ def test_the_emergency_bit_toggles_only_when_it_was_0_before() -> None:
     bench = Bench(state=S.FLYING)
     for _ in range(3):
         bench.say("REF", EMERGENCY)
-    assert bench.vehicle.take_told() == [EmergencyStop()]
+    assert bench.vehicle.take_commands() == [EmergencyStop()]
     bench.say("REF", 0)
     for _ in range(3):
         bench.say("REF", EMERGENCY)
-    assert bench.vehicle.take_told() == [ResetEmergency()]
+    assert bench.vehicle.take_commands() == [ResetEmergency()]
     assert bench.vehicle.state is S.LANDED
 
 
@@ -126,11 +126,11 @@ def test_a_low_battery_lands_the_drone_and_keeps_it_there(low: VehicleFeedback) 
     bench = Bench(state=S.HOVERING)
     bench.say("REF", TAKE_OFF)
     bench.wait(0.01, low)
-    assert bench.vehicle.take_told() == [Land()]
+    assert bench.vehicle.take_commands() == [Land()]
     assert bench.state & State.BATTERY_LOW
     bench.vehicle.state = S.LANDED
     bench.say("REF", TAKE_OFF)
-    assert bench.vehicle.take_told() == []
+    assert bench.vehicle.take_commands() == []
 
 
 def test_the_low_voltage_is_configurable_with_hysteresis() -> None:
@@ -285,11 +285,11 @@ def test_the_magnetometer_is_calibrated_by_a_turn_in_flight() -> None:
     bench.say("CALIB", 0)
     bench.say("PCMD", 1, 1.0, 0.0, 0.0, 0.0)
     bench.say("CALIB", 0)
-    assert bench.vehicle.take_told() == [Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S)]
+    assert bench.vehicle.take_commands() == [Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S)]
     for _ in range(50):
         bench.say("COMWDG")
         bench.wait(0.1)
-    assert bench.vehicle.take_told() == [Hover()]
+    assert bench.vehicle.take_commands() == [Hover()]
     bench.say("PCMD", 1, 1.0, 0.0, 0.0, 0.0)
     assert close(bench.vehicle.told[0], TILT, 0.0, 0.0, 0.0)
 
@@ -318,15 +318,15 @@ def test_a_silent_pilot_makes_it_hover_and_then_land() -> None:
     bench = Bench(state=S.HOVERING)
     bench.say("REF", TAKE_OFF)
     bench.say("PCMD", 1, 0.0, -0.5, 0.0, 0.0)
-    bench.vehicle.take_told()
+    bench.vehicle.take_commands()
     bench.wait(0.24)
     assert bench.vehicle.told == []
     bench.wait(0.02)
-    assert bench.vehicle.take_told() == [Hover()]
+    assert bench.vehicle.take_commands() == [Hover()]
     bench.wait(1.7)
     assert bench.vehicle.told == []
     bench.wait(0.1)
-    assert bench.vehicle.take_told() == [Land()]
+    assert bench.vehicle.take_commands() == [Land()]
 
 
 def test_the_time_before_the_landing_is_configurable() -> None:

@@ -129,7 +129,7 @@ class RunningFirmware(RunningEmulator):
 
     def _on_commands(self, datagram: bytes, _sender: Address) -> None:
         self.logic.receive(datagram)
-        self._look_at_video()
+        self._update_video()
 
     def _send_text(self, text: bytes) -> None:
         self._control_port.accept()  # a client that connected just before its command also gets the answer
@@ -143,7 +143,7 @@ class RunningFirmware(RunningEmulator):
         self.logic.supervise(report.believed)
         if self.logic.lost:
             self._video_clients = Listeners()  # or an AR.Drone 1 would keep sending to clients that have left
-        self._look_at_video()
+        self._update_video()
         now_ns = monotonic_ns()
         if self.logic.demo or self.logic.bootstrap:
             if now_ns < self._demo_due_ns:
@@ -203,7 +203,7 @@ class RunningFirmware(RunningEmulator):
         believed = self._report.believed
         return -believed.pitch_rad, believed.roll_rad, -believed.yaw_rad
 
-    def _look_at_video(self) -> None:
+    def _update_video(self) -> None:
         """Apply the video configuration. Runs on the loop's thread."""
         wanted = self.logic.video
         if wanted == self._shown:

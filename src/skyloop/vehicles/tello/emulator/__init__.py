@@ -188,7 +188,7 @@ class RunningFirmware(RunningEmulator):
 
     def _on_datagram(self, datagram: bytes, sender: Address) -> None:
         self.logic.receive(datagram, sender)
-        self._look_at_video()
+        self._update_video()
 
     def _answer(self, text: str, to: Address) -> None:
         self._commands.send(text.encode("ascii"), to)
@@ -207,7 +207,7 @@ class RunningFirmware(RunningEmulator):
         kbps = logic.bitrate_mbps * 1000 or automatic_kbps(self._settings.faults.drop)
         return OneCamera("bottom" if logic.looks_down else "front", logic.fps, kbps)
 
-    def _look_at_video(self) -> None:
+    def _update_video(self) -> None:
         """Apply the video configuration."""
         logic, wanted = self.logic, self._wanted_video()
         self._packer.size = (BOTTOM.width, BOTTOM.height) if logic.looks_down else logic.size
