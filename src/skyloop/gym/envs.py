@@ -41,9 +41,9 @@ SIZES_PX: Final = (16, 512)  #: smallest and largest edge of a picture
 SIZE: Final = (320, 240)
 ONBOARD_PX: Final = 64  #: edge of the pictures on board, by default
 _FOCAL_PX: Final = 260.0
-_ONBOARD_FOCAL: Final = 40.0 / 64.0  # of the edge: 77° across
+_ONBOARD_FOCAL: Final = 40.0 / 64.0  # as a share of the edge: 77° field of view
 _FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera, from the middle of the first cell's floor [m]
-_AT: Final = np.array([0.0, 0.0, 1.8])  #: and the point it looks at
+_AT: Final = np.array([0.0, 0.0, 1.8])  #: the point it looks at
 _EYE_M: Final = np.array([0.12, 0.0, 0.0])  # in front of the drone's own body
 _AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
 _RED: Final = (40, 40, 230)  # BGR
@@ -57,7 +57,7 @@ class _Observer:
     """Makes the observations of all drones of a task in the requested form.
 
     Attributes:
-        space: Of the observations of one drone.
+        space: The observation space of one drone.
     """
 
     def __init__(self, task: Reaching, form: Observe, size_px: int) -> None:

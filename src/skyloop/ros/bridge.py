@@ -36,7 +36,7 @@ class Settings:
         map_frame: A common frame for all drones' ``odom``, if one simulator or motion capture system locates them
             all; empty: none.
         use_sim_time: Stamps on the clock of ``/clock``.
-        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
+        domain: DDS domain; None: from ``ROS_DOMAIN_ID``.
         subnet: Make it visible to other machines, unless the environment configures discovery; else to this one only.
         arguments: For ROS 2, without ``--ros-args``: ``("-r", "cmd_vel:=teleop")``.
 

@@ -23,7 +23,7 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.vehicles.ros2.node import ros_name
 from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME, ClockMap
 
-KNOWN_MAJOR: Final = "9"  #: of the package ros-rclpy whose structures these are
+KNOWN_MAJOR: Final = "9"  #: version of the package ros-rclpy with these structures
 _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 

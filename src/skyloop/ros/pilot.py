@@ -27,7 +27,7 @@ class Pilot:
         drone: Connected as a pilot, with the time after which a velocity turns into hover.
         time: Stamps.
         frames: Names of the drone's frames.
-        priority: Of requests for the authority, 0 (highest) to 31; None: the default.
+        priority: Priority of authority requests, 0 (highest) to 31; None: the default.
         timeout_s: How old a stamped velocity may be [s].
     """
 
@@ -223,7 +223,7 @@ class Parameters:
     """Declares the drone's parameters at a node, writes values set by ROS, and shows changes made elsewhere.
 
     Args:
-        node: Of rclpy. Setting a parameter waits for the drone's proxy.
+        node: The rclpy node. Setting a parameter waits for the drone's proxy.
         drone: Connected as a pilot: writing needs the authority.
     """
 

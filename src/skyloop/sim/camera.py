@@ -74,10 +74,10 @@ class CameraModel:
     cx: float
     cy: float
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 in OpenCV's order
-    position_m: Vec3 = (0.0, 0.0, 0.0)  #: of the optical centre in body axes
+    position_m: Vec3 = (0.0, 0.0, 0.0)  #: position of the optical centre in body axes
     rotation: Rotation9 = LOOKING_FORWARD  #: body from optical, row by row
     latency_s: float = 0.0  #: from the middle of the exposure until the frame is delivered
-    noise_sigma: float = 0.0  #: of each channel of each pixel, in steps of 0 … 255
+    noise_sigma: float = 0.0  #: standard deviation per channel of each pixel, in steps of 0 … 255
     exposure_s: float = 0.0  #: opening time of the shutter, which blurs the image of a turning drone
     exposure_gain: float = 1.0  #: brightness relative to the scene's own
     vignetting: float = 0.0  #: share of light lost in the corners, 0 … 1

@@ -147,7 +147,7 @@ class CameraPipeline(_Frames):
         Args:
             world: The world.
             drones: Their number.
-            quality: Of the images: ``fast``, ``smooth`` or ``best``.
+            quality: Image quality: ``fast``, ``smooth`` or ``best``.
         """
         super().__init__()
         self._world = world

@@ -54,7 +54,7 @@ class _Near:
         other: The second.
         across: The square of the sum of their radii.
         upright: The square of the sum of their half heights.
-        solids: By drone within reach of a solid, a wall or the ceiling: the solids.
+        solids: The solids within reach, by drone; drones near only a wall or the ceiling have none.
         who: The drone of each pair of a drone and a solid.
         what: The solid.
         sizes: See :meth:`Solids.sizes`.

@@ -20,7 +20,7 @@ STEP_S = 0.004
 
 # As arrays, since NumPy computes faster with them than with numbers.
 _STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)
-_ROWS = 32  # of the table of a body's state and inputs
+_ROWS = 32  # rows of the table of a body's state and inputs
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
 _MOST_TILTING_AIRSPEED_M_S = 3.0  # no additional tilt above this airspeed, as no recording is faster
 
@@ -34,8 +34,8 @@ class BodyTable(ABC):
     """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns drones.
 
     Attributes:
-        position: Of the body's centre, world axes, (3, n) [m].
-        velocity: Of the body's centre, world axes, (3, n) [m/s].
+        position: Position of the body's centre, world axes, (3, n) [m].
+        velocity: Velocity of the body's centre, world axes, (3, n) [m/s].
         velocity_before: The same before the last step.
         angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
         rates: Derivatives of the angles.
@@ -352,7 +352,7 @@ def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
     """Return angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
 
     Args:
-        rates: Of roll, pitch, yaw: three numbers, or three arrays.
+        rates: Rates of roll, pitch, yaw: three numbers, or three arrays.
         sin: Sines of roll, pitch, yaw.
         cos: Cosines.
     """

@@ -54,7 +54,7 @@ class SimHost:
     The world is stepped while at least one observer is attached.
 
     Attributes:
-        options: Of the world and its drones.
+        options: Options of the world and its drones.
         wind: The present wind.
         simulation: The world.
     """
@@ -63,7 +63,7 @@ class SimHost:
         """Load the world and place the drones.
 
         Args:
-            options: Of the world and its drones; None takes the defaults.
+            options: Options of the world and its drones; None takes the defaults.
             drones: Their number.
 
         Raises:

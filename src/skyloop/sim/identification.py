@@ -32,7 +32,7 @@ from skyloop.sim.world_file import parse_world
 #: Length of the comparison from the beginning of a step.
 WINDOW_S = 3.0
 #: The recorded drone sends samples so often.
-_MAX_BYTES = 16 << 20  # of a track; an hour at 200 Hz takes 15 MB
+_MAX_BYTES = 16 << 20  # size limit of a track; an hour at 200 Hz takes 15 MB
 SAMPLE_PERIOD_S = 0.005
 #: Half a command tilted the recorded drone as far as a whole one: from this magnitude on it tilts fully.
 FULL_TILT_COMMAND = 0.5
@@ -59,7 +59,7 @@ class Recording:
     """A flight. Times are seconds of the clock that stamped them.
 
     Attributes:
-        name: Of its folder.
+        name: The folder's name.
         command: As recorded, but positive nose down.
         pitch: Positive nose down [rad].
         forward: Speed [m/s].
@@ -102,7 +102,7 @@ class SpeedEstimate:
 
     Attributes:
         lag_s: Time constant [s].
-        scale: Of the estimate. The recordings can't tell it from a pitch that reads too small by the same share.
+        scale: Factor of the estimate. The recordings can't tell it from a pitch that reads too small by the same share.
     """
 
     lag_s: float
@@ -197,7 +197,7 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
     Args:
         command: Positive nose down.
         vehicles: At least one.
-        duration_s: Of the flight.
+        duration_s: Length of the flight.
 
     Raises:
         UsageError: No vehicles, or more than fit into the world.

@@ -55,7 +55,7 @@ class Readings(msgspec.Struct, frozen=True, gc=False):
     newest sample until the next one.
     """
 
-    time_s: float  #: of the simulation
+    time_s: float  #: simulation time
     gyro_rad_s: Vec3
     acceleration_m_s2: Vec3  #: specific force: at rest, +g along z
     pressure_pa: float
@@ -82,7 +82,7 @@ class Firmware(Protocol):
         held: it must return in bounded time and call no method of the simulation.
 
         Args:
-            readings: At the beginning of the step.
+            readings: The readings at the beginning of the step.
 
         Returns:
             Commands of the rotors, 0 (stopped) to 1 (full): front left, front right, rear left, rear right; values
@@ -94,9 +94,9 @@ class Firmware(Protocol):
         ...
 
 
-LATITUDE_DEG: Final = 47.397742  #: of the worlds' origin, WGS 84
+LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
 LONGITUDE_DEG: Final = 8.545594
-ALTITUDE_M: Final = 488.0  #: of the worlds' floor above mean sea level
+ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
 #: The Earth's field there, east, north, up: the World Magnetic Model 2025, at the beginning of 2026.
 MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
@@ -154,7 +154,7 @@ class Instruments:
     Args:
         vehicle: The drone, with rotors.
         drone: Its number.
-        seed: Of the simulation.
+        seed: The simulation's seed.
         ranging: Measures distances to the surroundings.
     """
 

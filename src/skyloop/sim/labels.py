@@ -25,7 +25,7 @@ from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import FigureTarget, TargetState, World
 
-CLASS_NAMES = ("person", "car", "box")  #: of labels; boards and platforms have their own classes, outside this list
+CLASS_NAMES = ("person", "car", "box")  #: label classes; boards and platforms have other ones
 _CLEAR_M = 0.35  # between a camera and solids
 _LONGEST_STEP_S = 20.0  # between two pictures of ``pictures``; tracks keep only 60 s
 
@@ -35,7 +35,7 @@ class TargetBox:
     """An object's box in an image.
 
     Attributes:
-        name: Of the target or box in its world.
+        name: Name of the target or box in its world.
         class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
         box: x, y of the upper left corner, width and height [pixel], of its whole extent within the image.
         visible: Share of its pixels within the image that are not occluded, 0 to 1.
@@ -72,8 +72,8 @@ class Labeller:
 
         Args:
             state: The poses of all moving objects.
-            pose: Of the camera.
-            model: Of the camera.
+            pose: The camera's pose.
+            model: The camera's model.
 
         Raises:
             UsageError: The state does not fit the scene, or the model's distortion can't be inverted.

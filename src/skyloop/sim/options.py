@@ -28,20 +28,20 @@ class SimOptions:
 
     Attributes:
         world: Name of a shipped world, or path of a world file.
-        seed: Of all noise and gusts.
-        speed: Of simulated time, relative to real time.
-        cameras: Of each drone.
+        seed: Seed of all noise and gusts.
+        speed: Simulated time per real time.
+        cameras: The cameras of each drone.
         noise: Factor of the sensors' noise and biases.
         wind: Factor of the world's wind.
         battery: Charge at the start, 0 to 1.
-        quality: Of the images: ``fast``, ``smooth`` or ``best``.
+        quality: Image quality: ``fast``, ``smooth`` or ``best``.
         native: Actions that the drone's driver supports natively.
         position: Whether the drone reports its position.
         velocity: Whether the drone reports its velocity, which it uses for its flight in any case.
         truth: Whether the drone also reports its true state.
-        rate_hz: Of the reports.
+        rate_hz: Reports per second.
         most_lag_s: How far the world may fall behind the clock before it skips the rest [s].
-        parameters: Of the vehicles.
+        parameters: The vehicles' parameters.
         autopilot: The real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
         autopilot_folder: The folder for the firmware's settings; None: they last as long as the drone.
     """

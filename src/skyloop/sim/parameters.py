@@ -77,7 +77,7 @@ class RotorParameters:
 
     Attributes:
         places_m: Positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
-        inertia_kg_m2: About the body's axes.
+        inertia_kg_m2: Moments of inertia about the body's axes.
         thrust_n_s2: Thrust per square of the speed.
         torque_m: Torque per thrust.
         idle_speed_rad_s: Lowest speed of a running rotor.
@@ -88,7 +88,7 @@ class RotorParameters:
             rotors' speeds: from blade flapping and the blades' asymmetric drag.
         rotor_inflow_kg: The same along the rotors' axes: air from above reduces thrust.
         body_drag_kg_m: Force per square of the airspeed, along the body's axes.
-        rotor_inertia_kg_m2: Of one rotor about its axis: an accelerating rotor turns the body the other way.
+        rotor_inertia_kg_m2: Inertia of one rotor about its axis: an accelerating rotor turns the body the other way.
         efficiency: Share of the battery's power that reaches the air as torque times speed of the rotors' shafts.
         instruments: Errors of the instruments.
 
@@ -183,8 +183,8 @@ class VehicleParameters:
     rotor_height_m: float = 0.05  # of the rotors above the feet, for the ground effect; estimate
     ground_effect: float = 1.0  # share of the effect of one rotor of this radius [C]; 0 switches it off
     motor_time_constant_s: float = 0.06  # estimate
-    most_thrust: float = 1.9  # of the weight, battery full; estimate
-    least_thrust: float = 0.3  # of the weight, while the motors run; estimate
+    most_thrust: float = 1.9  # as a share of the weight, with a full battery; estimate
+    least_thrust: float = 0.3  # as a share of the weight, while the motors run; estimate
 
     # Inner loops
     attitude_frequency_rad_s: float = 16.0  # with the damping: a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s

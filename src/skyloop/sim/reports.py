@@ -16,7 +16,7 @@ class VehicleFeedback:
     Angles: roll right side down, pitch nose down, yaw counter-clockwise from east, within ±π.
     """
 
-    time_s: float  #: of the simulation
+    time_s: float  #: simulation time
     state: FlightState
     emergency_reason: str  #: reason for cut motors; empty in other states
     battery: float  #: remaining charge, 0 to 1
@@ -24,7 +24,7 @@ class VehicleFeedback:
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
-    altitude_m: float  #: of the feet above the floor
+    altitude_m: float  #: height of the feet above the floor
     velocity_m_s: Vec3  #: forward, left, up, in the levelled axes
     angular_velocity_rad_s: Vec3  #: about the body's axes
     acceleration_m_s2: Vec3  #: specific force along the body's axes: +g along z at rest
@@ -36,7 +36,7 @@ class VehicleTruth:
 
     time_s: float
     state: FlightState
-    position_m: Vec3  #: of the body's centre
+    position_m: Vec3  #: position of the body's centre
     velocity_m_s: Vec3
     roll_rad: float
     pitch_rad: float

@@ -24,7 +24,7 @@ from skyloop.errors import UsageError
 from skyloop.sim.columns import N, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, VehicleParameters
 
-PLANT_STEP_S = 0.001  #: of the rotor-level model and its instruments
+PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
@@ -221,7 +221,7 @@ def advance(
         do: The operations.
         c: The constants.
         turning: Quaternion (w, x, y, z; world from body) and body rates.
-        speeds: Of the rotors, constant during the step.
+        speeds: Rotor speeds, constant during the step.
         twist: See :func:`spin`.
         motion: Velocity of the air, position, velocity; world axes.
         knock: Acceleration, world axes, by which contacts changed the body's velocity in the last step.
@@ -300,8 +300,8 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
     Args:
         do: The operations.
         c: The constants.
-        rates: About the body's axes.
-        speeds: Of the rotors.
+        rates: Rates about the body's axes.
+        speeds: Rotor speeds.
         wanted: The target rates.
         thrust: Per mass; at 0 the rotors stop.
         sag: Voltage of the battery, as a share of the full one.

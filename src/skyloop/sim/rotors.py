@@ -51,9 +51,9 @@ class RotorBodies(BodyTable):
     Attributes:
         quaternion: World from body, w, x, y, z, (4, n).
         turning: Body rates, (3, n) [rad/s].
-        speeds: Of the rotors, (4, n) [rad/s].
-        voltage: Of the batteries under load, (n,) [V].
-        current: From the batteries, (n,) [A].
+        speeds: Rotor speeds, (4, n) [rad/s].
+        voltage: Voltage of the batteries under load, (n,) [V].
+        current: Current of the batteries, (n,) [A].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:

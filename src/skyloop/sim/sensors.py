@@ -35,7 +35,7 @@ class Sensors:
     """The sensors of all drones.
 
     Attributes:
-        altitude: Of the feet above the floor, (n,) [m].
+        altitude: Height of the feet above the floor, (n,) [m].
         velocity: Forward, left, up, levelled axes, (3, n) [m/s].
         numbers: For a few drones: altitude and velocity.
     """

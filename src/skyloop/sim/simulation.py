@@ -44,8 +44,8 @@ class Simulation:
 
     Attributes:
         world: The world.
-        parameters: Of each drone.
-        seed: Of all noise and gusts.
+        parameters: The parameters of each drone.
+        seed: Seed of all noise and gusts.
     """
 
     def __init__(
@@ -64,8 +64,8 @@ class Simulation:
         Args:
             world: The world.
             drones: Their number, 1 to 1000.
-            seed: Of all noise and gusts. Together with the world's own seed it determines the simulation. None uses the
-                world's seed.
+            seed: Seed of all noise and gusts. Together with the world's own seed it determines the simulation. None uses
+                the world's seed.
             parameters: One for all drones or one for each.
             limits: One for all drones or one for each.
             charge: Initial charge of the batteries, above 0, at most 1.
@@ -261,9 +261,9 @@ class Simulation:
 
         Args:
             drone: Its number.
-            position_m: Of its centre, world axes.
+            position_m: New position of its centre, world axes.
             yaw_rad: Its heading.
-            charge: Of its battery, 0 to 1.
+            charge: Charge of its battery, 0 to 1.
 
         Raises:
             UsageError: The drone is not flying, or a number is out of its range.

@@ -89,8 +89,8 @@ class Solids:
 
         Args:
             seconds: Moving solids stay within their boxes for this time, from their present positions.
-            radius_m: Of hulls that touch a box only if their own bounding box overlaps this one. (The distance of a
-                hull from a turned box's corner is that of a square turned the same way.)
+            radius_m: Radius of hulls that touch a box only if their own bounding box overlaps this one. (The distance of
+                a hull from a turned box's corner is that of a square turned the same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -134,7 +134,7 @@ class Solids:
         Never more than the true distance; negative inside.
 
         Args:
-            points: Of the drones, (3, m).
+            points: Positions of the drones, (3, m).
             hulls: Radius, radius, half height, (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
@@ -151,8 +151,8 @@ class Solids:
 
         Args:
             point: Its centre, three numbers [m].
-            radius: Of its hull [m].
-            half_height: Of its hull [m].
+            radius: Radius of its hull [m].
+            half_height: Half height of its hull [m].
             among: The solids to check, in addition to the room; None for all.
         """
         x, y, z = point
@@ -189,7 +189,7 @@ class Solids:
 
         Args:
             point: Start of a beam; from below the floor its length is 0.
-            direction: Of the beam, a unit vector.
+            direction: Direction of the beam, a unit vector.
             time_s: Simulation time, for the positions of moving solids.
         """
         if self._movers:

@@ -342,9 +342,9 @@ class FigureTarget:
         shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
         path: Its path.
         yaw: Its heading.
-        size_m: Along its own x (ahead), y (left) and z.
+        size_m: Size along its own x (ahead), y (left) and z.
         look: Determines its colours and the pattern of its clothes: equal shapes and looks are look-alikes.
-        colour: Of a person's top, or a car's body; None for the look's colour.
+        colour: Colour of a person's top or a car's body; None for the look's colour.
     """
 
     name: str

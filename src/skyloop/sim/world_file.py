@@ -79,7 +79,7 @@ from skyloop.sim.world_tables import (
 )
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
-_NEAREST_M = 0.01  # of two way points
+_NEAREST_M = 0.01  # least distance of two waypoints
 _WALL_GAP_M = 0.004  # posters and markers are this far off their wall, so that the renderer has a clear order
 
 N = TypeVar("N", bound=Named)
@@ -97,7 +97,7 @@ def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
 
     Args:
         name_or_path: A shipped world's name, or a file (any name that ends in ``.toml`` or has a separator).
-        seed: For everything random in the world.
+        seed: Seed of everything random in the world.
 
     Raises:
         UnknownNameError: No shipped world has this name.

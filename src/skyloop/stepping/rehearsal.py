@@ -55,7 +55,7 @@ class Radio:
 
     command_delay_s: float = 0.04
     feedback_delay_s: float = 0.02
-    picture_delay_s: float = 0.02  #: of frames, in addition to the camera's own latency
+    picture_delay_s: float = 0.02  #: delay of frames, in addition to the camera's own latency
     drop: float = 0.05  #: probability that a command, a sample of feedback or a frame is lost
     position_noise_m: float = 0.01  #: standard deviation of each component of the position in feedback
     seed: int = 0
@@ -193,8 +193,8 @@ class SteppedHost(SimHost):
         """Initialise the world.
 
         Args:
-            options: Of the simulation.
-            clock: Of the observers' samples; the caller moves it to :attr:`due_ns` before a step.
+            options: Options of the simulation.
+            clock: Clock of the observers' samples; the caller moves it to :attr:`due_ns` before a step.
             drones: Number of drones in the world.
         """
         super().__init__(options, drones)

@@ -45,7 +45,7 @@ class SteppedReplay:
         """Start the proxy.
 
         Args:
-            driver: Of the replay.
+            driver: The replay's driver.
         """
         self.reach = None
         self._executor = StepExecutor("skyloop-stepping")

@@ -36,7 +36,7 @@ class StepExecutor:
         """Start the thread.
 
         Args:
-            name: Of the thread.
+            name: Name of the thread.
         """
         self._jobs: SimpleQueue[Job | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)

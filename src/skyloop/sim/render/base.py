@@ -28,7 +28,7 @@ class SceneState:
     arrays afterwards.
 
     Attributes:
-        drone_positions_m: Of the bodies' origins, world axes, shape (n, 3).
+        drone_positions_m: Positions of the bodies' origins, world axes, shape (n, 3).
         drone_rotations: World from body, shape (n, 3, 3).
         targets: One for each target of the world, in the world's order.
         light: Brightness of the whole picture; 1 is full. See :class:`~skyloop.sim.world.Light`.

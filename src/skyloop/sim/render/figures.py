@@ -56,7 +56,7 @@ class Figure:
         limbs: As many equally large groups of quads as there are joints, each with its joint as origin; None: none.
         joints: Positions of the joints, (limbs, 3).
         swings: Forward swing of each limb in the middle of a step [rad], (limbs,).
-        spots: Of the shadow: x, y, radius [m].
+        spots: Circles of the shadow: x, y, radius [m].
     """
 
     body: Quads

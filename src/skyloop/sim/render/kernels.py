@@ -56,10 +56,10 @@ def prepare(
         two_sided: See ``Quads``.
         lit: See ``Quads``.
         shown: Whether to draw a quad at all, (n,).
-        weight: Of each quad's inverse depth, by its priority, (n,).
+        weight: Factor on each quad's inverse depth, by its priority, (n,).
         density: See ``Quads``.
         origin: x, y and span in the atlas of each quad's texture, (n, 3).
-        position: Of the camera.
+        position: The camera's position.
         rotation: World from optical axes.
         constants: Edge-on limit [m], ambient light, direct light, unit of light, factor of the footprint,
             direction to the light, unit.
@@ -192,7 +192,7 @@ def draw(
         planes: See :func:`prepare`.
         box: See :func:`prepare`.
         table: See :func:`prepare`.
-        samples: Of each pixel, 1 or 4.
+        samples: Samples per pixel, 1 or 4.
         to_grid: See ``Raster``.
         rows_for: Number of grid rows needed for each row of the picture, (height,).
         ray_x: x of each pixel's ray (x, y, 1), (height, width).
@@ -208,7 +208,7 @@ def draw(
         atlas_size: Its rows and columns.
         gap: Between two levels of a texture in the atlas [texels].
         farthest: 1/z assumed for a ray beyond a quad's horizon [1/m].
-        boxes: Of each shadow: first row, row after the last, first column, column after the last, (s, 4).
+        boxes: Box of each shadow: first row, row after the last, first column, column after the last, (s, 4).
         axes: World from optical.
         shadows: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it,
             (s, 7).

@@ -28,7 +28,7 @@ class Raster:
 
     Attributes:
         grid: The grid.
-        samples: Of each pixel: 1 or 4.
+        samples: Samples per pixel: 1 or 4.
         lookup: Flat index on the grid of each pixel's first sample, (pixels,); the others are the next one, and the two
             below these.
         to_grid: Scale of x and of y, and start of x and of y: a ray (x, y, 1) of ``rays`` times the scale plus the
@@ -36,7 +36,7 @@ class Raster:
             ``lookup``.
         sample_x: x/z of each column of the grid.
         sample_y: y/z of each row of the grid.
-        rays: Of each pixel's centre.
+        rays: Rays of the pixels' centres.
     """
 
     grid: Grid
@@ -96,7 +96,7 @@ class Painter(ABC):
     """Draws through one lens. Reuses buffers, so use it from one thread at a time.
 
     Args:
-        raster: Of the lens.
+        raster: The lens's raster.
         model: The lens.
         atlas: Textures of the scene.
     """
@@ -113,10 +113,10 @@ class Painter(ABC):
         """Draw a picture.
 
         Args:
-            quads: Of the scene.
+            quads: The scene's quads.
             shown: Which of them to draw at all, (n,).
             shadows: The shadows.
-            pose: Of the camera.
+            pose: The camera's pose.
             picture: Output: BGR, (height, width, 3), contiguous.
         """
 

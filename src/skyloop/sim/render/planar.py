@@ -69,7 +69,7 @@ class PlanarRenderer:
 
     Args:
         scene: The scene.
-        quality: Of the sampling.
+        quality: Sampling quality.
         compiler: For compiled drawing; None: always draw without it.
     """
 
@@ -88,8 +88,8 @@ class PlanarRenderer:
 
         Args:
             state: The poses of all moving objects.
-            pose: Of the camera.
-            model: Of the camera.
+            pose: The camera's pose.
+            model: The camera's model.
             out: Where to write the image; None creates an array.
 
         Returns:
@@ -203,7 +203,7 @@ class SensorEffects:
 
         Args:
             picture: BGR, of the camera's size.
-            number: Of the frame.
+            number: The frame's number.
             body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
                 which blurs the image over the exposure; None for a drone that does not turn.
 

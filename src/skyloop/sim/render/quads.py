@@ -111,7 +111,7 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # of a quad's vectors; then come the normal and the slopes of u and v
+_CORNERS = 4  # the first of a quad's vectors; the normal and the slopes of u and v follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +273,8 @@ class QuadBuilder:
         Args:
             low: Its lowest corner [m].
             high: Its highest corner [m].
-            sides: Of the four sides; a pair is for the sides facing along x and those facing along y.
-            ends: Of top and bottom; None uses the texture of the sides facing along x.
+            sides: Texture of the four sides; a pair is for the sides facing along x and those facing along y.
+            ends: Texture of top and bottom; None uses the texture of the sides facing along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

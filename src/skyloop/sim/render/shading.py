@@ -164,7 +164,7 @@ class Shadow:
 
     Attributes:
         centre_m: World axes.
-        radius_m: Of its edge.
+        radius_m: Radius of its edge.
         strength: Share of light missing in its middle, 0 to 1.
     """
 
@@ -248,8 +248,8 @@ def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth
     Args:
         picture: BGR, (height, width, 3), changed in place.
         shadow: The shadow.
-        rays: Of the lens.
-        inverse_depth: Of each pixel [1/m], (height, width).
+        rays: The lens's rays.
+        inverse_depth: Inverse depth of each pixel [1/m], (height, width).
     """
     top, bottom, left, right = shadow.box
     part = slice(top, bottom), slice(left, right)
@@ -270,8 +270,8 @@ def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float,
     """Return x/z and y/z of the corners of a square's part more than 1 cm ahead, optical axes.
 
     Args:
-        centre: Of the square [m].
-        sides: From there to the middles of two sides [m].
+        centre: The square's centre [m].
+        sides: Vectors from there to the middles of two sides [m].
     """
     (ax, ay, az), (bx, by, bz) = sides
     signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

@@ -228,7 +228,7 @@ class Configurator:
 
 # Set-up --------------------------------------------------------------------------------------------------------------
 
-_NEW_MOTHER_BOARD: Final = 32  #: of the AR.Drone 2; the AR.Drone 1 has 17 and less
+_NEW_MOTHER_BOARD: Final = 32  #: the AR.Drone 2 has at least this version, the AR.Drone 1 at most 17
 _ID_KEYS: Final = {
     "session": "custom:session_id",
     "profile": "custom:profile_id",
@@ -270,7 +270,7 @@ class Setup:
     the drone did not accept settings of our own.
 
     Args:
-        options: Of the vehicle's address.
+        options: Options of the vehicle's address.
         configurator: Runs the steps.
         ids: Ours.
         remembered: Keys that an application wrote before the link was lost. Those that the drone has forgotten are

@@ -119,7 +119,7 @@ class DumpClient:
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
         """Store the arguments. No I/O."""
-        self.address = ""  #: of the drone; empty until known
+        self.address = ""  #: the drone's address; empty until known
         self._port = port
         self._selector = selector
         self._ready = ready

@@ -32,10 +32,10 @@ class ArdroneOptions:
 
     host: str
     ports: Ports = navdata.STANDARD
-    version: int | None = None  #: of the drone; None: from its configuration
+    version: int | None = None  #: the drone's version; None: from its configuration
     full: bool = False  #: navdata at 200 Hz with all options instead of the demo mode
     navdata_options: int | None = None  #: one bit per tag; None: as configured in the drone
-    rate_hz: float = 50.0  #: of feedback, at most
+    rate_hz: float = 50.0  #: highest rate of feedback
     video: bool = True
     ids: bool = True  #: own settings on an AR.Drone 2 (multi-configuration)
 

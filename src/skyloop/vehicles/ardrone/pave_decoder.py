@@ -40,7 +40,7 @@ class PaveDecoder:
         self._codec: int | None = None
         self._context: VideoCodecContext | None = None
         self._needs_key = True
-        self._number = 0  # of the previous frame
+        self._number = 0  # number of the previous frame
 
     def restart(self) -> None:
         """Wait for a key frame, as the stream is interrupted."""

@@ -100,7 +100,7 @@ class ArdroneSession(VehicleSession):
         self._health = Health()
         self._setup_ns: int | None = None
         self._setups_failed = 0
-        self._state = self._earlier = State(0)  # of the newest datagram and the previous one
+        self._state = self._earlier = State(0)  # state bits of the newest datagram and the previous one
         self._sent_ns = 0
         self._started_ns = 0
         self._published_ns = 0

@@ -73,7 +73,7 @@ class DroneStamps:
 
     def __init__(self) -> None:
         self._clock = LiveClock()
-        self._stamp_ms = 0  # of the previous frame, as sent
+        self._stamp_ms = 0  # stamp of the previous frame, as sent
         self._time_ms = 0  # the same without wraps
 
     def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
@@ -294,7 +294,7 @@ class UvlcVideo:
         self.waited = 0
         self.damaged = 0
         self._decoder = UvlcDecoder()
-        self._number: int | None = None  # of the newest picture
+        self._number: int | None = None  # number of the newest picture
         self._old_run = 0
 
     def restart(self) -> None:

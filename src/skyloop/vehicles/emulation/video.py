@@ -209,9 +209,9 @@ class Encoder:
     Args:
         form: Codec and size.
         fps: Pictures a second.
-        bitrate_kbps: On average.
+        bitrate_kbps: Average bitrate.
         group: Pictures between key frames.
-        profile: Of H.264.
+        profile: H.264 profile.
         buffer_s: The burst limit, in seconds of the bitrate; None: single pictures may have any size.
 
     Raises:

@@ -125,7 +125,7 @@ class RosContext:
 
     Args:
         purpose: Named by an error when rclpy is missing.
-        domain: Of DDS; None: from ``ROS_DOMAIN_ID``.
+        domain: DDS domain; None: from ``ROS_DOMAIN_ID``.
         arguments: For ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
 
     Raises:

@@ -53,14 +53,14 @@ class Options:
     land: str  #: ``std_srvs/Trigger``
     camera: str  #: name of the camera
     mount: str  #: a name in :data:`MOUNTS`
-    width: int  #: of its images [px]
+    width: int  #: image width [px]
     height: int  #: [px]
-    fps: float  #: of its images [1/s]
+    fps: float  #: frame rate [1/s]
     compressed: bool  #: whether its images are JPEG
     stamped: bool  #: whether velocities have a stamp
     ground: bool  #: whether it is a ground vehicle: take-off and landing then begin and end the drive
     timeout_s: float  #: silence after which the link is lost [s]
-    domain: int | None  #: of DDS; None: from ``ROS_DOMAIN_ID``
+    domain: int | None  #: DDS domain; None: from ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
         """Return the robot's capabilities for its topics and services."""

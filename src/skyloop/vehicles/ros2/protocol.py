@@ -86,10 +86,10 @@ class RobotSession:
         self._system_clock = system_clock
         self._lock = threading.RLock()
         self._clocks = {topic: CaptureClock() for topic in ("odom", "image")}
-        self._fields: dict[str, Any] = {}  # of the newest odometry
+        self._fields: dict[str, Any] = {}  # fields of the newest odometry
         self._battery: dict[str, Any] = {}
         self._intrinsics: Intrinsics | None = None
-        self._captured_ns = 0  # of the newest feedback
+        self._captured_ns = 0  # capture time of the newest feedback
         self._received_ns: int | None = None
         self._odometry_ns: int | None = None
         self._measures_height = False  # its odometry was above the ground once, which a planar one never is

@@ -146,7 +146,7 @@ class TelloSession(VehicleSession):
     """The protocol between one opened driver and its drone. Not thread-safe.
 
     Args:
-        options: Of the vehicle's address.
+        options: Options of the vehicle's address.
         now_ns: The time of opening.
         extra: Returns further telemetry for ``Feedback.native``.
         video_ns: Returns when usable video or a key picture last arrived; 0 for never.
@@ -167,7 +167,7 @@ class TelloSession(VehicleSession):
         self.setpoints = SetpointController()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
-        self._watch = RestartWatch()  # of the count of seconds with running motors
+        self._watch = RestartWatch()  # watches the count of seconds with running motors
         self.sdk: Sdk | None = None  #: None until ``sdk?`` is answered; SDK 1.3 answers with an error
         self.serial = ""
         self.ready = False  #: whether state arrives and commands are answered

@@ -255,10 +255,10 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         drone: Its number in that world.
         version: 1 or 2.
         bind: The address of this machine to listen on.
-        ports: To listen on; 0 for any free one.
+        ports: Ports to listen on; 0 for any free one.
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
         delay_s: Added to those datagrams, in each direction.
-        header_size: Of the PaVE headers, 68 bytes, or 64 as in early firmware.
+        header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
         torn_start: Whether a new client of an AR.Drone 2's video first gets the last picture sent to another client,
             however old, and then the following frames, key frame or not, as from a real drone. Otherwise its stream
             begins with the next key frame.

@@ -21,7 +21,7 @@ from skyloop.vehicles.ardrone.wire.configuration import (
 
 MOST_CUSTOM: Final = 16  #: of sessions, users and applications each; the real drone's number is unknown
 
-Ids = tuple[str, str, str]  #: of session, user and application, as ``CONFIG_IDS`` has them
+Ids = tuple[str, str, str]  #: of session, user and application, as in ``CONFIG_IDS``
 
 _ID: Final = re.compile(r"[0-9a-f]{8}")
 _ID_KEYS: Final = {

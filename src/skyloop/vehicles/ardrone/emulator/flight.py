@@ -127,7 +127,7 @@ class FlightControl:
         self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM; navdata is relative to them
         self.progress = NO_PROGRESS  #: the last valid one
         self.animation: Animation | None = None
-        self.calibrations = 0  #: of the magnetometer, started so far
+        self.calibrations = 0  #: calibrations of the magnetometer started so far
 
     # Commands --------------------------------------------------------------------------------------------------
 

@@ -53,8 +53,8 @@ class PaveFrame:
     codec: int  #: one of :class:`Codec`, or another number
     type: int  #: one of :class:`FrameType`, or another number
     number: int  #: counts the drone's frames
-    timestamp_ms: int  #: of the drone's own clock
-    width: int  #: of the picture to show [px]
+    timestamp_ms: int  #: time of the drone's own clock
+    width: int  #: width of the picture to show [px]
     height: int
     stream_id: int
     payload: bytes
@@ -128,7 +128,7 @@ class PaveParser:
         self.skipped_bytes = 0
         self.broken_frames = 0
         self._buffer = bytearray()
-        self._header: _Header | None = None  # of the frame that the buffer starts with
+        self._header: _Header | None = None  # header of the frame at the buffer's start
         self._searched = 0  # the buffer has been searched for a header up to here
         self._damaged = False
 

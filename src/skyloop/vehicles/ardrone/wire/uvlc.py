@@ -81,8 +81,8 @@ class UvlcPicture:
 
     number: int  #: counts the drone's pictures, 32 bits
     type: PictureType
-    quant: int  #: of the picture's header
-    width: int  #: of the coded part [px]
+    quant: int  #: quantiser in the picture's header
+    width: int  #: width of the coded part [px]
     height: int
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
 
@@ -94,7 +94,7 @@ class UvlcHeader:
     number: int
     type: PictureType
     quant: int
-    width: int  #: of the coded part [px]
+    width: int  #: width of the coded part [px]
     height: int
 
 
@@ -159,9 +159,9 @@ class _Reader:
         self._window = self._walker.window
         self._end = 8 * len(packet)
         self._at = 0
-        self._coded: list[bool] = []  # of each macroblock
-        self._quants: list[int] = []  # of each coded one
-        self._means: list[int] = []  # of each of its blocks
+        self._coded: list[bool] = []  # for each macroblock
+        self._quants: list[int] = []  # for each coded macroblock
+        self._means: list[int] = []  # for each block of the coded macroblocks
 
     def read_header(self) -> UvlcHeader:
         code = self._read(START_CODE_BITS)

@@ -48,8 +48,8 @@ QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
-BLOCKS: Final = 6  #: of a macroblock: four of luma in reading order, then Cb, Cr, at half resolution
-SIDE: Final = 8  #: of a block
+BLOCKS: Final = 6  #: blocks of a macroblock: four of luma in reading order, then Cb, Cr, at half resolution
+SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
 DC_BITS: Final = 10
 

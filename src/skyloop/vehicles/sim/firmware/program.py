@@ -74,7 +74,7 @@ class Program:
     """A firmware's process, restarted whenever it ends, until :meth:`close`.
 
     Attributes:
-        name: Of the firmware, for messages.
+        name: The firmware's name in messages.
         starts: Number of starts.
         pid: Its process id; 0 while it does not run.
     """
@@ -92,14 +92,14 @@ class Program:
         """Store the arguments; :meth:`start` starts it.
 
         Args:
-            name: Of the firmware, for messages.
+            name: The firmware's name in messages.
             prepare: Called before each start with the working folder; writes the files that the firmware reads there.
                 Raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
             report: Called with each event, on a thread of this object.
             verify: Called once its process runs, before the start is reported; raises ``OSError`` for a failed start,
                 which is then ended and retried; :class:`StartedInVainError`: at once. None: no check.
             folder: Working folder with its settings; None: a new one, removed at the end.
-            restart_s: From its end to its next start [s].
+            restart_s: Time from its end to its next start [s].
         """
         self.name = name
         self.starts = 0

@@ -46,7 +46,7 @@ __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
 
 REPORTS_HZ: Final = 50.0
-TAKEOFF_ALTITUDE_M: Final = 0.8  #: of a recorded flight
+TAKEOFF_ALTITUDE_M: Final = 0.8  #: as in a recorded flight
 
 #: Small and light. Mass, size and time of flight: Ryze, Tello specifications; rotors of 3 inches. The rest is the
 #: simulator's own vehicle.

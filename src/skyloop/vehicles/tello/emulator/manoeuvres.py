@@ -103,7 +103,7 @@ class Going:
     Args:
         report: The present one.
         places: Waypoints in world axes [m].
-        speed_m_s: Along the way.
+        speed_m_s: Speed along the way.
     """
 
     def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
