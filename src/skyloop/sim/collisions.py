@@ -23,7 +23,7 @@ from skyloop.sim.world import Vec3
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or nothing would come to rest
 _PASSES = 6
 _TOUCH_M = 1e-9  # overlaps up to this count as touching: rounding leaves some that no push removes
-#: Steps between two broad phases. With few drones a broad phase costs relatively more and its result covers less.
+#: Steps between two broad phases. With few drones one costs as much, but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
 _SLACK_M = 0.03  # extra reach in a broad phase, for drones that are pushed
 #: Up to this many pairs are faster to check one at a time.

@@ -29,7 +29,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
 _ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
-_YAW_SHARE = 0.25  # of the rotors' range of thrust, reserved for yaw when roll and pitch would take all
+_YAW_SHARE = 0.25  # of the rotors' range of thrust that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
 Three: TypeAlias = tuple[N, N, N]

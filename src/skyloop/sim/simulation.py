@@ -64,8 +64,8 @@ class Simulation:
         Args:
             world: The world.
             drones: Their number, 1 to 1000.
-            seed: Seed of all noise and gusts. Together with the world's own seed it determines the simulation. None uses
-                the world's seed.
+            seed: Seed of all noise and gusts. Together with the world's own seed it determines the simulation. None
+                uses the world's seed.
             parameters: One for all drones or one for each.
             limits: One for all drones or one for each.
             charge: Initial charge of the batteries, above 0, at most 1.

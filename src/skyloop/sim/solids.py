@@ -89,8 +89,8 @@ class Solids:
 
         Args:
             seconds: Moving solids stay within their boxes for this time, from their present positions.
-            radius_m: Radius of hulls that touch a box only if their own bounding box overlaps this one. (The distance of
-                a hull from a turned box's corner is that of a square turned the same way.)
+            radius_m: Radius of hulls that touch a box only if their own bounding box overlaps this one. (The distance
+                of a hull from a turned box's corner is that of a square turned the same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m

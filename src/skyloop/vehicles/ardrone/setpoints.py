@@ -143,7 +143,7 @@ class Condition:
         return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
-#: After this silence a flying drone may have landed: it lands without commands for 2 s.
+#: After this silence a flying drone may have landed: it lands after 2 s without commands.
 SILENT_NS: Final = nanoseconds(0.25)
 
 

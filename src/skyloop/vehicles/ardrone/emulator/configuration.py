@@ -69,7 +69,7 @@ class Configuration:
         self._ids = dict.fromkeys(Category, DEFAULT_ID)
 
     def __getitem__(self, name: str) -> Value:
-        """Return a key's value in force."""
+        """Return the current value of a key."""
         category = self._keys[name].category
         return self._values[category][self._ids[category]][name]
 
@@ -78,7 +78,7 @@ class Configuration:
         return name in self._keys
 
     def number(self, name: str) -> float:
-        """Return the value in force of a numeric key."""
+        """Return the current value of a numeric key."""
         value = self[name]
         assert isinstance(value, int | float)
         return value

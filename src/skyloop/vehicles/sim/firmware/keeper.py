@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
     def begin() -> None:
-        if libc is not None:  # a killed parent cannot end its child
+        if libc is not None:  # if this process is killed, it cannot end the firmware
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if prompt:
             become_prompt()
