@@ -40,7 +40,7 @@ Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
 SIZES_PX: Final = (16, 512)  #: smallest and largest edge of a picture
 SIZE: Final = (320, 240)
 ONBOARD_PX: Final = 64  #: edge of the pictures on board, by default
-_FOCAL_PX: Final = 260.0
+_FOCAL_PX: Final = 260.0  #: of the rendering camera
 _ONBOARD_FOCAL: Final = 40.0 / 64.0  # as a share of the edge: 77° field of view
 _FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera, from the middle of the first cell's floor [m]
 _AT: Final = np.array([0.0, 0.0, 1.8])  #: the point it looks at
@@ -48,7 +48,7 @@ _EYE_M: Final = np.array([0.12, 0.0, 0.0])  # in front of the drone's own body
 _AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
 _RED: Final = (40, 40, 230)  # BGR
 _LATER: Final = (40, 160, 230)  # BGR, of the goal after it
-_NEAREST_M: Final = 0.05
+_NEAREST_M: Final = 0.05  #: near plane: rings with closer points are not drawn
 _TURN: Final = np.linspace(0.0, 2.0 * np.pi, 25)
 _CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 

@@ -111,7 +111,7 @@ Infos = dict[str, NDArray[Any]]
 
 PERIOD_S: Final = 0.04  #: between two actions
 SPEED_M_S: Final = 1.0  #: at a full action
-TURN_RAD_S: Final = 1.5
+TURN_RAD_S: Final = 1.5  #: at a full action
 NEAR_M: Final = 0.2  #: distance from the goal that counts as reached
 FOLLOWED_M: Final = 1.5  #: the desired distance from a followed target
 GATES: Final = 4
@@ -123,7 +123,7 @@ _SPREAD: Final = (2.0, 2.0, 0.8)  #: goals and starts: up to this far from the m
 _HEIGHT: Final = 2.0  #: … whose middle is this high
 _WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there [m]
 _WALK_RAD_S: Final = 0.18  #: angular rate of the walk, for at most 0.3 m/s
-_FAILURE: Final = -5.0
+_FAILURE: Final = -5.0  #: reward for leaving the cell or falling
 _FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
 #: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to desired heading: sine, cosine
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)

@@ -125,7 +125,7 @@ class Batteries:
 
 
 LOW_BATTERY = 0.03  # share of the charge below which the vehicle lands
-_HEIGHT_TOLERANCE_M = 0.08
+_HEIGHT_TOLERANCE_M = 0.08  # below its target height, a take-off counts as finished
 _STANDING_S = 0.05  # time since the last ground contact below which a drone counts as standing
 _KEPT_OCCURRENCES = 1000
 

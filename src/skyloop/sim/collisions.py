@@ -21,7 +21,7 @@ from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or nothing would come to rest
-_PASSES = 6
+_PASSES = 6  # attempts per step to push a drone out of solids
 _TOUCH_M = 1e-9  # overlaps up to this count as touching: rounding leaves some that no push removes
 #: Steps between two broad phases. With few drones one costs as much, but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30

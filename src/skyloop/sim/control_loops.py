@@ -26,8 +26,8 @@ _MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, for a drone held by a wall
 
 
 _ROWS = 15  # of the table of set-points, limits and, from this row on, the loops' state:
-_STATE = 11
-_LANDING = 10
+_STATE = 11  # first row of the state
+_LANDING = 10  # row that is above 0 while landing
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose
 from skyloop.sim.world import Wind
 
-STEP_S = 0.004
+STEP_S = 0.004  # of the simulation: 250 Hz
 
 # As arrays, since NumPy computes faster with them than with numbers.
 _STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)

@@ -31,9 +31,8 @@ from skyloop.sim.world_file import parse_world
 
 #: Length of the comparison from the beginning of a step.
 WINDOW_S = 3.0
-#: The recorded drone sends samples so often.
 _MAX_BYTES = 16 << 20  # size limit of a track; an hour at 200 Hz takes 15 MB
-SAMPLE_PERIOD_S = 0.005
+SAMPLE_PERIOD_S = 0.005  #: between samples of the recorded drone
 #: Half a command tilted the recorded drone as far as a whole one: from this magnitude on it tilts fully.
 FULL_TILT_COMMAND = 0.5
 

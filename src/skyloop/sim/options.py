@@ -19,7 +19,7 @@ from skyloop.sim.world_file import load_world
 #: The simulated vehicles' own actions; for positions and the return to the start the proxy flies them.
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
-MOST_LAG_S: Final = 0.25
+MOST_LAG_S: Final = 0.25  #: default lag behind the clock beyond which steps are skipped
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ class SimOptions:
         return with_scaled_flaws(self.parameters, self.noise)
 
 
-_LONGEST_RUN_STEPS = 25
+_LONGEST_RUN_STEPS = 25  # per call at real time
 SLOW_SHARE = 0.95  #: a simulation below this share of its speed is too slow,
 SLOW_NS = 5 * NS_PER_S  #: measured over this time;
 SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings

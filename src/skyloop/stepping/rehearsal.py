@@ -41,8 +41,8 @@ from skyloop.vehicles.sim.options import options_of
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera, SteppedCameraPipeline
 
-_BEGIN_NS: Final = 10 * NS_PER_S
-_CONNECT_S: Final = 20.0
+_BEGIN_NS: Final = 10 * NS_PER_S  #: start of the simulated clock
+_CONNECT_S: Final = 20.0  #: limit for connecting
 
 
 @dataclass(frozen=True, slots=True)

@@ -157,7 +157,7 @@ def _yaw(angle: float) -> NDArray[np.float64]:
 _FINEST = 128.0  # texels per metre of a room's surfaces, if its size allows
 _LARGEST = 1280.0  # texels along a side of such a surface
 _AFAR_M = 150.0  # extent of the open ground
-_SKY_M = 400.0
+_SKY_M = 400.0  # half the side of the sky
 SIDES = 6  #: quads of a box; in ``static_quads`` the shell comes first, then boxes, panels, markers
 # Direction of solids' shadows: away from the light of ``shading``, shortened, as in a room lit from all around.
 _LEAN = np.array([-0.16, 0.20])

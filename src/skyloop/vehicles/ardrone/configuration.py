@@ -21,7 +21,7 @@ from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_valu
 from skyloop.vehicles.ardrone.wire.navdata import State
 
 REPEAT_NS: Final = nanoseconds(0.15)  #: between repeats of an unacknowledged CONFIG; two periods of the demo mode
-REPEAT_DUMP_NS: Final = nanoseconds(0.3)
+REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: between repeats of a request for the dump
 MAX_DUMP: Final = 1 << 18  #: bytes; real dumps have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
 _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))

@@ -110,7 +110,7 @@ def _discard(port: socket.socket) -> None:
 
 # The control port ----------------------------------------------------------------------------------------------------
 
-RETRY_NS: Final = nanoseconds(0.25)
+RETRY_NS: Final = nanoseconds(0.25)  #: between attempts to connect to the control port
 _CHUNK: Final = 1 << 16
 
 

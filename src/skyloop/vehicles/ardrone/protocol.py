@@ -59,7 +59,7 @@ HURRY_NS: Final = nanoseconds(
     0.01
 )  #: minimum time between a datagram and a new set-point that does not wait for its tick
 DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
-LOST_NS: Final = nanoseconds(1.0)
+LOST_NS: Final = nanoseconds(1.0)  #: of silence
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none arrive
 SETUP_NS: Final = nanoseconds(6.0)  #: limit for the drone's set-up, which is then retried

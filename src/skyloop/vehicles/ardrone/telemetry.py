@@ -118,7 +118,7 @@ class DroneClock:
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_WINDOW_NS: Final = nanoseconds(0.3)
+CLIMB_WINDOW_NS: Final = nanoseconds(0.3)  #: over which the slope of the altitude is measured
 Vector = tuple[float, float, float]
 
 _FLIGHT_STATES: Final = {

@@ -139,10 +139,10 @@ class PaveAssembly:
         return [coded]
 
 
-CONNECT_S: Final = 1.0
-POLL_S: Final = 0.1
+CONNECT_S: Final = 1.0  #: limit for a connection
+POLL_S: Final = 0.1  #: longest wait in one read
 SILENT_S: Final = 3.0  #: limit without a whole frame, after which the connection is closed
-KEEP_ALIVE_S: Final = 0.5
+KEEP_ALIVE_S: Final = 0.5  #: between requests to an AR.Drone 1
 WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
 

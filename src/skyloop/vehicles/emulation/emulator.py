@@ -98,7 +98,7 @@ class RunningEmulator(ABC):
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 
-LONGEST_DELAY_S: Final = 10.0
+LONGEST_DELAY_S: Final = 10.0  #: of datagrams
 NO_FAULTS: Final = Faults()
 
 R = TypeVar("R", bound=RunningEmulator)

@@ -64,11 +64,11 @@ LIFT_M: Final = 0.3  #: height of the simulated vehicle's own take-off, before t
 LIMITS: Final = Limits(
     tilt_rad=0.52, climb_m_s=2.5, yaw_rate_rad_s=2.5, altitude_m=100.0, speed_m_s=8.0, takeoff_altitude_m=LIFT_M
 )
-PLACE_GAIN_PER_S: Final = 0.9
-YAW_GAIN_PER_S: Final = 2.0
-YAW_RATE_RAD_S: Final = 1.5
-GO_M_S: Final = 3.0
-SINK_M_S: Final = 1.5
+PLACE_GAIN_PER_S: Final = 0.9  #: speed per distance to a position
+YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per heading error
+YAW_RATE_RAD_S: Final = 1.5  #: limit while turning to a heading
+GO_M_S: Final = 3.0  #: usual horizontal speed towards a position
+SINK_M_S: Final = 1.5  #: usual climb and descent towards a position
 HEADROOM_M: Final = 1.0  #: kept below the ceiling
 _CLIMB_LAG_S: Final = 0.33  #: of the simulated vehicle's climb loop
 _AIRBORNE: Final = (FlightState.HOVERING, FlightState.FLYING)

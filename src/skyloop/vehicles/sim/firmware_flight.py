@@ -58,8 +58,8 @@ _SEVERITIES: Final = {
     FirmwareEventKind.FAILED: Severity.ERROR,
     FirmwareEventKind.DEAF: Severity.INFO,
 }
-_KEPT_REPORTS: Final = 64
-_POSE_STD_M: Final = 0.001
+_KEPT_REPORTS: Final = 64  # for the truth at the time of delayed feedback
+_POSE_STD_M: Final = 0.001  # stated accuracy of the true position
 #: Largest age of the firmware's reported state, as it arrives over loopback. In a simulation slower than real time the
 #: firmware's clock is slow as well; its driver trusts that clock and would report a larger age.
 _OLDEST_NS: Final = nanoseconds(0.05)

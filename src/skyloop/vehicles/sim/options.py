@@ -43,7 +43,7 @@ AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.PX4: "iris",
 }
 #: Firmware that uses the computer's clock never catches up: world time would fall behind, and images would look old.
-REAL_TIME_LAG_S: Final = 0.02
+REAL_TIME_LAG_S: Final = 0.02  #: lag beyond which steps are skipped with such firmware
 TRUTH_HZ: Final = 100.0  #: how often to store the truth that goes with the firmware's state
 
 

@@ -26,7 +26,7 @@ from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
 from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
-TRIES: Final = 3
+TRIES: Final = 3  #: of a request before it fails
 MOTION_NS: Final = nanoseconds(20.0)  #: limit for the answer to a take-off or landing
 
 #: Receives the answer, or None if there was none.
@@ -127,7 +127,7 @@ class Conversation:
 TICK_NS: Final = nanoseconds(0.05)  #: between two ``rc``
 HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc``
 DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states arrive ten times a second
-LOST_NS: Final = nanoseconds(1.5)
+LOST_NS: Final = nanoseconds(1.5)  #: of silence
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state arrives
 ALIVE_NS: Final = nanoseconds(4.0)  #: between requests that prevent the drone's automatic landing after 15 s

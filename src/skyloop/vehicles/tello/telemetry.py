@@ -87,10 +87,10 @@ def _angle(degrees: float | None) -> float | None:
 
 STILL_NS: Final = nanoseconds(1.6)  #: if the count of seconds pauses for this long, the motors are off
 GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or not yet begun
-LOW_M: Final = 0.15
-HIGH_M: Final = 0.25
-HOVER_M: Final = 0.4
-SLOW_DM_S: Final = 1.0
+LOW_M: Final = 0.15  #: at most this height is near the ground
+HIGH_M: Final = 0.25  #: from this height on the drone is off the ground
+HOVER_M: Final = 0.4  #: least height at the end of a take-off
+SLOW_DM_S: Final = 1.0  #: vertical speed at the end of a take-off, at most
 SETTLED: Final = 3  #: consecutive high and slow samples that end a take-off
 RISE_NS: Final = nanoseconds(8.0)  #: longest take-off
 
@@ -176,7 +176,7 @@ class FlightWatch:
 # Health --------------------------------------------------------------------------------------------------------------
 
 HOT_C: Final = 90.0  #: estimate: users report that the drone refuses to start its motors somewhat above
-COOL_C: Final = 85.0
+COOL_C: Final = 85.0  #: the drone counts as hot until it is below this again
 PAD_LOST: Final = 5  #: consecutive states without a pad until it counts as out of view
 
 

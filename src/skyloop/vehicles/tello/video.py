@@ -83,9 +83,9 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
-POLL_S: Final = 0.1
+POLL_S: Final = 0.1  #: longest wait in one read
 SILENT_S: Final = 3.0  #: without a datagram for this long, reopen the port
-BURST: Final = 64
+BURST: Final = 64  #: datagrams per read
 
 
 class VideoStream:

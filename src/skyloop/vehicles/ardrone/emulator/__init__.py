@@ -68,7 +68,7 @@ class Settings:
     torn_start: bool
 
 
-DEMO_HZ: Final = 15.0
+DEMO_HZ: Final = 15.0  #: navdata of the demo mode
 
 
 class RunningFirmware(RunningEmulator):

@@ -10,7 +10,7 @@ from typing import Final
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE
 from skyloop.vehicles.emulation.datagrams import Address, Loop, bound
 
-MOST: Final = 8
+MOST: Final = 8  #: recipients of datagrams
 
 
 class Listeners:
@@ -42,7 +42,7 @@ class Listeners:
         return len(self._sequences)
 
 
-MOST_CLIENTS: Final = 8
+MOST_CLIENTS: Final = 8  #: of a TCP port
 MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client, beyond the system's buffer
 _SYSTEM_BUFFER: Final = 64 * 1024
 _READ: Final = 4096

@@ -23,7 +23,7 @@ from skyloop.vehicles.sim.firmware.ports import Apart
 
 RESTART_S: Final = 1.0  #: from the firmware's end to its next start; doubled after each early end
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0
+SOON_S: Final = 10.0  #: a process that ends within this time ended early
 AT_ONCE: Final = 5  #: consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5

@@ -88,7 +88,7 @@ def _refusal(sdk: Sdk) -> str:
     return "error" if sdk is Sdk.V1_3 else OUT_OF_RANGE
 
 
-USUAL_SPEED_CM_S: Final = 50
+USUAL_SPEED_CM_S: Final = 50  #: until ``speed`` sets another
 FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
 SIZES: Final = {"high": (960, 720), "low": (640, 480)}
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)

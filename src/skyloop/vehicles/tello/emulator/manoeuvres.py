@@ -18,9 +18,9 @@ TAKEOFF_ANSWER_S: Final = 8.7  #: after the command in the same flight, though i
 FLIP_S: Final = 1.5  #: estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: estimate
 PATIENCE_S: Final = 30.0  #: a command that takes longer has failed
-_NEAR_M: Final = 0.06
-_SLOW_M_S: Final = 0.12
-_NEAR_RAD: Final = 0.03
+_NEAR_M: Final = 0.06  # distance at the end of a move
+_SLOW_M_S: Final = 0.12  # speed at the end of a move
+_NEAR_RAD: Final = 0.03  # remaining angle at the end of a turn
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 #: The vehicle's next command, and the answer if the job is over.
