@@ -224,7 +224,7 @@ def test_the_bars_of_a_gate_leave_the_opening_free() -> None:
         assert bar.corners()[:, 2].min() >= -1e-9
 
 
-# What the seed places ------------------------------------------------------------------------------------------------
+# Placement by the seed ------------------------------------------------------------------------------------------------
 
 VARIED = """
 [room]
