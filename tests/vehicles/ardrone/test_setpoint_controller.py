@@ -247,7 +247,7 @@ def test_set_points_are_sent_until_the_next_decision() -> None:
 
 
 @pytest.mark.parametrize("action", [Land(), Takeoff(), EmergencyStop()])
-def test_what_ends_a_set_point(action: AnyAction) -> None:
+def test_actions_that_end_a_set_point(action: AnyAction) -> None:
     cockpit = at(AIR)
     cockpit.take(Attitude(pitch=0.1))
     cockpit.take(action)

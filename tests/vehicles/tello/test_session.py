@@ -304,7 +304,7 @@ def test_an_answer_alone_does_not_end_a_stop() -> None:
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
 
 
-def test_a_stop_in_a_take_off_goes_on_until_the_motors_are_off() -> None:
+def test_a_stop_during_a_take_off_continues_until_the_motors_are_off() -> None:
     """They were not turning at the stop, and turn once the drone received the take-off but not the stop."""
     rig = Rig()
     rig.ready()
@@ -447,7 +447,7 @@ def test_a_silent_drone_is_left_to_its_automatic_landing() -> None:
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.6])
-def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float) -> None:
+def test_a_take_off_lost_before_it_shows_ends_in_an_automatic_landing(after_s: float) -> None:
     """``command``, twice a second, once kept it in the air for as long as it was silent."""
     rig = Rig()
     rig.ready()

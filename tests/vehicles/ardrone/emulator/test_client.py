@@ -223,7 +223,7 @@ def test_the_channel_and_the_codec_are_switched_in_flight(drone: ArdroneFirmware
     assert drone.logic.video.fps == 15
 
 
-def test_the_video_of_an_ar_drone_1_comes_in_datagrams(switch_on: Switch) -> None:
+def test_the_video_of_an_ar_drone_1_arrives_in_datagrams(switch_on: Switch) -> None:
     drone = switch_on(version=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as video:
         video.settimeout(10)
