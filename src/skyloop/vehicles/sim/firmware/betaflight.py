@@ -148,8 +148,8 @@ SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
 #: For the first answer of a start. Healthy ones take 0.8 s; one in ten never answers, by a race between its threads.
 ANSWER_S: Final = 1.5
-LONGEST_ANSWER_S: Final = 6.0  #: doubled after each failed start, up to this limit, for a busy computer
-START_S: Final = 5.0  #: limit from the start of its process to its first motor commands
+LONGEST_ANSWER_S: Final = 6.0  #: as that is doubled with each start in vain, for a computer that is busy
+START_S: Final = 5.0  #: from the start of its process until its first motors, at most
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
 
@@ -238,7 +238,7 @@ class Betaflight(CoupledFirmware):
         """Ask it something on its serial port."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>"):
             pass
-        time.sleep(_PAUSE_S)  # until it accepts the next connection: it takes one at a time
+        time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
