@@ -1,6 +1,6 @@
 """ArduCopter in the simulated world, through its JSON interface and in step with it.
 
-ArduCopter gets the true state and derives the readings of barometer, compass and GPS itself, with the errors of its own
+ArduCopter gets the true state and derives the readings of barometer, compass and GPS itself, with the errors set by its
 ``SIM_`` parameters; gyro, accelerometer, range finder and battery are the simulation's.
 
 The two talk through ArduPilot's JSON interface for simulators: motor outputs as packets, and the vehicle's state as
