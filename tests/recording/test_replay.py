@@ -190,7 +190,7 @@ def test_it_belongs_to_one_application(flight: Path) -> None:
     try:
         with (
             open_drone(dial, app="first", scheduler=way.scheduler, on_exit="hover"),
-            pytest.raises(LinkError, match="in step with one application, and that one is connected"),
+            pytest.raises(LinkError, match="in step with one application, which is already connected"),
         ):
             open_drone(dial, app="second", timeout_s=0.5)
     finally:
