@@ -1,4 +1,4 @@
-"""Find a marker on a wall, fly up to it, and swing round it.
+"""Find a marker on a wall, fly up to it, and swing around it.
 
 python examples/approach.py               # in a simulated room
 python examples/approach.py alpha 12 0.25 # a running proxy; marker 12, 0.25 m wide

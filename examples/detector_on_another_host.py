@@ -1,4 +1,4 @@
-"""A detector that runs anywhere, and a controller that turns towards what it finds.
+"""A detector that runs anywhere, and a controller that turns towards its detections.
 
 skyloop proxy sim:// --name alpha                                             # on the host of the drone
 skyloop process examples/detector_on_another_host.py:Detector --drone alpha   # on another, as often as you like
@@ -20,7 +20,7 @@ class Sighting:
 
 
 class Detector:
-    """Looks for markers in each frame. Imagine something here that needs the GPU of another machine."""
+    """Looks for markers in each frame. Imagine a detector that needs the GPU of another machine."""
 
     def __init__(self) -> None:
         self.markers = MarkerDetector("4x4_50", size_m=0.3)
@@ -32,10 +32,10 @@ class Detector:
 
 
 class Face(skyloop.Controller):
-    """Turns on the spot until a marker is in the middle of the picture."""
+    """Turns on the spot until a marker is in the middle of the image."""
 
     processors = ("detector",)
-    result_max_age_s = 0.5  # older results are left out, and counted
+    result_max_age_s = 0.5  # older results are skipped and counted
 
     def on_result(self, result: skyloop.Result) -> None:
         sightings = result.to(list[Sighting])

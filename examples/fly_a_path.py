@@ -1,4 +1,4 @@
-"""Fly a square, an eight and a helix by position, and tell how far off each was. Extra [sim].
+"""Fly a square, a figure of eight and a helix by position, and print the errors. Extra [sim].
 
 python examples/fly_a_path.py          # in simulated time, with noise, delay, loss and gusts of 1 m/s: a few seconds
 python examples/fly_a_path.py alpha    # a running proxy: skyloop sim --name alpha --world empty

@@ -1,7 +1,7 @@
 """Fly a course of five gates, each found by its colour.
 
 python examples/fly_gates.py             # in a simulated hall
-python examples/fly_gates.py alpha 120   # a running proxy, for two minutes at most
+python examples/fly_gates.py alpha 120   # a running proxy, for at most two minutes
 """
 
 import sys

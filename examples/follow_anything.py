@@ -1,4 +1,4 @@
-"""Follow a person without any marker, by a detector and by looks; then circle the person, and look from the spot.
+"""Follow a person without a marker, by detector and appearance; then circle the person, then only turn to them.
 
 python examples/follow_anything.py                       # a simulated park
 python examples/follow_anything.py alpha my.onnx         # a running proxy, by your own network
@@ -15,7 +15,7 @@ EACH_S = {FollowMode.FOLLOW: 12.0, FollowMode.ORBIT: 12.0, FollowMode.LOOK: 4.0}
 
 
 def main(target: str = "sim://?world=park&cameras=front&fps=15", weights: str | None = None) -> None:
-    detector = simulated_detector() if weights is None else OnnxDetector(weights)  # the first knows drawings only
+    detector = simulated_detector() if weights is None else OnnxDetector(weights)  # for rendered figures only
     with skyloop.connect(target) as drone:
         drone.takeoff()
         pilot = FollowTarget(drone, class_name="person", detector=detector, settings=SETTINGS)

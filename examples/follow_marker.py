@@ -1,4 +1,4 @@
-"""Find a marker that is carried about, follow it 1.5 m in front of its face, and print how well that went.
+"""Find a moving marker, follow it 1.5 m in front of its face, and print how well that worked.
 
 python examples/follow_marker.py             # starts a simulated drone
 python examples/follow_marker.py alpha 60    # a running proxy, for a minute
@@ -12,7 +12,7 @@ from skyloop.control.follow import FollowMarker
 
 
 class Follow(FollowMarker):
-    """The controller of ``skyloop demo``, telling what it does. The README has a simpler one, from scratch."""
+    """The controller of ``skyloop demo`` with printed phases. The README has a simpler one, from scratch."""
 
     def on_frame(self, frame: skyloop.Frame) -> None:
         before = self.mode

@@ -1,7 +1,7 @@
-"""Land on a platform that moves: search its marker with the camera below, follow it, go down with it.
+"""Land on a moving platform: search for its marker with the bottom camera, follow it, descend with it.
 
-python examples/land_on_platform.py            # a simulated platform that goes about at 0.3 m/s
-python examples/land_on_platform.py alpha 90   # a running proxy, for a minute and a half at most
+python examples/land_on_platform.py            # a simulated platform that moves at 0.3 m/s
+python examples/land_on_platform.py alpha 90   # a running proxy, for at most a minute and a half
 """
 
 import sys
@@ -16,9 +16,9 @@ def main(target: str = "sim://?world=platform&cameras=bottom&fps=15", seconds: f
         landing = LandOnMarker(drone, marker_id=30, size_m=0.2)
         with drone.on_event(lambda event: print(event.text)):
             print(landing.run(seconds=float(seconds)))
-        print("it stands" if landing.landed else f"not landed: {landing.phase}")
+        print("landed on the platform" if landing.landed else f"not landed: {landing.phase}")
         truth = drone.feedback().native or {}
-        if "truth.target.x" in truth:  # the simulator tells where both really are
+        if "truth.target.x" in truth:  # the simulator's true positions of both
             x, y, marker_x, marker_y = (
                 float(str(truth[f"truth.{name}"])) for name in ("x", "y", "target.x", "target.y")
             )

@@ -1,6 +1,6 @@
-"""A drone learns to fly to a place: the cross-entropy method on 64 simulated drones at once, a linear policy.
+"""Teach a drone to fly to a place: the cross-entropy method on 64 simulated drones at once, a linear policy.
 
-Run it: python examples/learn_to_reach.py --rounds 12 (extra [gym]). It prints how the mean return grows.
+Run it: python examples/learn_to_reach.py --rounds 12 (extra [gym]). It prints the growing mean return.
 """
 
 import argparse
@@ -9,11 +9,11 @@ import numpy as np
 
 from skyloop.gym import ReachVectorEnv
 
-DRONES, ELITE = 64, 12  # policies tried in each round, and the best of them that the next round begins from
+DRONES, ELITE = 64, 12  # policies tried in each round, and the best ones, from which the next round starts
 
 
 def returns_of(policies: np.ndarray, seconds: float, seed: int) -> np.ndarray:
-    """The sum of rewards of each policy, one drone for each; shape (n,)."""
+    """Return the sum of rewards of each policy, with one drone each; shape (n,)."""
     envs = ReachVectorEnv(len(policies), seconds=seconds)
     seen, _ = envs.reset(seed=seed)
     total, alive = np.zeros(len(policies)), np.ones(len(policies), dtype=bool)
@@ -26,7 +26,7 @@ def returns_of(policies: np.ndarray, seconds: float, seed: int) -> np.ndarray:
 
 
 def learn(rounds: int, seconds: float = 4.0, seed: int = 1) -> list[float]:
-    """Mean returns of all policies, round by round; and the mean policy's own, at the end."""
+    """Return the mean returns of all policies, round by round, and finally the mean policy's."""
     rng = np.random.default_rng(seed)
     mean, spread = np.zeros((4, 10)), np.full((4, 10), 0.5)
     curve = []
@@ -38,7 +38,7 @@ def learn(rounds: int, seconds: float = 4.0, seed: int = 1) -> list[float]:
         curve.append(float(returns.mean()))
         print(f"round {number + 1:2d}: mean return {curve[-1]:6.2f}, best {returns.max():6.2f}")
     final = returns_of(np.repeat(mean[None], DRONES, axis=0), seconds, seed + 1000)
-    print(f"what was learnt: mean return {final.mean():.2f} on {DRONES} new starts and goals")
+    print(f"learned policy: mean return {final.mean():.2f} on {DRONES} new starts and goals")
     return [*curve, float(final.mean())]
 
 

@@ -1,4 +1,4 @@
-"""Fly a circle looking outwards, and map the markers on the walls from there. Extra [control].
+"""Fly a circle facing outwards, and map the markers on the walls. Extra [control].
 
 python examples/orbit_and_map.py                     # in a simulated room
 python examples/orbit_and_map.py alpha 0.25          # a running proxy that knows its position; markers of 0.25 m

@@ -1,7 +1,7 @@
-"""Record a flight, let an old and a changed controller look at the recording, and tell what they do differently.
+"""Record a flight, replay it to an old and a changed controller, and print what they do differently.
 
-python examples/replay_and_compare.py            # into a new folder of the system's temporary ones
-python examples/replay_and_compare.py flights    # into one of yours; needs the extra [record]
+python examples/replay_and_compare.py            # into a new temporary folder
+python examples/replay_and_compare.py flights    # into your own folder; needs the extra [record]
 """
 
 import sys
@@ -15,7 +15,7 @@ from skyloop.vision import MarkerDetector
 
 
 class Face(skyloop.Controller):
-    """Turns towards marker 7 and keeps 1.5 m away; looks around for it while it is not seen."""
+    """Turns towards marker 7 and keeps 1.5 m away; looks around while it is out of view."""
 
     def __init__(self, drone: skyloop.Drone, gain: float) -> None:
         super().__init__(drone)
@@ -40,7 +40,7 @@ def main(into: str = "", seconds: float | str = 10.0) -> None:
         print("flown:", Face(drone, gain=1.5).run(seconds=float(seconds)))
         drone.land()
 
-    # The same pictures, all of them, as fast as each controller takes them: what they ask for is kept, and none flies.
+    # All the same images, as fast as each controller takes them: their commands are recorded, and nothing flies.
     for path, gain in ((old, 1.5), (new, 2.5)):
         with (
             skyloop.connect(f"replay://{flight}?speed=max") as drone,

@@ -1,4 +1,4 @@
-"""Several people, one drone: a pilot, any number who look on, and a colleague who asks for a turn.
+"""Several people, one drone: a pilot, any number of observers, and a colleague who asks for a turn.
 
 skyloop sim --name alpha
 python examples/shared_drone.py alpha pilot      # in one terminal: flies, and hands over when asked
@@ -13,11 +13,11 @@ import skyloop
 
 
 def pilot(name: str, seconds: float = 60.0) -> None:
-    """Turns on the spot, and hands over when asked unless the battery is nearly empty."""
+    """Turn on the spot, and hand over on request unless the battery is nearly empty."""
     with skyloop.connect(name, name="pilot", on_exit="land") as drone:
 
         def may_have_it(_: object) -> bool | str:
-            battery = drone.feedback().battery  # None where the vehicle does not tell
+            battery = drone.feedback().battery  # None if the vehicle does not report it
             return battery is None or battery > 0.2 or "landing, the battery is nearly empty"
 
         drone.on_takeover(may_have_it)
@@ -33,7 +33,7 @@ def pilot(name: str, seconds: float = 60.0) -> None:
 
 
 def look(name: str, seconds: float = 60.0) -> None:
-    """Prints each change of pilot."""
+    """Print each change of pilot."""
     with skyloop.connect(name, access="observe") as drone:
         owner, end = "", time.monotonic() + seconds
         while time.monotonic() < end:
@@ -43,7 +43,7 @@ def look(name: str, seconds: float = 60.0) -> None:
 
 
 def turn(name: str, seconds: float = 5.0) -> None:
-    """Asks politely, waits for the answer, climbs a little, and gives it back."""
+    """Ask politely, wait for the answer, climb a little, and give the drone back."""
     asking = skyloop.Authority(priority=8, takeover="ask", wait_s=30)
     with skyloop.connect(name, name="colleague", authority=asking, on_exit="hover") as drone:
         print("my turn", flush=True)

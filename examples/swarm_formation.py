@@ -1,4 +1,4 @@
-"""One program, several drones: they take off together, fly in a V, in a circle, and behind one of them.
+"""One program, several drones: they take off together, fly in a V, in a circle, and behind a leader.
 
 skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/swarm_formation.py "drone*"

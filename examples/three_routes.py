@@ -1,4 +1,4 @@
-"""Three drones with a route each: checked first, then flown at the same time, and landed.
+"""Three drones with a route each: check the routes, fly them at the same time, and land.
 
 skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/three_routes.py "drone*"
@@ -12,14 +12,14 @@ from skyloop.control import FlyRoute, Route, RouteWaypoint, Wait
 
 
 def tour(height: float, x: float, y: float) -> Route:
-    """A square of 0.8 m above one place, at the drone's own height, so that no two drones meet. World axes [m]."""
+    """Return a square of 0.8 m at the drone's own height, so that no two drones meet. World axes [m]."""
     corners = [(x, y), (x + 0.8, y), (x + 0.8, y + 0.8), (x, y + 0.8)]
     places = [RouteWaypoint(a, b, height, look_at=(x + 0.4, y + 0.4), actions=(Wait(0.3),)) for a, b in corners]
     return Route(waypoints=tuple(places), name=f"square at {height:g} m", speed=0.6, end="return")
 
 
 def fly(flight: FlyRoute) -> None:
-    """To the end of the route, or until it pauses because something is wrong."""
+    """Fly to the end of the route, or until it pauses because of a problem."""
     flight.run(seconds=120.0, until=lambda: bool(flight.law.problem))
 
 
@@ -29,8 +29,8 @@ def main(*targets: str) -> None:
         flights = []
         for number, drone in enumerate(drones):
             x, y, _ = drone.feedback().position_m or (0.0, 0.0, 0.0)
-            told = lambda step, name=drone.name: print(f"{name}: {step.text}", flush=True)  # noqa: E731
-            flights.append(FlyRoute(drone, tour(0.8 + 0.5 * number, x, y), on_progress=told))
+            report = lambda step, name=drone.name: print(f"{name}: {step.text}", flush=True)  # noqa: E731
+            flights.append(FlyRoute(drone, tour(0.8 + 0.5 * number, x, y), on_progress=report))
         for flight in flights:
             for finding in (found := flight.check()).findings:
                 print(flight.drone.name, finding.severity, finding.waypoint, finding.reason)

@@ -1,17 +1,17 @@
-"""See and avoid: fly ahead, and past orange pillars, by fuzzy rules over where the nearest is and how wide it looks.
+"""See and avoid: fly ahead and past orange pillars, by fuzzy rules on the nearest one's bearing and apparent width.
 
 python examples/behaviours/see_and_avoid.py             # in a simulated hall
 python examples/behaviours/see_and_avoid.py alpha 6     # a running proxy, 6 m ahead
 
-A behaviour of one's own, with its law and the technique that the law is made of.
+A custom behaviour, with its law and the technique behind it.
 
-An obstacle is detected by its colour, and kept out of the middle of the image by a fuzzy controller, as in
-Olivares-Mendez, Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by
-cross-entropy", FUZZ-IEEE 2012. Here the rules take its bearing and apparent width, and give the sideways speed.
+A fuzzy controller keeps an obstacle, detected by its colour, out of the middle of the image, as in Olivares-Mendez,
+Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by cross-entropy",
+FUZZ-IEEE 2012. Here the rules map its bearing and apparent width to the sideways speed.
 
-The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is the mean of these, weighted by how
-true the rules are; the truth of a rule is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of
-systems and its applications to modeling and control", IEEE Trans. SMC 15(1), 1985).
+The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is their mean, weighted by the rules'
+truth; a rule's truth is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of systems and its
+applications to modeling and control", IEEE Trans. SMC 15(1), 1985).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _NEAR: Colour = (255, 120, 60)
 class Trapezoid:
     """Membership function: 0 up to ``a``, rising to 1 at ``b``, 1 up to ``c``, falling to 0 at ``d``.
 
-    Infinite ``a`` and ``b``, or ``c`` and ``d``, leave that side at 1.
+    Infinite ``a`` and ``b``, or ``c`` and ``d``, keep that side at 1.
 
     Raises:
         UsageError: The corners do not satisfy ``a`` ≤ ``b`` ≤ ``c`` ≤ ``d``.
@@ -75,17 +75,17 @@ class Trapezoid:
 def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
     """Return triangular terms of one variable, each 1 at its peak and 0 at the next ones.
 
-    All together add up to 1 everywhere; the outermost ones stay at 1 beyond their peaks.
+    The terms add up to 1 everywhere; the outermost ones stay at 1 beyond their peaks.
 
     Args:
-        peaks: Where each term is 1, by its name; at least two, in rising order.
+        peaks: Value at which each term is 1, by name; at least two, in rising order.
 
     Raises:
         UsageError: There are fewer than two peaks, or they do not rise.
     """
     names, at = list(peaks), list(peaks.values())
     if len(at) < 2 or any(not low < high for low, high in itertools.pairwise(at)):
-        raise UsageError(f"two peaks or more, each above the one before, not {dict(peaks)}")
+        raise UsageError(f"peaks need two or more values in rising order, got {dict(peaks)}")
     lows, highs = [-math.inf, *at[:-1]], [*at[1:], math.inf]
     return {
         name: Trapezoid(low, -math.inf if low == -math.inf else peak, math.inf if high == math.inf else peak, high)
@@ -97,7 +97,7 @@ def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
 class Rule:
     """If every variable is as in ``when``, the output is ``then``."""
 
-    when: Mapping[str, str]  #: term by variable; a variable that is not named may have any value
+    when: Mapping[str, str]  #: term by variable; a variable not named can have any value
     then: float
 
 
@@ -133,7 +133,7 @@ class FuzzyController:
             **values: One for each variable.
 
         Returns:
-            The weighted mean of the rules' conclusions; 0 where no rule applies.
+            The weighted mean of the rules' conclusions; 0 if no rule applies.
 
         Raises:
             UsageError: A variable has no value, or it is NaN.
@@ -152,8 +152,8 @@ class FuzzyController:
 def avoidance() -> FuzzyController:
     """Return the rules for the sideways speed.
 
-    Their inputs are ``bearing`` [rad, left positive] and apparent ``width`` [rad] of an obstacle; the output is from 1
-    (to the left) to -1 (to the right).
+    Their inputs are ``bearing`` [rad, left positive] and apparent ``width`` [rad] of an obstacle; the output ranges
+    from 1 (to the left) to -1 (to the right).
     """
     variables = {
         "bearing": triangles({"right": -0.5, "ahead right": -0.2, "ahead": 0.0, "ahead left": 0.2, "left": 0.5}),
@@ -170,10 +170,10 @@ def avoidance() -> FuzzyController:
 
 
 class AvoidPhase(StrEnum):
-    """What :class:`AvoidLaw` is doing."""
+    """The phases of :class:`AvoidLaw`."""
 
-    CLEAR = "nothing in the way"
-    AVOIDING = "going past something"
+    CLEAR = "the way is clear"
+    AVOIDING = "passing an obstacle"
     ARRIVED = "arrived"
 
 
@@ -182,11 +182,11 @@ class AvoidSettings:
     """Speeds and distances of :class:`AvoidLaw`."""
 
     speed_m_s: float = 0.6  #: ahead
-    aside_m_s: float = 0.7  #: at most
+    aside_m_s: float = 0.7  #: greatest sideways speed
     close_rad: float = 0.9  #: apparent width of an obstacle at which the speed ahead is 0
-    back_share: float = 0.25  #: share of the speed at which it backs off where there is no way on
-    avoiding_rad: float = 0.15  #: apparent width above which an obstacle is avoided
-    passing_s: float = 2.5  #: for so long after an obstacle left the image at one side, that side is blocked
+    back_share: float = 0.25  #: share of the speed for backing off when blocked
+    avoiding_rad: float = 0.15  #: avoid obstacles with a larger apparent width
+    passing_s: float = 2.5  #: a side stays blocked for this long after an obstacle left the image there
     yaw_gain: float = 1.5  #: [1/s]
     acceleration_m_s2: float = 2.0
 
@@ -203,25 +203,25 @@ class AvoidLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            distance_m: How far to fly ahead.
+            distance_m: Distance to fly ahead.
             settings: None are the defaults.
         """
         self.settings = s = settings or AvoidSettings()
         super().__init__(SetpointLimits(acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = AvoidPhase.CLEAR
-        self.ahead_m = 0.0  #: how far it has come
+        self.ahead_m = 0.0  #: distance flown
         self._distance_m = distance_m
         self._rules = avoidance()
         self._begin: Array | None = None
         self._yaw = 0.0
         self._seen: list[BlobSighting] = []
-        self._beside: dict[float, int] = {}  # side (1 left, -1 right): when something was last seen there
+        self._beside: dict[float, int] = {}  # side (1 left, -1 right): last sighting there
 
     def see(self, seen: list[BlobSighting], captured_ns: int) -> None:
-        """Update with the obstacles that are in a frame.
+        """Update with the obstacles in a frame.
 
         Args:
-            seen: The widest first; empty if there are none. One with an edge that is no number counts as close.
+            seen: Obstacles, the widest first; empty if there are none. One with a NaN edge counts as close.
             captured_ns: Capture of the frame.
         """
         self._seen = [self._placed(one) for one in seen]
@@ -249,7 +249,7 @@ class AvoidLaw(VelocityLaw):
         return np.array([*wanted, -0.8 * way[2], turn])
 
     def _placed(self, one: BlobSighting) -> BlobSighting:
-        """Return what is seen as it is, or, where the lens can't tell all of it, as wide as what is close."""
+        """Return a sighting, widened to a close obstacle if the lens model can't place all of it."""
         edges = [edge for edge in (one.left_rad, one.right_rad) if math.isfinite(edge)]
         if len(edges) == 2:
             return one
@@ -257,7 +257,7 @@ class AvoidLaw(VelocityLaw):
         return replace(one, left_rad=at + half, right_rad=at - half)
 
     def _share(self) -> float:
-        """Return the share of the speed ahead: the wider an obstacle ahead looks, the less."""
+        """Return the share of the speed ahead, which falls with the width of an obstacle ahead."""
         in_the_way = (one.width_rad for one in self._seen if abs(one.bearing_rad) < one.width_rad / 2 + 0.2)
         return max(0.0, 1.0 - max(in_the_way, default=0.0) / self.settings.close_rad)
 
@@ -272,7 +272,7 @@ class AvoidLaw(VelocityLaw):
 
 
 class SeeAndAvoid(Behaviour):
-    """Flies ahead for a distance at one height and yaw, past whatever has the colour; then hovers."""
+    """Flies ahead for a distance at one height and yaw, past obstacles of a colour; then hovers."""
 
     name = "see and avoid"
 
@@ -289,10 +289,10 @@ class SeeAndAvoid(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            distance_m: How far to fly ahead.
+            distance_m: Distance to fly ahead.
             colour: Red, green, blue of the obstacles, 0 to 255.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the colour has no hue.
@@ -307,7 +307,7 @@ class SeeAndAvoid(Behaviour):
 
     @property
     def phase(self) -> AvoidPhase:
-        """What the behaviour is doing."""
+        """The current phase."""
         return self._avoid_law.phase
 
     @property

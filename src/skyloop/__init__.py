@@ -8,8 +8,8 @@
         drone.takeoff()
         drone.velocity(forward=0.3)
 
-The names are those of the stub beside this file, ``__init__.pyi``, which type checkers also read. Each is imported on
-first use, so that ``import skyloop`` stays light. More is in the packages: ``skyloop.messages``, ``skyloop.errors``,
+The names come from the stub beside this file, ``__init__.pyi``, which type checkers read too. Each name is imported on
+first use, so ``import skyloop`` loads nothing heavy. The packages hold more: ``skyloop.messages``, ``skyloop.errors``,
 ``skyloop.control``, ``skyloop.vision``, ….
 """
 
@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Any
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-# Switch off the telemetry of dependencies that report on their users, before any of them is imported (docs/security.md
-# has the list). Set the variable to opt in.
+# Turn off the telemetry of dependencies before any of them is imported (docs/security.md has the list). To allow it,
+# set the variable.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
 #: The module that each name is imported from.
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
-#: Packages to suggest for names that are not offered here, the lightest first.
+#: Packages to search for names not offered here, the lightest first.
 _ELSEWHERE = ("errors", "messages", "client", "control", "recording", "motion_capture")
 
 __all__ = sorted(["__version__", *_HOMES])  # noqa: PLE0605  (made of the stub)
@@ -53,7 +53,7 @@ def __dir__() -> list[str]:
 
 
 def _hint(name: str) -> str:
-    """Return where the class of this name is, for an error; empty if there is none."""
+    """Return where a class of this name is, for an error; empty if there is none."""
     if not name[:1].isupper():
         return ""
     for package in _ELSEWHERE:

@@ -1,6 +1,6 @@
-"""Measures the user's machine: delays beside the bare hand-over of the same bytes, and the simulator's speed.
+"""Measure the user's machine: delays beside the bare hand-over of the same bytes, and the simulator's speed.
 
-``skyloop bench`` prints the results. The makers' measurements are in the repository's ``benchmarks/``.
+``skyloop bench`` prints the results. The developers' measurements are in the repository's ``benchmarks/``.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 Setpoint = tuple[float, float, float]  #: forward and left [m/s], yaw rate [rad/s]
-#: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].
+#: Called for each received sample with its channel and sending time [ns, monotonic].
 Received = Callable[[str, int], None]
-#: Called with the share that is done, 0 to 1, and the next measurement.
+#: Called with the share done so far, 0 to 1, and the next measurement.
 Progress = Callable[[float, str], None]
 
 COMMAND: Final = "command"
@@ -69,7 +69,7 @@ FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
 #: The channels, and the periods [s] of the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
-LARGEST: Final = (1920, 1080)
+LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
 
 _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
@@ -78,15 +78,15 @@ _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
 
 class Machine(msgspec.Struct, frozen=True):
-    """The machine that figures were taken on, without anything that names it or its user."""
+    """The machine behind the figures, without anything that identifies it or its user."""
 
     cpu: str
-    cores: int  #: that this process may use
+    cores: int  #: cores available to this process
     system: str
     kernel: str
     python: str
     packages: dict[str, str] = {}  #: versions
-    load: float | None = None  #: average number of processes that wanted a core in the minute before
+    load: float | None = None  #: load average of the minute before
 
     @classmethod
     def here(cls) -> Machine:
@@ -107,19 +107,19 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 def cpu_model(cpuinfo: str) -> str:
-    """Return the model's name in ``/proc/cpuinfo``; empty if there is none."""
+    """Return the model name in ``/proc/cpuinfo``; empty if there is none."""
     found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo, re.MULTILINE)
     return " ".join(found[1].split()) if found else ""
 
 
 def os_name(os_release: str) -> str:
-    """Return the name for people in ``/etc/os-release``; empty if there is none."""
+    """Return the display name in ``/etc/os-release``; empty if there is none."""
     found = re.search(r'^PRETTY_NAME="?([^"\n]+)"?$', os_release, re.MULTILINE)
     return found[1] if found else ""
 
 
 def numbers_of(release: str) -> str:
-    """Return a kernel's release without what its builder added, which may name a machine."""
+    """Return a kernel's release without its builder's suffix, which may name a machine."""
     found = re.match(r"\d+(\.\d+)*", release)
     return found[0] if found else ""
 
@@ -147,10 +147,10 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 def spread(times_ns: Sequence[float]) -> Spread:
-    """Return the median and the 99th percentile of some times.
+    """Compute the median and the 99th percentile of times.
 
     Raises:
-        ValueError: There are none: something did not flow.
+        ValueError: There are no times: no sample arrived.
     """
     if not times_ns:
         raise ValueError("not one sample arrived")
@@ -163,30 +163,30 @@ def spread(times_ns: Sequence[float]) -> Spread:
 CAMERA: Final = "bench"
 USUAL_CAMERA: Final = CameraInfo(CAMERA, 320, 240, 15.0)
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
-_UNIT_M_S: Final = 2.0**-46
+_UNIT_M_S: Final = 2.0**-46  # per nanosecond: 2**40 ns stay below 2 cm/s
 
 
 def stamped(sent_ns: int) -> float:
-    """Encode a time as a climb rate of less than 2 cm/s, which a command carries to the last bit within all limits."""
+    """Encode a time as a climb rate below 2 cm/s, which a command carries exactly within all limits."""
     return (sent_ns % _WRAPS_NS) * _UNIT_M_S
 
 
 def stamp_of(up: float, now_ns: int) -> int:
-    """Return the time within the last 18 minutes that :func:`stamped` made this of [ns].
+    """Decode the time within the last 18 minutes encoded by :func:`stamped` [ns].
 
     Args:
         up: The climb rate [m/s].
-        now_ns: The present time, on the same clock.
+        now_ns: The current time, on the same clock.
     """
     return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
-    """A vehicle that hovers for ever, and gives feedback and frames on request: nothing but Skyloop is measured.
+    """A vehicle that hovers forever and produces feedback and frames on request, to measure only Skyloop.
 
     Args:
-        received: Called with each new set-point, on the thread that applies it.
-        camera: Its camera.
+        received: Called on the applying thread with each new set-point.
+        camera: The vehicle's camera.
     """
 
     shared = False
@@ -209,30 +209,30 @@ class BenchVehicle(Driver):
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
-        if type(action) is Velocity and action.up != self._last_up:  # each call has another one: equal ones are repeats
+        if type(action) is Velocity and action.up != self._last_up:  # differs per call: equal ones are repeats
             self._last_up = action.up
             self._received(COMMAND, stamp_of(action.up, now_ns))
         return action
 
     def show(self, captured_ns: int, image: Image) -> None:
-        """Give a frame."""
+        """Publish a frame."""
         if (sink := self._sink) is not None:
             height, width, _ = image.shape
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
 
     def publish_feedback(self, captured_ns: int) -> None:
-        """Give feedback with as many values as a real vehicle's."""
+        """Publish feedback with as many values as a real vehicle's."""
         if (sink := self._sink) is not None:
             sink.feedback(typical_feedback(captured_ns, FlightState.HOVERING))
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the proxy that is measured."""
+    """Return the name of the measured proxy."""
     return Path(folder).name.lower()
 
 
 class Vehicle:
-    """The end with the proxy, which is named after the folder of this run."""
+    """The proxy's end, named after the folder of this run."""
 
     camera = USUAL_CAMERA
 
@@ -256,7 +256,7 @@ class Vehicle:
         self._vehicle.show(sent_ns, image)
 
     def close(self) -> None:
-        """End the proxy."""
+        """Close the proxy."""
         self._proxy.end()
 
 
@@ -268,7 +268,7 @@ class Listening:
         self._known_ns = 0
 
     def feedback(self, feedback: Feedback) -> None:
-        """Report feedback that is new."""
+        """Report new feedback."""
         if feedback.captured_ns > self._known_ns:  # the proxy repeats the last state when the authority changes
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
@@ -278,15 +278,15 @@ class Listening:
         self._received(VIDEO, frame.captured_ns)
 
     def picture(self, picture: EncodedFrame) -> None:
-        """Report an encoded picture."""
+        """Report an encoded image."""
         self._received(VIDEO, picture.captured_ns)
 
 
 class Application:
-    """The end with the user's drone; see :class:`Vehicle`, which is there first."""
+    """The end with the user's drone; start :class:`Vehicle` first."""
 
-    looks = True  #: whether it receives the video
-    video = VideoOptions()  #: the form of the video
+    looks = True  #: whether to receive the video
+    video = VideoOptions()  #: format of the video
 
     def __init__(self, folder: str, received: Received) -> None:
         self._drone = self._connect(folder)
@@ -311,16 +311,16 @@ class Application:
 # The bare hand-over -------------------------------------------------------------------------------------------------
 
 _STAMP: Final = struct.Struct("<qqq")  # time of sending, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same, zeros for the size, and three numbers: 100 bytes, as Skyloop's
+_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with zero size, and three numbers: 100 bytes, like Skyloop's
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
 class BareVehicle:
-    """The hand-over without Skyloop: the least that any library in Python must do to bring the same bytes over.
+    """The hand-over without Skyloop: the minimum that any Python library must do to transfer the same bytes.
 
-    One ``SOCK_SEQPACKET`` socket, with a thread at each end that waits. A packet is 100 bytes that carry the time of
-    sending. A frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver
-    makes an array over the memory. Arguments and methods are those of :class:`Vehicle`.
+    One ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet is 100 bytes with the sending time. A
+    frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver makes an
+    array over the memory. Arguments and methods are those of :class:`Vehicle`.
     """
 
     def __init__(self, folder: str, received: Received) -> None:
@@ -328,7 +328,7 @@ class BareVehicle:
         self._descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
-        self._memory[:] = 1  # the pages are there before the first frame, as Skyloop's slots are after their first use
+        self._memory[:] = 1  # map the pages before the first frame, like Skyloop's slots after their first use
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
@@ -346,7 +346,7 @@ class BareVehicle:
         self._socket.send(_STAMP.pack(sent_ns, width, height))
 
     def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread if nobody has connected
+        self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread if there is no connection yet
         self._thread.join()
         self._listener.close()
         self._path.unlink()
@@ -356,7 +356,7 @@ class BareVehicle:
         try:
             self._socket, _ = self._listener.accept()
         except OSError:
-            return  # closed before anybody connected
+            return  # closed before a connection
         with self._socket as sock:
             socket.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
@@ -403,20 +403,20 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
     BARE: (BareVehicle, BareApplication),
     SKYLOOP: (Vehicle, Application),
 }
-_TURN_S: Final = 5.0
+_TURN_S: Final = 5.0  # duration of a turn of one kind of hand-over
 _WARM_UP_S: Final = 0.4  # at the start of a turn, not counted: threads, slots and discovery of a new connection
 _SETTLE_S: Final = 0.3  # for the last samples of a turn to arrive
-_AHEAD_NS: Final = 50_000_000
-_ANSWERS_WITHIN_S: Final = 30.0
-_GOLDEN: Final = 0.618034  # multiples of it, less whole numbers, are spread evenly however many there are
+_AHEAD_NS: Final = 50_000_000  # lead of the start time, so that both processes can start together
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process, beyond the turn
+_GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
-#: By channel: when each sample was sent, and when it was received [ns].
+#: By channel: sending and receiving time of each sample [ns].
 _Arrivals = dict[str, list[tuple[int, int]]]
 
 
 class _Turn(msgspec.Struct, frozen=True):
-    """All three channels at once; ``number`` shifts them against each other, so that they meet in every way."""
+    """A turn with all three channels at once; ``number`` varies their relative phases."""
 
     number: int
     seconds: float
@@ -426,7 +426,7 @@ class _Turn(msgspec.Struct, frozen=True):
         return max(1, int(self.seconds / PERIODS_S[channel]))
 
     def paced(self, channel: str, begin_ns: int) -> Iterator[int]:
-        """Yield the number of each sample when it is due, from the warm-up on; a late one does not shift the others."""
+        """Yield each sample's number when due, starting with the warm-up; a late one does not delay the others."""
         period_ns = PERIODS_S[channel] * 1e9
         phase = list(PERIODS_S).index(channel) * (1 + self.number) * _GOLDEN % 1.0
         for index in range(-int(_WARM_UP_S / PERIODS_S[channel]), self.count(channel)):
@@ -435,17 +435,17 @@ class _Turn(msgspec.Struct, frozen=True):
 
 
 class DelayRow(msgspec.Struct, frozen=True):
-    """One channel, while frames of one size flow."""
+    """The results of one channel with frames of one size."""
 
-    size: str  #: of the frames, ``320×240``
+    size: str  #: size of the frames, ``320×240``
     channel: str
     skyloop: Spread
     bare: Spread
-    lost: int  #: samples that Skyloop's receiver never had
+    lost: int  #: samples that Skyloop's receiver never got
 
 
 class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
-    """A whole run. ``seconds``: how long each was measured with each size."""
+    """The results of a run. ``seconds``: duration of each measurement at each size."""
 
     machine: Machine
     seconds: float
@@ -455,12 +455,12 @@ class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
 def measure_delays(
     seconds: float, sizes: Sequence[tuple[int, int]], progress: Progress = lambda _share, _what: None
 ) -> DelayResults:
-    """Measure Skyloop and the bare hand-over in turns, each between two processes.
+    """Measure Skyloop and the bare hand-over alternately, each between two processes.
 
     Args:
-        seconds: How long each is measured with each size of frames [s].
+        seconds: Duration of each measurement at each frame size [s].
         sizes: Width and height of the frames, at most :data:`LARGEST`.
-        progress: Called with the share that is done, 0 to 1, and the next measurement's name.
+        progress: Called with the share done so far, 0 to 1, and the next measurement's name.
 
     Raises:
         LinkError: The processes do not find each other, or nothing arrives.
@@ -493,7 +493,7 @@ def named(size: tuple[int, int]) -> str:
 
 
 class _Pair:
-    """The two processes of one way to bring samples over."""
+    """The two processes of one kind of hand-over."""
 
     def __init__(self, kind: str, folder: str) -> None:
         self._kind = kind
@@ -508,8 +508,8 @@ class _Pair:
             self._pipes.append(ours)
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
-        """Return the delays of the samples that arrived in a turn [ns], by channel."""
-        for pipe in self._pipes:  # the vehicle is there before the application
+        """Return the delays of the samples received in a turn [ns], by channel."""
+        for pipe in self._pipes:  # the vehicle starts before the application
             pipe.send(turn)
             self._answer(pipe)
         begin_ns = time.monotonic_ns() + round(_WARM_UP_S * 1e9) + _AHEAD_NS
@@ -528,20 +528,20 @@ class _Pair:
         try:
             return pipe.recv()
         except (EOFError, ConnectionResetError):
-            raise LinkError(f"a measuring process of {self._kind} ended; its error stands above") from None
+            raise LinkError(f"a measuring process of {self._kind} ended; its error is above") from None
 
     def __enter__(self) -> _Pair:
         return self
 
     def __exit__(self, *_: object) -> None:
         for pipe in self._pipes:
-            pipe.close()  # which ends the process
+            pipe.close()  # ends the process
         for process in self._processes:
             process.close()
 
 
 def _run_end(number: int, kind: str, side: str, folder: str) -> None:
-    """Run one end of a hand-over, turn after turn: the work of a process, until its pipe is closed."""
+    """Run one end of a hand-over, turn by turn, until its pipe closes: the main function of a process."""
     make, work = _ENDS[kind][side == "application"], _WORK[side]
     with Connection(number) as pipe, suppress(KeyboardInterrupt, EOFError, BrokenPipeError):
         while True:
@@ -579,7 +579,7 @@ def _produce(end: Vehicle, turn: _Turn, begin_ns: int) -> None:
 
 
 def _steer(end: Application, turn: _Turn, begin_ns: int) -> None:
-    """Send set-points of which no two are alike."""
+    """Send set-points, no two alike."""
     for index in turn.paced(COMMAND, begin_ns):
         speed, angle = 0.5 + 0.4 * math.sin(0.05 * index), 0.03 * index
         end.command(time.monotonic_ns(), (speed * math.cos(angle), speed * math.sin(angle), 0.3))
@@ -593,7 +593,7 @@ _WORK: Final[dict[str, Callable[[Any, _Turn, int], None]]] = {"vehicle": _produc
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Drones in a world: their model, and whether firmware flies them, which gets all instruments' readings."""
+    """Drones in a world: their model, and whether firmware flies them with readings of all instruments."""
 
     world: str
     drones: int
@@ -601,8 +601,8 @@ class Fleet:
     firmware: bool = False
 
 
-#: Free flight in an open hall, and a hundred crowded among gates, some of which they touch; then drones that are
-#: modelled down to their rotors in steps of a millisecond, one of them with all its instruments.
+#: Free flight in an open hall, and a hundred drones crowded among gates, some touching them; then drones modelled down
+#: to their rotors in steps of a millisecond, one of them with all instruments.
 FLEETS: Final = (
     Fleet("empty", 1),
     Fleet("empty", 10),
@@ -612,34 +612,34 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: pictures as wide as the cameras' own, and twice as wide
+SIZES: Final = (1.0, 2.0)  #: image widths: the cameras' own, and twice that
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: furnished, with markers and a moving board
-FRAMES_PER_S: Final = 30.0  #: of each camera, by which the drones fly on between pictures
+FRAMES_PER_S: Final = 30.0  #: per camera; the drones fly for one period between images
 #: A multiple of all periods in steps, so that every batch does the same work.
 BATCH_STEPS: Final = 100
-LEAST_ROUNDS: Final = 3  #: however short the time
-_TAKE_OFF_S: Final = 5.0
-#: Circles of half a metre, so fast that the pictures of the front camera are smeared by the turning.
+LEAST_ROUNDS: Final = 3  #: even if the time is short
+_TAKE_OFF_S: Final = 5.0  # simulated time before measuring
+#: Circles of half a metre, fast enough that the front camera's images are blurred by the rotation.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
-    """Drones that fly circles, or that firmware flies straight up and down, with nothing drawn.
+    """Drones that fly circles, or that firmware flies straight up and down, without rendering.
 
-    ``step`` is the time of a step, taken from batches of :data:`BATCH_STEPS`.
+    ``step`` is the time per step, from batches of :data:`BATCH_STEPS`.
     """
 
     world: str
     drones: int
     step: Spread
-    real_time: float  #: simulated seconds a second
+    real_time: float  #: simulated seconds per second
     model: str = "quadrotor"
     firmware: bool = False
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Pictures with the flaws of the sensor. ``round``: the time that ``pictures`` of them take."""
+    """Rendering with the sensor's flaws. ``round``: the time for ``pictures`` images."""
 
     cameras: str
     width: int
@@ -650,7 +650,7 @@ class DrawingRow(msgspec.Struct, frozen=True):
 
 
 class SimResults(msgspec.Struct, frozen=True):
-    """A whole run."""
+    """The results of a run."""
 
     machine: Machine
     physics: list[PhysicsRow]
@@ -658,13 +658,13 @@ class SimResults(msgspec.Struct, frozen=True):
 
 
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
-    """Measure physics and drawing in the calling thread, to which OpenCV is kept meanwhile.
+    """Measure physics and rendering on the calling thread, with OpenCV limited to that thread.
 
-    Where Numba is installed, pictures are drawn by compiled code from the first on.
+    If Numba is installed, compiled code renders all images, from the first on.
 
     Args:
-        seconds: About how long, beside the time for making the scenes [s].
-        progress: Called with the share that is done, 0 to 1, and the present measurement's name.
+        seconds: Approximate duration, without the time to build the scenes [s].
+        progress: Called with the share done so far, 0 to 1, and the current measurement's name.
     """
     from skyloop.sim.render.compiled import COMPILER
 
@@ -701,7 +701,7 @@ def _measure_physics(fleet: Fleet, seconds: float, progress: Callable[[float], N
 
 
 def _measure_pair(factor: float, seconds: float, progress: Callable[[float], None]) -> list[DrawingRow]:
-    """Draw for the two cameras of one drone in turn, with images ``factor`` times as wide as the cameras' own."""
+    """Render the two cameras of one drone in turn, ``factor`` times as wide as the cameras' own images."""
     from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
@@ -716,7 +716,7 @@ def _measure_pair(factor: float, seconds: float, progress: Callable[[float], Non
 
 
 def _measure_many(seconds: float, progress: Callable[[float], None]) -> DrawingRow:
-    """Draw for the front cameras of drones that see one another."""
+    """Render the front cameras of drones that see one another."""
     from skyloop.sim.camera import FRONT_CAMERA
 
     flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
@@ -741,12 +741,12 @@ class Flight:
         self._cameras = [(drone, model, SensorEffects(model, n)) for n, (drone, model) in enumerate(cameras)]
         self._steps = max(1, math.floor(1.0 / (FRAMES_PER_S * STEP_S * len(cameras))))
         self._number = 0
-        self.picture: Image = np.empty(0, np.uint8)  #: drawn last, BGR, shape (height, width, 3)
+        self.picture: Image = np.empty(0, np.uint8)  #: the last image, BGR, shape (height, width, 3)
         for at in range(len(cameras)):
-            self.draw(at)  # the first picture of a lens makes its tables
+            self.draw(at)  # a lens's first image computes its tables
 
     def draw(self, at: int) -> int:
-        """Fly on, then draw what a camera sees with the flaws of its sensor; return the time of the drawing [ns]."""
+        """Advance the flight, then render a camera's view with its sensor's flaws; return the rendering time [ns]."""
         from skyloop.sim.render import SceneState
 
         simulation, (drone, model, effects) = self._simulation, self._cameras[at]
@@ -763,10 +763,10 @@ class Flight:
 
 
 class _Hops:
-    """Firmware that lets a drone jump: it reads all, and computes nothing."""
+    """Firmware that makes a drone hop: it reads everything and computes nothing."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return full thrust near the ground, and none above."""
+        """Return full thrust near the ground and none above."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 
@@ -782,7 +782,7 @@ def _flown_by_firmware(fleet: Fleet) -> Simulation:
 
 
 def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
-    """Return a world whose drones have taken off and fly circles."""
+    """Create a world whose drones have taken off and fly circles."""
     from skyloop.sim import STEP_S, Simulation, load_world
     from skyloop.sim.vehicles import VEHICLES
 
@@ -795,7 +795,7 @@ def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
 
 
 def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
-    """Yield until the time is up, and at least :data:`LEAST_ROUNDS` times."""
+    """Yield until the time is up, but at least :data:`LEAST_ROUNDS` times."""
     begin, limit = time.monotonic_ns(), round(seconds * 1e9)
     done = 0
     while done < LEAST_ROUNDS or time.monotonic_ns() - begin < limit:
@@ -806,7 +806,7 @@ def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """Keep OpenCV to the calling thread; afterwards it may use as many threads as before."""
+    """Limit OpenCV to the calling thread; restore its number of threads afterwards."""
     from skyloop.sim.render import use_one_core
     from skyloop.sim.render.base import cv2
 

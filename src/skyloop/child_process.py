@@ -1,10 +1,10 @@
-"""Child processes that end with their parent, and what a fork of this process leaves to it.
+"""Child processes that end with their parent, and safety of this process's objects after a fork.
 
-A child's standard input is a pipe into which nothing is written. When the parent closes its end or is gone, however it
-ended, the child reads the end of file (:func:`on_parent_end`) and ends too.
+A child's standard input is a pipe into which nothing is written. When the parent closes its end or dies, however it
+ends, the child reads the end of file (:func:`on_parent_end`) and exits, too.
 
-A child made by ``os.fork`` is another matter: it has copies of its parent's objects, but none of its threads, and their
-ends would end what the parent still uses (:func:`leave_to_parent`).
+A child made by ``os.fork`` is different: it has copies of its parent's objects but none of its threads, and destroying
+the copies would destroy resources that the parent still uses (:func:`leave_to_parent`).
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, Final, Protocol
 
-GRACE_S: Final = 4.0  #: for a child to end by itself, and again to end when it is terminated
-_TAIL: Final = 2000  # bytes of a child's standard error that an error shows
-_LOOK_S: Final = 0.25  # how often a child that may fall silent is looked at
-#: How long what a dead child has written is read. A grandchild that holds the pipe keeps it open for longer.
+GRACE_S: Final = 4.0  #: time for a child to exit when asked, and again when terminated
+_TAIL: Final = 2000  # bytes of a child's standard error shown in an error
+_LOOK_S: Final = 0.25  # how often to check a child that may fall silent
+#: How long to read a dead child's output: a grandchild that holds the pipe can keep it open longer.
 _DRAIN_S: Final = 1.0
-#: What a child is handed in its environment, which only its own user can read, as others can its command line.
+#: Data for a child in its environment, which only its user can read; a command line is readable by all users.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
 _log = logging.getLogger(__name__)
 
 
 class LeftToParent(Protocol):
-    """What belongs to the process that made it."""
+    """An object that belongs to the process that created it."""
 
     def forked(self) -> None:
-        """In a child made by ``os.fork``: let nothing that is called from now on reach what the parent uses.
+        """In a child made by ``os.fork``: keep all later calls away from the parent's resources.
 
-        Other threads are gone, and their locks may be held for ever: take none.
+        Other threads are gone, and their locks may stay held forever: take none.
         """
 
 
@@ -57,16 +57,16 @@ def _leave_all() -> None:
     _left.clear()
 
 
-if hasattr(os, "register_at_fork"):  # where there is no fork nothing is inherited
+if hasattr(os, "register_at_fork"):  # without fork nothing is inherited
     os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
 class ChildProcess:
-    """A child in a session of its own, so that Ctrl-C in the terminal reaches only the parent. Any thread.
+    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread.
 
     Attributes:
-        pid: Its process id.
-        stdout: What it writes to standard output; open until :meth:`close`.
+        pid: Process id of the child.
+        stdout: The child's standard output; open until :meth:`close`.
     """
 
     def __init__(
@@ -80,11 +80,11 @@ class ChildProcess:
         """Start the child.
 
         Args:
-            command: Its command line.
-            keep_errors: Keep what it writes to standard error, for :attr:`last_words`; if False, that goes where this
-                process writes its own.
-            inherited: Numbers of descriptors that the child has too.
-            handed: What it gets of :func:`handed_over`: what is not for a command line, which everybody can read.
+            command: Command line of the child.
+            keep_errors: Keep its standard error for :attr:`last_words`; if False, the child shares this process's
+                standard error.
+            inherited: File descriptors that the child inherits.
+            handed: Data for :func:`handed_over` that must not be on a command line, which all users can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
@@ -109,7 +109,7 @@ class ChildProcess:
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Leave the child to the process that started it, without a copy of the pipe that keeps it running."""
+        """Leave the child to the process that started it; close the copy of the pipe that keeps it running."""
         self.part()
         self._ours = False
 
@@ -120,49 +120,49 @@ class ChildProcess:
 
     @property
     def last_words(self) -> str:
-        """The end of what it has written to standard error."""
+        """The end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._last_words
-        number = self._errors.fileno()  # read without seeking: the child writes where this file stands
+        number = self._errors.fileno()  # read without seeking: the child writes at this file's position
         size = os.fstat(number).st_size
         return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
 
     @property
     def ending(self) -> str:
-        """How it ended, for people: follows its name."""
+        """How the child ended, for people; follows its name."""
         code = self.code
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
     @property
     def quoted_output(self) -> str:
-        """Its last words as the end of a message; empty for none."""
+        """The end of its standard error, to append to a message; empty if it wrote none."""
         text = self.last_words
         return f"; its output:\n{text}" if text else ""
 
     def part(self) -> None:
-        """Ask it to end, by closing its standard input. Does not wait. Idempotent."""
+        """Ask the child to exit by closing its standard input. Does not wait. Idempotent."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()
 
     def terminate(self) -> None:
-        """Send it SIGTERM. Does not wait. Idempotent."""
+        """Send the child SIGTERM. Does not wait. Idempotent."""
         if self._ours:
             self._process.terminate()
 
     def kill(self) -> None:
-        """Kill it. Does not wait. Idempotent."""
+        """Kill the child. Does not wait. Idempotent."""
         if self._ours:
             self._process.kill()
 
     def wait(self, timeout_s: float | None = None) -> int | None:
-        """Wait until it has ended; return its exit code, None if it still runs after ``timeout_s`` [s]."""
+        """Wait until the child has ended; return its exit code, or None if it still runs after ``timeout_s`` [s]."""
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(timeout_s)
         return None
 
     def end(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """Ask it to end and wait so long [s]; then terminate it and wait, at last kill it. Idempotent."""
+        """Ask the child to exit and wait [s]; then terminate it and wait; finally kill it. Idempotent."""
         if not self._ours:
             return
         self.part()
@@ -173,15 +173,15 @@ class ChildProcess:
                 self._process.wait()
 
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End it as :meth:`end` does, and close its output, which nobody may be reading then. Idempotent."""
+        """End the child like :meth:`end`, and close its output, which no thread may be reading. Idempotent."""
         if not self._ours:
-            return  # and its output may be locked for ever by a thread that the fork left behind
+            return  # its output may be locked forever by a thread that the fork left behind
         self.end(grace_s, harder_s)
         self.stdout.close()
         self.close_errors()
 
     def close_errors(self) -> None:
-        """Keep the end of what it wrote to standard error, and nothing else of it. Idempotent."""
+        """Keep only the end of its standard error. Idempotent."""
         if self._errors is not None and not self._errors.closed:
             self._last_words = self.last_words
             self._errors.close()
@@ -189,10 +189,10 @@ class ChildProcess:
 
 @contextmanager
 def interrupt_deferred() -> Iterator[threading.Event]:
-    """Let Ctrl-C set an event within the block, and raise :class:`KeyboardInterrupt` at its end only.
+    """Make Ctrl-C set an event within the block, and raise :class:`KeyboardInterrupt` only at its end.
 
-    For the end of several flights: raised in the middle it would keep the rest from theirs. It does nothing on other
-    threads than the main one, nor where the program handles Ctrl-C itself.
+    For ending several flights: raised midway, it would skip the remaining ones. Does nothing on other threads than the
+    main one, or if the program handles Ctrl-C itself.
     """
     noted = threading.Event()
     on_main = threading.current_thread() is threading.main_thread()
@@ -209,18 +209,18 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return what the parent has handed to this process beside its command line, once; None for nothing."""
+    """Return, once, the data that the parent handed over besides the command line; None if there is none."""
     return os.environ.pop(_HANDED, None)
 
 
 class RestartingChild:
-    """Keeps one child running: whenever it ends another is started, until :meth:`stop`. Any thread.
+    """Keeps one child running, restarting it whenever it ends, until :meth:`stop`. Any thread.
 
-    Everything is decided under one lock, so that no child begins after :meth:`request_stop`, and each is ended.
+    All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and each one is ended.
 
     Attributes:
-        child: The present one, or the last; None before the first.
-        restarts: How many were started in place of another.
+        child: The current or last child; None before the first.
+        restarts: Number of restarts.
     """
 
     def __init__(
@@ -239,12 +239,12 @@ class RestartingChild:
 
         Args:
             command: The children's command line.
-            name: Of the threads.
-            read: Reads a child's ``stdout`` to its end, on a thread of its own for each child.
-            ended: Called when a child has ended, with how, for people; with None when one could not be started.
-                Returns the pause before the next one is started [s]; None: none is.
-            started: Called with each child before anything of it is read, under the lock: must be quick.
-            silent: Whether the present child has hung and is to be killed; asked four times a second.
+            name: Name of the threads.
+            read: Reads a child's ``stdout`` to its end, on a separate thread for each child.
+            ended: Called when a child has ended, with how it ended, for people; with None if one could not be started.
+                Returns the pause before the next start [s]; None for no restart.
+            started: Called with each child, under the lock, before its output is read: must be quick.
+            silent: Returns whether the current child hangs and must be killed; called four times a second.
             keep_errors: See :class:`ChildProcess`.
             handed: See :class:`ChildProcess`.
         """
@@ -265,32 +265,32 @@ class RestartingChild:
 
     @property
     def stopping(self) -> bool:
-        """Whether no other child will be started."""
+        """Whether no further child will be started."""
         return self._stopping
 
     @property
     def over(self) -> bool:
-        """Whether the last child has ended and no other will be started."""
+        """Whether the last child has ended and no further one will be started."""
         return not self._keeper.is_alive()
 
     def start(self) -> None:
         """Start the first child. Once.
 
         Raises:
-            OSError: It can't be started.
+            OSError: The child can't be started.
         """
         self._begin()
         self._keeper.start()
 
     def request_stop(self) -> ChildProcess | None:
-        """Start no other child, and return the present one, which goes on. Does not wait. Idempotent."""
+        """Start no further child; return the current one, which keeps running. Does not wait. Idempotent."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
             return self.child
 
     def stop(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End the present child as :meth:`ChildProcess.end` does, and start no other. Idempotent."""
+        """End the current child like :meth:`ChildProcess.end`, and start no further one. Idempotent."""
         child = self.request_stop()
         if child is not None:
             child.end(grace_s, harder_s)
@@ -312,10 +312,10 @@ class RestartingChild:
         try:
             self._read(child)
         except Exception:  # noqa: BLE001  the child is replaced all the same
-            _log.exception("the output of a child process could not be read: it is killed")
+            _log.exception("killing a child process whose output can't be read")
             child.kill()
         finally:
-            child.stdout.close()  # only here: closing what another thread reads would wait for it
+            child.stdout.close()  # only here: closing a stream that another thread reads would block
 
     def _keep(self) -> None:
         child, ending = self.child, ""
@@ -330,14 +330,14 @@ class RestartingChild:
                 self.restarts += 1
             try:
                 child = self._begin()
-            except OSError as error:  # no memory or no descriptors left, for a moment
+            except OSError as error:  # out of memory or descriptors for a moment
                 child, ending = None, f"could not be started: {error}"
                 continue
             if child is None:
                 return
 
     def _wait(self, child: ChildProcess) -> str:
-        """Wait until a child has ended and its output was read; return how it ended, for people."""
+        """Wait until a child has ended and its output is read; return how it ended, for people."""
         while child.wait(None if self._silent is None else _LOOK_S) is None:
             if self._silent is not None and self._silent():
                 child.kill()
@@ -350,15 +350,15 @@ class RestartingChild:
 
 
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
-    """In a child: call ``stop`` when a pipe whose other end the parent holds has ended, on a thread of its own.
+    """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
     Args:
-        stop: What then ends the child.
-        descriptor: The pipe's reading end; standard input as :class:`ChildProcess` has it.
+        stop: Ends the child.
+        descriptor: The pipe's reading end; standard input in a :class:`ChildProcess`.
     """
 
     def watch() -> None:
-        with suppress(OSError):  # it can't be read: as good as gone
+        with suppress(OSError):  # unreadable: as good as closed
             while os.read(descriptor, 64):
                 pass
         stop()

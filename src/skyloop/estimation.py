@@ -1,7 +1,7 @@
-"""The steps that all Kalman filters here are made of, and which measurement belongs to what. Pure.
+"""The common steps of all Kalman filters, and the assignment of measurements. Pure.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001. A state has the
-shape (n,), or (n, k) for k things of one covariance, (n, n).
+Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001. A state has shape
+(n,), or (n, k) for k states that share one covariance, (n, n).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ Array = NDArray[np.float64]
 
 
 def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
-    """Return how positions and velocities, in this order, go on, and how they wander, each (2·axes, 2·axes).
+    """Return transition and process noise of positions and velocities, in this order, each (2·axes, 2·axes).
 
-    Continuous white-noise acceleration (section 6.2.2): two predictions are one over both times.
+    Continuous white-noise acceleration (section 6.2.2): two predictions equal one over both times.
 
     Args:
         dt_s: The time.
-        intensity: Of the noise: within a second the velocity wanders by the root of it.
+        intensity: Intensity of the noise: within a second the velocity wanders by its root.
         axes: Number of positions.
     """
     move = np.eye(2 * axes) + np.eye(2 * axes, k=axes) * dt_s
@@ -34,17 +34,17 @@ def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
 def corrected(
     state: Array, covariance: Array, off: Array, seen: Array, noise: Array, spread: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return state and covariance after a measurement, the latter in Joseph's form (section 5.2.6).
+    """Return state and covariance after a measurement, using Joseph's form (section 5.2.6).
 
-    It stays positive whatever the rounding.
+    The covariance stays positive in spite of rounding.
 
     Args:
-        state: Before.
-        covariance: Before.
+        state: State before the measurement.
+        covariance: Covariance before the measurement.
         off: Measured minus expected, (m,) or (m, k).
-        seen: Derivative by the state of what is measured, (m, n).
+        seen: Derivative of the measurement with respect to the state, (m, n).
         noise: Covariance of the measurement, (m, m).
-        spread: Covariance of ``off``, if it is to be another one than that of state and noise.
+        spread: Covariance of ``off``, if it differs from that of state and noise.
     """
     if spread is None:
         spread = seen @ covariance @ seen.T + noise
@@ -54,11 +54,11 @@ def corrected(
 
 
 def assignment(what: str, extra: str) -> Callable[[Array], tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return SciPy's ``linear_sum_assignment``: from costs (rows, columns), the pairs that cost least altogether.
+    """Return SciPy's ``linear_sum_assignment``: the pairs of least total cost, from costs (rows, columns).
 
     Args:
-        what: Needs it.
-        extra: Brings it.
+        what: The feature that needs it, for the error.
+        extra: The extra that installs it.
 
     Raises:
         MissingExtraError: SciPy is not installed.

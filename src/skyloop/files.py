@@ -1,4 +1,4 @@
-"""Files at the edge: read up to a limit and decoded with one kind of error, written whole or not at all, waited for."""
+"""File access: bounded reading and decoding with one kind of error, atomic replacing, waiting for readability."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from skyloop.errors import FileFormatError, UsageError
 
 T = TypeVar("T")
 
-MAX_TEXT: Final = 1 << 20  #: bytes of a list that a person writes
+MAX_TEXT: Final = 1 << 20  #: bytes of a hand-written list
 MAX_RESULTS: Final = 256 << 20  #: bytes of a file of measurements; those of an hour take some megabytes
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
-    """The content of a file of at most so many bytes. ``what`` says for people what is in it.
+    """Read a file of at most ``most`` bytes. ``what`` describes its content for people.
 
-    Raises :class:`FileFormatError` for one that can't be read, or that is larger.
+    Raises :class:`FileFormatError` if it can't be read or is larger.
     """
     try:
         with expand(path).open("rb") as file:
@@ -32,12 +32,12 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
     except OSError as error:
         raise FileFormatError(f"{what} {path} can't be read: {error.strerror or error}") from None
     if len(content) > most:
-        raise FileFormatError(f"{what} {path} is larger than {most} bytes: it is something else")
+        raise FileFormatError(f"{what} {path} is larger than {most} bytes, the limit")
     return content
 
 
 def decoded(content: bytes) -> str:
-    """A text in UTF-8, without the byte order mark that editors of Windows begin it with.
+    """Decode UTF-8, without the byte order mark that Windows editors write.
 
     Raises :class:`UnicodeDecodeError`.
     """
@@ -45,7 +45,7 @@ def decoded(content: bytes) -> str:
 
 
 def read_text(path: str | Path, what: str, most: int) -> str:
-    """The same of a text; see :func:`decoded`."""
+    """Read a text file, like :func:`read_bytes`; see :func:`decoded`."""
     try:
         return decoded(read_bytes(path, what, most))
     except UnicodeDecodeError as error:
@@ -53,7 +53,7 @@ def read_text(path: str | Path, what: str, most: int) -> str:
 
 
 def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
-    """The same of JSON, as this type."""
+    """Read a JSON file as a type, like :func:`read_bytes`."""
     content = read_bytes(path, what, most)
     try:
         return msgspec.json.decode(decoded(content), type=kind)
@@ -62,15 +62,15 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
 
 
 class Descriptor(Protocol):
-    """Something open."""
+    """Anything with a file descriptor."""
 
     def fileno(self) -> int: ...
 
 
 def wait_readable(source: Descriptor | int, within_s: float) -> bool:
-    """Wait until a descriptor, whatever its number, can be read from or has ended. False: not within ``within_s`` [s].
+    """Wait until a descriptor is readable or closed; return False if not within ``within_s`` [s].
 
-    ``select.select`` raises for numbers from 1,024 on.
+    Works for any descriptor number; ``select.select`` raises from 1,024 on.
     """
     if not hasattr(select, "poll"):  # Windows
         return bool(select.select([source], [], [], within_s)[0])
@@ -80,7 +80,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """With the home directory for ``~``; one of nobody stays as it is, and is not found."""
+    """Expand ``~`` to the home directory; that of an unknown user stays as it is and is not found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -89,11 +89,11 @@ def expand(path: str | Path) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Where to write what is to be at ``path``: it is there, whole, after the block, and if that fails untouched.
+    """Yield a temporary path that replaces ``path`` after the block; on failure ``path`` stays untouched.
 
-    A device or a pipe is written to directly. Raises :class:`UsageError` for an ``OSError``.
+    Devices and pipes are written to directly. Raises :class:`UsageError` for an ``OSError``.
     """
-    place = Path(os.path.realpath(path))  # what a link points to is replaced, and the link stays
+    place = Path(os.path.realpath(path))  # replace the target of a link and keep the link
     special = place.exists() and not place.is_file()
     part = place if special else place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
     try:

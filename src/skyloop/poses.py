@@ -1,8 +1,8 @@
-"""Poses as SciPy's ``RigidTransform``: of the body, its cameras and what they see. Needs the extra ``control``.
+"""Poses as SciPy's ``RigidTransform``: of the body, its cameras and seen things. Needs the extra ``control``.
 
-``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s. So
-they are chained by ``*``, and turned round by ``inv()``. World axes: x east, y north, z up; body axes: x forward, y
-left, z up (ROS REP 103); a camera's optical axes: x right, y down, z forward. Metres.
+``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s.
+Poses chain with ``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up
+(ROS REP 103); a camera's optical axes: x right, y down, z forward. Metres.
 """
 
 from __future__ import annotations
@@ -21,55 +21,53 @@ if TYPE_CHECKING:
 
 
 def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
-    """The pose with this position (3,) and this rotation matrix (3, 3) or (9,), row by row.
+    """Create the pose with a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
 
-    Raises :class:`UsageError` for what is not finite, or is no rotation.
+    Raises :class:`UsageError` if a value is not finite, or the matrix is not a rotation.
     """
     place = np.asarray(position, dtype=np.float64)
     turn = np.asarray(rotation, dtype=np.float64)
     if place.shape != (3,) or turn.size != 9:
-        raise UsageError(f"a position has 3 numbers and a rotation 3×3, not {place.shape} and {turn.shape}")
+        raise UsageError(f"a position needs 3 numbers and a rotation 3×3, got {place.shape} and {turn.shape}")
     turn = turn.reshape(3, 3)
     if not (np.isfinite(place).all() and np.isfinite(turn).all()):
         raise UsageError("a pose must be finite")
     if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0.0:
-        raise UsageError(
-            "this matrix is no rotation: its rows must be of length 1, square to one another, right-handed"
-        )
+        raise UsageError("this matrix is not a rotation: its rows must have length 1, be orthogonal and right-handed")
     transforms = _scipy()
     pose: RigidTransform = transforms.RigidTransform.from_components(place, transforms.Rotation.from_matrix(turn))
     return pose
 
 
 def attitude(feedback: Feedback) -> Rotation:
-    """From body to world axes. Raises :class:`UsageError` while the attitude is not known."""
+    """Return the rotation from body to world axes. Raises :class:`UsageError` while the attitude is unknown."""
     rotation: Rotation = _scipy().Rotation.from_matrix(_rotation(feedback))
     return rotation
 
 
 def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """The vehicle's pose; ``position`` (3,) [m] from elsewhere goes before the vehicle's own.
+    """Return the vehicle's pose; a given ``position`` (3,) [m] takes precedence over the vehicle's own.
 
-    Raises :class:`UsageError` while attitude or position is not known.
+    Raises :class:`UsageError` while attitude or position is unknown.
     """
     place = feedback.position_m if position is None else position
     if place is None:
-        raise UsageError(f"{NO_POSITION}: give the one that you know, or {POSITION_SOURCES}")
+        raise UsageError(f"{NO_POSITION}: give a known position, or {POSITION_SOURCES}")
     return transform(place, _rotation(feedback))
 
 
 def camera_in_body(camera: CameraInfo) -> RigidTransform:
-    """How a camera is mounted; one that does not say where is taken to be in the body's centre.
+    """Return a camera's mounting; a camera with unknown position counts as at the body's centre.
 
-    Raises :class:`UsageError` if it does not say how it is turned.
+    Raises :class:`UsageError` if its orientation is unknown.
     """
     return transform((0.0, 0.0, 0.0) if camera.position_m is None else camera.position_m, mounting_rotation(camera))
 
 
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """A camera's pose in the state of ``feedback``: for a picture, ``frame.feedback``, the state at its capture.
+    """Return a camera's pose in the state of ``feedback``(``frame.feedback`` for an image).
 
-    ``position`` and errors as of :func:`body_in_world` and :func:`camera_in_body`.
+    ``position`` and errors as for :func:`body_in_world` and :func:`camera_in_body`.
     """
     return body_in_world(feedback, position) * camera_in_body(camera)
 
@@ -77,14 +75,14 @@ def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike 
 def target_in_world(
     target_in_camera: RigidTransform, camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None
 ) -> RigidTransform:
-    """Where something is that a camera saw, as :attr:`MarkerSighting.pose` tells it, in the state of ``feedback``."""
+    """Return the pose of a thing seen by a camera, such as :attr:`MarkerSighting.pose`, by ``feedback``."""
     return camera_in_world(camera, feedback, position) * target_in_camera
 
 
 def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
-    """From a camera's optical axes to body axes, shape (3, 3); needs no extra.
+    """Return the rotation from a camera's optical axes to body axes, shape (3, 3); needs no extra.
 
-    Raises :class:`UsageError` if the camera does not say how it is mounted.
+    Raises :class:`UsageError` if the camera's mounting is unknown.
     """
     if camera.rotation is None:
         raise UsageError(f"camera {camera.name!r} does not say how it is mounted: give its CameraInfo a rotation")

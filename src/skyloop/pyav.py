@@ -1,4 +1,4 @@
-"""Decoders and encoders of PyAV, made in one place: PyAV is optional, and imported when the first one is made."""
+"""PyAV's decoders and encoders, created in one place: PyAV is optional, and imported when the first one is created."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def require_pyav(purpose: str) -> None:
     """Check that PyAV is installed.
 
     Raises:
-        MissingExtraError: It is not.
+        MissingExtraError: PyAV is not installed.
     """
     try:
         import av  # noqa: F401
@@ -31,13 +31,13 @@ def require_pyav(purpose: str) -> None:
 def new_decoder(
     codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = False, low_delay: bool = True
 ) -> VideoCodecContext:
-    """Make a decoder that gives each picture at once.
+    """Create a decoder that returns each image at once.
 
     Args:
-        codec: FFmpeg's name of it.
+        codec: FFmpeg's name of the codec.
         purpose: As for :func:`require_pyav`.
-        patch: Fill what is damaged with what stood there before; otherwise a damaged picture is an error.
-        low_delay: False for a stream whose pictures build on later ones: they are held back for those.
+        patch: Fill damaged parts from earlier images; otherwise a damaged image is an error.
+        low_delay: False for a stream whose images depend on later ones: it delays them until those arrive.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -49,44 +49,44 @@ def new_decoder(
     if patch:
         context.flags |= av.codec.context.Flags.output_corrupt
     else:
-        # A picture of H.264 is refused also if bits of it are left over: the like of it would refuse every end of an
-        # MPEG-4 sequence.
+        # For H.264 also refuse an image with leftover bits; for MPEG-4 such a check would refuse every end of a
+        # sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)
     if low_delay:
         context.flags |= av.codec.context.Flags.low_delay
-    context.thread_count = 1  # frame threads would hold pictures back
+    context.thread_count = 1  # frame threads would delay images
     return context
 
 
 def limit_memory(context: CodecContext) -> None:
-    """A damaged header must not make the decoder ask for gigabytes."""
+    """Limit a decoder's memory: a damaged header must not make it allocate gigabytes."""
     context.options = {**context.options, "max_pixels": str(MAX_PIXELS)}
 
 
-_TICK: Final = Fraction(1, 1_000_000)  # of the stamps that the encoder's rate control goes by [s]
-#: How much of a second at its rate a stream may send at once: what a key picture takes. A slow link has to carry it
-#: before the next picture.
+_TICK: Final = Fraction(1, 1_000_000)  # time base of the encoder's rate control [s]
+#: How much of a second's data a stream may send at once: the size of a key frame. A slow link has to carry it before
+#: the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3
-_FALLS: Final = 12  # below this share of the most it may send, a single picture takes the path for too long
-_KEY_EVERY_S: Final = 10.0  #: who comes later asks for one
+_GROWS: Final = 3  # greatest increase of a rate that will change
+_FALLS: Final = 12  # below 1/12 of its maximum rate, a single image occupies the link for too long
+_KEY_EVERY_S: Final = 10.0  #: late subscribers request a key frame
 #: The colours of PAL television, with 16 to 235 from black to white: what FFmpeg converts to, and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
 
 class H264Encoder:
-    """Encodes one stream so that each picture comes out at once. Used by one thread at a time.
+    """Encodes one stream, returning each image at once. Use from one thread at a time.
 
-    H.264, Main profile, Annex B, without pictures that build on later ones; parameter sets before each key picture.
+    H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame.
 
     Args:
-        width: Of the pictures [px], even.
-        height: Of the pictures [px], even.
-        fps: About how many there will be in a second.
-        kbit_s: On average [kbit/s].
-        varies: Whether the rate will be changed, up to three times as much. What x264 may send at once is set when it
-            begins, so a steady rate is kept more strictly.
+        width: Width of the images [px], even.
+        height: Height of the images [px], even.
+        fps: Approximate frame rate.
+        kbit_s: Average rate [kbit/s].
+        varies: Whether the rate will change, up to three times as high. x264 fixes the largest burst when it starts, so
+            a steady rate is kept more strictly.
 
     Raises:
         MissingExtraError: PyAV is not installed, or without x264.
@@ -120,37 +120,37 @@ class H264Encoder:
             "x264-params": f"repeat-headers=1:scenecut=0:sliced-threads=0:{_COLOURS}",
         }
         context.open()
-        # x264 takes another rate later only if it began with the most that it may send, and then none above that.
+        # x264 accepts a later change of rate only if it started with a maximum rate, and never above it.
         context.bit_rate = kbit_s * 1000
         self._context = context
         self._fresh = True
 
     def carries(self, kbit_s: int) -> bool:
-        """Return whether it can be set to a rate [kbit/s], or another one has to be begun."""
+        """Return whether the encoder can switch to a rate [kbit/s]; if not, create a new one."""
         return self._most_kbit_s / _FALLS <= kbit_s <= self._most_kbit_s
 
     def set_rate(self, kbit_s: int) -> None:
-        """Change the average rate from the next picture on [kbit/s], at no cost; see :meth:`carries`."""
+        """Change the average rate from the next image on [kbit/s], at no cost; see :meth:`carries`."""
         self.kbit_s = kbit_s
         self._context.bit_rate = kbit_s * 1000
 
     def encode(
         self, pixels: NDArray[np.uint8], form: str, captured_ns: int, *, key: bool = False
     ) -> tuple[bytes, bool]:
-        """Encode one picture; other threads run meanwhile.
+        """Encode one image, letting other threads run meanwhile.
 
         Args:
-            pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous, of any size: it is scaled.
+            pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous; any size is scaled.
             form: FFmpeg's name of the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
-            captured_ns: When it was captured [ns], later than the one before.
-            key: Make it a key picture.
+            captured_ns: Capture time [ns], later than the previous one.
+            key: Whether to make it a key frame.
 
         Returns:
-            The access unit, and whether it is a key picture. Empty if the encoder gave none.
+            The access unit, and whether it is a key frame. Empty if the encoder returned none.
         """
         import av
 
-        picture = av.VideoFrame.from_numpy_buffer(pixels, format=form)  # copies nothing
+        picture = av.VideoFrame.from_numpy_buffer(pixels, format=form)  # no copy
         picture = picture.reformat(self.width, self.height, "yuv420p", interpolation="AREA")
         picture.pts, picture.time_base = captured_ns // 1000, _TICK
         first, self._fresh = self._fresh, False

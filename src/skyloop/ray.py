@@ -1,6 +1,6 @@
-"""Processors on a Ray cluster: what ``skyloop process`` runs, as actors that Ray places. Needs the extra ``ray``.
+"""Processors on a Ray cluster: like ``skyloop process``, but as actors placed by Ray. Needs the extra ``ray``.
 
-Frames and results travel between proxy and actors as always; Ray starts the actors and restarts them when they die.
+Frames and results travel between proxy and actors as usual; Ray starts the actors and restarts them when they die.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopE
 from skyloop.processing import Code, Settings, Status, Worker, load_processor
 
 _ASK_S: Final = 10.0  #: time for an actor to return its status
-_LOOK_S: Final = 0.1
+_LOOK_S: Final = 0.1  # how often to check whether all actors have started
 _START_S: Final = 60.0  #: time for Ray to place and start all actors
-#: Variables of this program's environment by which a worker finds the proxy.
+#: Environment variables of this program with which a worker finds the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
 
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """What an actor is to do; it travels to the actor's host."""
+    """The task of an actor, sent to the actor's host."""
 
     kind: type[Any]
     drone: str
@@ -35,20 +35,20 @@ class _Order:
 
 
 class Workers:
-    """The actors of one processor, made by :func:`process`. A context manager that ends them."""
+    """The actors of one processor, created by :func:`process`. A context manager that ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
         """Keep Ray's handles of the actors."""
         self.actors = actors  #: Ray's handles
 
     def statuses(self, timeout_s: float = _ASK_S) -> list[Status | None]:
-        """Return the statistics of each actor; None for one that does not answer, as while Ray restarts it.
+        """Return the statistics of each actor; None for one that does not answer, for example during a restart.
 
         Args:
-            timeout_s: How long to wait for all of them [s].
+            timeout_s: How long to wait for all actors [s].
 
         Raises:
-            LinkError: If an actor can't go on, as when other code took the name; says why.
+            LinkError: An actor can't continue, for example because other code took the name; the message says why.
         """
         ray = _ray()
         asked = [actor.status.remote() for actor in self.actors]
@@ -94,28 +94,28 @@ def process(
     stuck_s: float = 2.0,
     **options: Any,
 ) -> Workers:
-    """Run a processor as actors of a Ray cluster; returns when all of them work.
+    """Run a processor as actors of a Ray cluster; return when all of them work.
 
-    Uses the cluster that this program is connected to, and starts one on this host if there is none.
+    Uses the cluster that this program is connected to, or else starts one on this host.
 
     Args:
-        target: The class, or where it is: ``module:Class`` or ``file.py:Class``.
-        drone: Name or address of the drone, as found from the host of each actor.
+        target: The class, or its location: ``module:Class`` or ``file.py:Class``.
+        drone: Name or address of the drone, as reachable from each actor's host.
         workers: Number of actors, at least 1.
         camera: Name of the camera; None: the vehicle's first.
         name: Name of the processor; None: the class's in lower case.
-        shared: Each frame goes to one of the workers; if False, each worker gets all.
-        max_age_s: Frames older than this when their turn comes are left out [s]; None: none are.
-        max_fps: Most frames a second for each worker; None: all.
-        stuck_s: A call of ``process`` that takes longer gives the worker's share to the others [s].
-        **options: For Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged with
-            the variables of the environment by which an actor finds the proxy, and goes before them.
+        shared: Each frame goes to one of the workers; if False, each worker gets all frames.
+        max_age_s: Skip frames older than this at their turn [s]; None: skip none.
+        max_fps: Frame rate limit of each worker; None: no limit.
+        stuck_s: A longer call of ``process`` gives the worker's share to the others [s].
+        **options: Options of Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged
+            with, and takes precedence over, the environment variables with which an actor finds the proxy.
 
     Raises:
-        MissingExtraError: If Ray is not installed.
-        UsageError: If an argument is out of range, or the class is no processor.
-        NoAnswerError: If Ray has no room for so many actors within 60 s.
-        LinkError: If an actor fails; says why.
+        MissingExtraError: Ray is not installed.
+        UsageError: An argument is out of range, or the class is not a processor.
+        NoAnswerError: Ray has no room for that many actors within 60 s.
+        LinkError: An actor fails; the message says why.
     """
     ray = _ray()
     if not isinstance(workers, int) or workers < 1:
@@ -125,7 +125,7 @@ def process(
     if not ray.is_initialized():
         ray.init(include_dashboard=False, log_to_driver=False)
     module = sys.modules[code.kind.__module__]
-    if module.__name__.startswith("skyloop_user_"):  # loaded from a file: can't be imported on another host
+    if module.__name__.startswith("skyloop_user_"):  # loaded from a file: another host can't import it
         ray.cloudpickle.register_pickle_by_value(module)
     options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
@@ -140,12 +140,12 @@ def process(
 
 
 def _runtime_env(wanted: Any) -> dict[str, Any]:
-    """Return the user's ``runtime_env`` with the variables by which an actor finds the proxy."""
+    """Return the user's ``runtime_env`` with the variables with which an actor finds the proxy."""
     wanted = {} if wanted is None else wanted
     variables = wanted.get("env_vars") or {} if isinstance(wanted, Mapping) else None
     if not isinstance(variables, Mapping):
         raise UsageError(
-            f"runtime_env is {wanted!r} and must be a dict as Ray takes it, with a dict of env_vars if any"
+            f"runtime_env is {wanted!r} and must be a dict as Ray takes it, with env_vars, if any, as a dict"
         )
     ours = {key: os.environ[key] for key in _ENVIRONMENT if key in os.environ}
     return {**wanted, "env_vars": {**ours, **variables}}
@@ -158,12 +158,12 @@ def _await_start(workers: Workers) -> None:
             return
         time.sleep(_LOOK_S)
     raise NoAnswerError(
-        f"Ray did not start {len(workers.actors)} actors within {_START_S:g} s: has it so many CPUs free?"
+        f"Ray did not start {len(workers.actors)} actors within {_START_S:g} s: does it have that many CPUs free?"
     )
 
 
 class _Actor:
-    """One worker, on a host that Ray chooses."""
+    """One worker, on a host chosen by Ray."""
 
     def __init__(self, task: _Order) -> None:
         self._trouble = ""
@@ -172,7 +172,7 @@ class _Actor:
             self._begin(task)
         except SkyloopError as error:
             self._trouble = str(error)
-        except Exception as error:  # noqa: BLE001  (the user's class may raise anything when it is made)
+        except Exception as error:  # noqa: BLE001  (the user's class may raise anything)
             self._trouble = f"{task.kind.__name__}() raised {error!r}"
 
     def _begin(self, task: _Order) -> None:
@@ -193,11 +193,11 @@ class _Actor:
             worker.run(math.inf)
         except SkyloopError as error:
             self._trouble = str(error)
-        except BaseException as error:  # noqa: BLE001  (nobody else learns of it: the status shows that it has ended)
+        except BaseException as error:  # noqa: BLE001  (otherwise the error is lost: the status shows that it has ended)
             self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:
-        """The worker's statistics, and why it has ended, if it has."""
+        """Return the worker's statistics, and why it has ended, if it has."""
         return None if self._worker is None else self._worker.status, self._trouble
 
 

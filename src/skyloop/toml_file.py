@@ -1,4 +1,4 @@
-"""TOML files read into msgspec structs. An error says where in the file, what was given, and what is allowed."""
+"""Read TOML files into msgspec structs, with errors that give the place in the file, the value and the allowed ones."""
 
 from __future__ import annotations
 
@@ -18,44 +18,44 @@ from skyloop.errors import FileFormatError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 1 << 18  #: of a file; the largest world that is shipped takes 5 kB
-#: Parts of a key: a parser goes through all of them for each key below, which takes minutes for some ten thousand.
+MAX_BYTES: Final = 1 << 18  #: limit of a file; the largest world shipped takes 5 kB
+#: Parts of a key: a parser walks through all of them for each key below, which takes minutes with ten thousand.
 MAX_DEPTH: Final = 16
-MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither shown nor computed with
-#: msgspec looks at a struct's fields when it first converts to it, and crashes if two threads do at the same time.
+MAX_WHOLE: Final = (1 << 63) - 1  #: TOML's limit; larger numbers are neither shown nor used
+#: msgspec inspects a struct's fields on its first conversion, and crashes if two threads do so at once.
 _converting = threading.Lock()
 _SHOWN: Final = 80  #: characters of a wrong value in a message
-# Nothing in it is tried twice, and it begins where a part does: it is as fast for what it does not find.
+# Possessive quantifiers, and a start at a part's start, avoid backtracking: a miss is as fast as a match.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
-_WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # how msgspec ends an error
+_WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # the end of a msgspec error
 _STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
 _KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a text", list: "a list", dict: "a table"}
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A table of a file, for errors about it."""
+    """A table of a file, for error messages."""
 
     source: str  #: the file's name
-    table: str = ""  #: as a person finds it there; empty for what belongs to none
+    table: str = ""  #: its name in the file; empty for top-level keys
 
     def under(self, key: str) -> Place:
-        """Return the place of a table in this one."""
+        """Return the place of a table inside this one."""
         return Place(self.source, f"{self.table}.{key}" if self.table else key)
 
     def item(self, key: str, number: int, name: object) -> Place:
-        """Return the place of one of several tables: by its name, or by its number, from 1."""
+        """Return the place of one of several tables, by name or by number from 1."""
         place = self.under(key).table
         return Place(self.source, f"{place} {name!r}" if isinstance(name, str) and name else f"{place} #{number}")
 
     def error(self, key: str, problem: str) -> FileFormatError:
-        """Return the error to raise about a key of the table."""
+        """Create an error about a key of the table."""
         where = [self.source, f"[{self.table}]"] if self.table else [self.source]
         return FileFormatError(f"{', '.join(where)}, key {key!r}: {problem}")
 
     def wrong(self, key: str, value: object, wanted: str) -> FileFormatError:
-        """Return the error to raise about a value that is another than wanted."""
+        """Create an error about a wrong value."""
         kind = _KINDS.get(type(value), type(value).__name__)
         return self.error(key, f"{_shown(value)} ({kind}) given, but it must be {wanted}")
 
@@ -68,19 +68,19 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         source: The file's name, for messages.
 
     Raises:
-        FileFormatError: It is not TOML.
+        FileFormatError: The text is not TOML.
     """
     if _DEEP_KEY.search(text):
-        raise FileFormatError(f"{source}: a key of more than {MAX_DEPTH} parts with dots between them")
+        raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:
         values: dict[str, Any] = msgspec.toml.decode(text)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # numbers and lists that are too large, besides
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # also for numbers and lists that are too large
         raise FileFormatError(f"{source}: not valid TOML: {error}") from None
     return values
 
 
 def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
-    """Convert what was parsed to a struct.
+    """Convert parsed values to a struct.
 
     Args:
         values: From :func:`parse_toml`.
@@ -88,7 +88,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
         kind: A :class:`msgspec.Struct`, with tables and lists of tables as fields, that forbids unknown keys.
 
     Raises:
-        FileFormatError: A key is missing or unknown, or a value is of another kind or out of its range.
+        FileFormatError: A key is missing or unknown, or a value has the wrong type or is out of range.
     """
     try:
         with _converting:
@@ -98,7 +98,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Return msgspec's error with what was given and what was meant: it has only the place, and what was expected."""
+    """Complete msgspec's error, which has only the place and the expected type, with the given value and a hint."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():
@@ -124,13 +124,13 @@ def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileF
 def _wrong_key(
     place: Place, table: dict[str, Any], fields: dict[str, tuple[inspect.Type, bool]], message: str
 ) -> FileFormatError:
-    """Return the error about a key that is unknown or missing, or about both where one is the other misspelt."""
+    """Create the error about an unknown or missing key, or about both if one is the other misspelt."""
     unknown = [key for key in table if key not in fields]
     missing = [key for key, (_, required) in fields.items() if required and key not in table]
     for key in missing:
         wanted = f"missing; it must be {_wanted(fields[key][0], place.under(key))}"
         for near in difflib.get_close_matches(key, unknown, n=1, cutoff=0.6):
-            return place.error(key, f"{wanted} (there is {near!r}; did you mean {key!r}?)")
+            return place.error(key, f"{wanted} (found {near!r}; did you mean {key!r}?)")
         if "missing" in message:
             return place.error(key, wanted)
     if unknown:
@@ -139,7 +139,7 @@ def _wrong_key(
 
 
 def _plain(info: inspect.Type) -> Any:
-    """Return what a type is besides optional and described."""
+    """Return a type without its optional and metadata wrappers."""
     if isinstance(info, inspect.Metadata):
         return _plain(info.type)
     if isinstance(info, inspect.UnionType):
@@ -149,14 +149,14 @@ def _plain(info: inspect.Type) -> Any:
 
 
 def _tables(info: inspect.Type) -> list[inspect.StructType]:
-    """Return the kinds of table that a value may be."""
+    """Return the kinds of table that a value can be."""
     plain = _plain(info)
     kinds = plain.types if isinstance(plain, inspect.UnionType) else [plain]
     return [kind for kind in kinds if isinstance(kind, inspect.StructType)]
 
 
 def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
-    """Return type and whether it is required of each key of a table; of several kinds the one that it says it is."""
+    """Return each key's type and whether it is required; of several kinds take the one that the table names."""
     kinds = _tables(info)
     tag = kinds[0].tag_field
     fields: dict[str, tuple[inspect.Type, bool]] = {}
@@ -174,7 +174,7 @@ def _choices(info: inspect.Type) -> tuple[str, ...]:
 
 
 def _wanted(info: inspect.Type, place: Place) -> str:
-    """Return in words what a value must be; ``place`` is its own."""
+    """Return in words what a value must be; ``place`` is the value's."""
     if isinstance(info, inspect.Metadata) and info.extra_json_schema:
         return str(info.extra_json_schema["description"])
     plain = _plain(info)
@@ -196,7 +196,7 @@ def _wanted(info: inspect.Type, place: Place) -> str:
 
 
 def _range(low: float | None, high: float | None) -> str:
-    """Return what a number between these bounds is, where the largest number that there is stands for none."""
+    """Describe a number between these bounds; the largest float stands for no upper bound."""
     least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
     if least and most:
         return f"a number from {low:g} to {high:g}"

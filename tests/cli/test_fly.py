@@ -270,4 +270,4 @@ def test_a_misspelt_callback_is_told_before_the_take_off(capsys: pytest.CaptureF
 
     with scripted() as proxy, flown(proxy) as drone:
         make(Mine, drone)
-    assert capsys.readouterr().err == "note: Mine.onframe is called by nobody: is on_frame meant?\n"
+    assert capsys.readouterr().err == "note: Mine.onframe is never called: did you mean on_frame?\n"

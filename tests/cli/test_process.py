@@ -47,7 +47,7 @@ def test_the_help_shows_how(run: Run) -> None:
     ("arguments", "words"),
     [
         (("nowhere.py", "--drone", "bravo"), "there is no file nowhere.py"),
-        (("detector", "--drone", "bravo"), "names no processor"),
+        (("detector", "--drone", "bravo"), "is not a processor"),
         (("{file}", "--drone", "brvo"), "did you mean 'bravo'"),
         (("{file}", "--drone", "bravo", "--camera", "frnt"), "no camera named 'frnt'"),
         (("{file}", "--drone", "bravo", "--name", "a b"), "the name of a processor must have 1 to 64 letters"),

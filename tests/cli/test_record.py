@@ -49,7 +49,7 @@ def test_until_it_is_interrupted(
     ("words", "said"),
     [
         (("record", "alhpa"), "did you mean 'alpha'"),
-        (("record", "alpha", "-o", "/nowhere/f.mcap"), "/nowhere is no folder"),
+        (("record", "alpha", "-o", "/nowhere/f.mcap"), "/nowhere is not a folder"),
         (("record", "alpha", "--channels", "vidio"), "did you mean 'video'"),
         (("record", "alpha", "--encoding", "gif"), "jpeg"),
     ],

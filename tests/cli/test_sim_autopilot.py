@@ -12,7 +12,7 @@ from tests.support.commands import Run
     [
         ("--autopilot px4 --autopilot ardupilot", "--autopilot is given 2 times for --drones 1"),
         ("--drones 2 --autopilot px4 --autopilot betaflight", "choose one, such as --option vehicle=iris"),
-        ("--drones 2 --speed 2 --autopilot px4 --autopilot betaflight", "speed is 1 with it, not 2"),
+        ("--drones 2 --speed 2 --autopilot px4 --autopilot betaflight", "speed must be 1, not 2"),
         ("--autopilot px4 --firmware px4", "give one of them"),
     ],
 )

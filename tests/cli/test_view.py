@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.recording.foxglove_access import ParameterDesk
+from skyloop.recording.foxglove_access import ParameterAccess
 from tests.support import fake_rerun
 from tests.support.commands import Run
 from tests.support.processes import Process
@@ -45,7 +45,7 @@ def test_a_file_of_rerun_for_a_time(run: Run, alpha: Process, tmp_path: Path, mo
 
 def test_parameters_are_written_under_a_lease_that_is_held_for_that_moment(alpha: Process) -> None:
     with skyloop.connect("alpha", access="observe") as observer:
-        desk = ParameterDesk([observer], 31)
+        desk = ParameterAccess([observer], 31)
         try:
             before = observer.config["limits.tilt"]
             written = desk.write("alpha/limits.tilt", 0.1)

@@ -1,5 +1,5 @@
 """A small kinematic world for the follower's law: a vehicle with lag and delay, a camera with latency and noise, and a
-board that walks about. No pictures: what the camera would see is computed."""
+board that moves about. No images: the camera's view is computed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FROM_SIDE = math.radians(65)  # seen from further aside than this, a marker is n
 
 @dataclass
 class Board:
-    """Walks around the origin within a ring and looks at the centre, speed and turns by chance."""
+    """Moves around the origin within a ring, facing the centre, with random speed and turns."""
 
     rng: np.random.Generator
     speed: float = 0.5
@@ -53,7 +53,7 @@ class Board:
 
 
 class FollowWorld:
-    """Flies the law for a while and keeps what matters: was it in view, how far was it."""
+    """Flies the law for a while and records whether the marker was in view, and its distance."""
 
     def __init__(self, seed: int, *, fps: float = 15.0, speed: float = 0.5) -> None:
         self.rng = np.random.default_rng(seed)

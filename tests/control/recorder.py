@@ -1,4 +1,4 @@
-"""A drone that keeps what a controller tells it, and what that controller sees."""
+"""A fake drone that records a controller's calls, and the frames that the controller sees."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
 
 
 class Recorder:
-    """Stands for the drone: keeps what it is told."""
+    """Stands in for the drone and records calls."""
 
     def __init__(self) -> None:
         cameras = (CameraInfo("front", 320, 240, 15.0, rotation=FORWARD), CameraInfo("bottom", 320, 240, 15.0))

@@ -1,4 +1,4 @@
-"""What is known of a vehicle's motion, how old it is, and what laws do where it is not known any more."""
+"""A vehicle's motion, its age and its gaps, and what laws do while it is unknown."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_velocity_stays_where_it_was_when_the_vehicle_turns() -> None:
     assert turned == pytest.approx((0.0, -forward, 0.0), abs=1e-3), "it moves to the right of its nose now"
 
 
-def test_a_vehicle_that_landed_is_at_rest() -> None:
+def test_a_landed_vehicle_is_at_rest() -> None:
     estimate = TiltVelocity()
     held(2.0, estimate, pitch_rad=0.2)
     assert estimate.step(tilted(2.1, state=FlightState.LANDED, pitch_rad=0.2)) == (0.0, 0.0, 0.0)
@@ -97,11 +97,11 @@ def test_neither_gaps_nor_late_samples_are_integrated_over() -> None:
     assert late == after_gap
 
 
-def test_a_vehicle_on_its_side_is_no_rocket() -> None:
+def test_a_vehicle_on_its_side_does_not_accelerate() -> None:
     assert np.hypot(*held(0.5, roll_rad=math.pi / 2)[:2]) < 2.0 * GRAVITY
 
 
-def test_how_fast_it_tilts_is_told_by_the_last_samples() -> None:
+def test_the_tilt_rate_comes_from_the_last_samples() -> None:
     tilting = Airframe()
     assert tilting.tilt_rate_rad_s == 0.0
     for n in range(5):
@@ -117,10 +117,10 @@ def test_how_fast_it_tilts_is_told_by_the_last_samples() -> None:
     assert tilting.tilt_rate_rad_s == 0.0, "that was long ago"
 
 
-# Age, and what is missing ------------------------------------------------------------------------------------------
+# Age and missing parts ---------------------------------------------------------------------------------------------
 
 
-def test_what_was_not_reported_for_half_a_second_is_not_known() -> None:
+def test_a_part_not_reported_for_half_a_second_is_unknown() -> None:
     airframe = Airframe(Part.VELOCITY, Part.HEIGHT)
     assert airframe.missing(0) == "the vehicle's velocity and height above the ground are not known"
     airframe.add(state(1.0))
@@ -139,7 +139,7 @@ def test_what_was_not_reported_for_half_a_second_is_not_known() -> None:
 
 @pytest.mark.parametrize("name", sorted(STILL))
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_what_is_not_finite_counts_as_missing(name: str, wrong: float) -> None:
+def test_values_that_are_not_finite_count_as_missing(name: str, wrong: float) -> None:
     value = STILL[name]
     airframe = Airframe()
     airframe.add(state(1.0, **dict[str, Any]({name: (0.0, wrong, 0.0) if isinstance(value, tuple) else wrong})))
@@ -148,7 +148,7 @@ def test_what_is_not_finite_counts_as_missing(name: str, wrong: float) -> None:
     assert all(getattr(airframe.feedback, other) == STILL[other] for other in STILL if other != name)
 
 
-def test_samples_after_one_that_was_stamped_ahead_are_not_ignored() -> None:
+def test_samples_after_one_stamped_ahead_are_not_ignored() -> None:
     airframe = Airframe(Part.VELOCITY)
     airframe.add(state(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
     airframe.add(state(1.1, velocity_m_s=(1.0, 0.0, 0.0)))
@@ -181,7 +181,7 @@ def laws() -> list[AirframeLaw]:
 
 
 def see(law: AirframeLaw, seen: Feedback, place: Any) -> None:
-    """Show a law what it looks for, at a place in body axes, if it looks for anything."""
+    """Show a law its target, if it has one, at a place in body axes."""
     if isinstance(law, FollowLaw | GateLaw | CourseLaw):
         law.see(place, BACK, seen, seen.captured_ns)
     elif isinstance(law, LandingLaw):
@@ -215,12 +215,12 @@ def test_without_feedback_each_law_holds_the_vehicle_and_says_why(number: int) -
         assert "not known" in law.problem
     law.feedback(state(9.0))
     step(law, 9.0)
-    assert law.problem == "", "and flies on when it is known again"
+    assert law.problem == "", "it continues once the motion is known again"
 
 
 @pytest.mark.parametrize("number", [0, 1, 3, 4])
 def test_a_velocity_that_goes_missing_ends_flight_and_turn(number: int) -> None:
-    """Attitude, height and frames go on: what turned away from a visible marker, or flew off, holds now."""
+    """Attitude, height and frames continue. Laws used to turn away from a visible marker, or fly off."""
     law = laws()[number]
     setpoint: Velocity | Attitude = Velocity()
     for k in range(200):
@@ -239,7 +239,7 @@ def test_a_velocity_that_goes_missing_ends_flight_and_turn(number: int) -> None:
 
 @pytest.mark.parametrize("gone_s", [2.0, 3.0, 4.0, 5.0])
 def test_a_landing_is_not_declared_in_the_air_where_the_velocity_goes_missing(gone_s: float) -> None:
-    """It was declared at 1.01 m, as the marker seemed to rise while the vehicle's own motion stood still."""
+    """It was declared at 1.01 m: the marker seemed to rise while the vehicle's own motion was frozen."""
     law, place, velocity = LandingLaw(), np.array([0.5, 0.0, 2.6]), np.zeros(3)
     for k in range(1200):
         at_s = 1.0 + k / 40
@@ -259,8 +259,8 @@ def test_a_landing_is_not_declared_in_the_air_where_the_velocity_goes_missing(go
     assert np.hypot(*place[:2]) < 0.2
 
 
-def test_what_was_seen_before_a_gap_is_not_flown_to_after_it() -> None:
-    """Where the vehicle was meanwhile nobody knows, and so not where the marker is from there."""
+def test_a_target_seen_before_a_gap_is_not_flown_to_after_it() -> None:
+    """The vehicle's position after the gap is unknown, so the marker's direction is unknown, too."""
     follow, gate, landing = FollowLaw(), GateLaw(), LandingLaw()
     for law in (follow, gate, landing):
         for at_s in (1.0, 1.1, 1.2, 3.0):
@@ -272,8 +272,8 @@ def test_what_was_seen_before_a_gap_is_not_flown_to_after_it() -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1, 4])
-def test_after_a_while_without_set_points_they_begin_from_rest(number: int) -> None:
-    """Frames had stopped, and the vehicle hovered: what it was asked for before is not what it does."""
+def test_after_a_pause_set_points_start_from_rest(number: int) -> None:
+    """Frames had stopped and the vehicle hovered: the old set-point is not its motion."""
     law, fastest = laws()[number], 0.0
     for k in range(80):
         at_s = 1.0 + 0.05 * k
@@ -321,7 +321,7 @@ def test_nan_anywhere_yields_no_set_point_that_is_not_finite_or_grows(
             assert max(map(abs, (setpoint.roll, setpoint.pitch, setpoint.climb))) < 1.0
 
 
-def test_a_landing_holds_where_attitude_and_velocity_never_come_together() -> None:
+def test_a_landing_holds_if_attitude_and_velocity_are_never_known_together() -> None:
     law = LandingLaw()
     for k in range(6):
         wrong = {"velocity_m_s": None} if k % 2 else {"roll_rad": math.nan}
@@ -335,7 +335,7 @@ def test_a_landing_holds_where_attitude_and_velocity_never_come_together() -> No
     assert law.problem == ""
 
 
-def test_positions_that_were_stamped_ahead_do_not_tilt_it_until_then() -> None:
+def test_positions_stamped_ahead_do_not_tilt_it_until_then() -> None:
     law = FlowLaw()
     for at_s, x in ((9.0, 0.0), (9.05, 0.1), (9.1, 0.2)):
         law.feedback(state(at_s))
@@ -348,11 +348,11 @@ def test_positions_that_were_stamped_ahead_do_not_tilt_it_until_then() -> None:
     law.see(np.array([5.0, 0.0]), nanoseconds(at_s))
     step(law, at_s)
     assert law.phase is FlowPhase.HOLDING
-    assert law.off_m == pytest.approx(0.0, abs=0.01), "there, where it is now"
+    assert law.off_m == pytest.approx(0.0, abs=0.01), "held at its current place"
 
 
-def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:
-    """It ended the flight by an error about a fuzzy variable."""
+def test_an_obstacle_with_an_edge_outside_the_lens_model_counts_as_close() -> None:
+    """It ended the flight with an error about a fuzzy variable."""
     law = AvoidLaw(9.0)
     law.feedback(state(1.0))
     law.see([BlobSighting((0.0, 0.0, 9.0, 9.0), math.nan, 0.1)], nanoseconds(1.0))
@@ -361,7 +361,7 @@ def test_an_obstacle_whose_edge_the_lens_can_not_tell_counts_as_close() -> None:
     assert law.step(nanoseconds(1.2)).left < 0.0, "away from it"
 
 
-def test_of_the_phases_that_a_law_ends_in_none_is_reached_while_it_is_blind() -> None:
+def test_no_law_reaches_a_final_phase_while_blind() -> None:
     avoid, flow = AvoidLaw(1.0), FlowLaw()
     for law in (avoid, flow):
         law.feedback(state(1.0, velocity_m_s=(2.0, 0.0, 0.0)))

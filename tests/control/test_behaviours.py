@@ -1,4 +1,4 @@
-"""Behaviours flown by the whole of Skyloop in simulated time, one or two seeds each; the script flies all."""
+"""Behaviours flown by all of Skyloop in simulated time, with one or two seeds each; the script flies all seeds."""
 
 from __future__ import annotations
 
@@ -50,20 +50,20 @@ from tests.support.scripted_proxy import WAIT_S, flown, scripted
 
 @pytest.fixture(scope="module")
 def script() -> Iterator[ModuleType]:
-    """The script that measures."""
+    """The measuring script."""
     path = Path(__file__).parents[2] / "scripts" / "behaviours.py"
     spec = importlib.util.spec_from_file_location("behaviours", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(path.parent))  # it has modules beside it
+        patch.syspath_prepend(str(path.parent))  # it imports modules beside it
         spec.loader.exec_module(module)
         yield module
 
 
-def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back() -> None:
-    """It was still down in its own mind, and landed the vehicle from any height, wherever that was."""
+def test_a_landing_taken_over_restarts_when_control_returns() -> None:
+    """The law stayed in phase DOWN and landed the vehicle from any height, wherever it was."""
     with rehearse("sim://?world=empty&cameras=bottom&fps=10") as drone:
         drone.takeoff()
         pilot = LandOnMarker(drone)
@@ -77,7 +77,7 @@ def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back(
         assert not pilot.landed
         assert drone.feedback().state is FlightState.FLYING
         drone.land()
-        assert pilot.run(seconds=5.0).reason == "stopped", "others have landed it"
+        assert pilot.run(seconds=5.0).reason == "stopped", "another client landed it"
         assert not pilot.landed
 
 
@@ -97,7 +97,7 @@ def test_a_landing_that_others_took_over_does_not_go_on_where_they_give_it_back(
         ("approach", 1, 1.0),
     ],
 )
-def test_does_what_it_should(script: ModuleType, name: str, seed: int, gust: float) -> None:
+def test_reaches_its_goal(script: ModuleType, name: str, seed: int, gust: float) -> None:
     flight = script.GOALS[name].fly(seed, gust)
     assert flight.good, flight.note
     assert flight.seconds > 5.0
@@ -110,7 +110,7 @@ def test_follows_in_gusts(script: ModuleType) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["servo", "orbit", "avoid", "flow"])
-def test_does_what_it_should_in_calm_air(script: ModuleType, name: str) -> None:
+def test_reaches_its_goal_in_calm_air(script: ModuleType, name: str) -> None:
     flight = script.GOALS[name].fly(1, 0.0)
     assert flight.good, flight.note
 
@@ -121,7 +121,7 @@ def test_two_flights_with_the_same_seed_are_the_same(script: ModuleType) -> None
     assert first == second
 
 
-def test_summary_says_what_was_missed(script: ModuleType) -> None:
+def test_summary_lists_what_was_missed(script: ModuleType) -> None:
     good, bad = script.Flight(True, 0.1, 10.0), script.Flight(False, math.nan, 90.0, "lost")
     text = script.summary(script.GOALS["landing"], 0.0, [good] * 17 + [bad] * 3)
     assert "17 of 20" in text
@@ -159,7 +159,7 @@ def test_a_landing_that_finds_nothing_ends_hovering_high_and_warns(tmp_path: Pat
         assert (drone.feedback().altitude_m or 0.0) > 2.2
 
 
-def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleType) -> None:
+def test_a_missing_gate_is_searched_for_but_not_flown_to(script: ModuleType) -> None:
     nowhere = GateKind("none", (0, 255, 255))
     with rehearse("sim://?world=gates&cameras=front&fps=15&wind=0") as drone:
         drone.takeoff()
@@ -175,13 +175,13 @@ def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleTyp
         assert pilot.passed == 0
         assert not pilot.done
         assert math.dist(after[:2], before[:2]) < 0.3, "it turns on the spot"
-        assert "gates: searching the gate" in told
+        assert "gates: searching for the gate" in told
         assert drawn
         assert drawn[-1].source == "gates"
 
 
 @pytest.mark.slow
-def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
+def test_when_frames_stop_it_hovers_and_reports_it() -> None:
     with rehearse("sim://?world=gates&cameras=front&fps=15&wind=0", radio=Radio(drop=0.0)) as drone:
         drone.takeoff()
         told: list[tuple[str, Severity]] = []
@@ -199,7 +199,7 @@ def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
         assert ("gates: frames arrive again", Severity.INFO) in told
 
 
-def test_a_landing_goes_on_after_a_link_that_was_down_for_a_moment() -> None:
+def test_a_landing_continues_after_a_short_loss_of_the_link() -> None:
     with scripted() as proxy, flown(proxy) as drone:
         proxy.state = FlightState.FLYING
         landing = LandOnMarker(drone)
@@ -217,8 +217,8 @@ def test_a_landing_goes_on_after_a_link_that_was_down_for_a_moment() -> None:
         proxy.state = FlightState.LANDED
 
 
-def test_what_holds_its_place_by_the_ground_hovers_while_it_does_not_see_it() -> None:
-    """It went level, and kept whatever speed it had, although the vehicle can brake by itself."""
+def test_flow_hover_hovers_while_the_ground_is_out_of_view() -> None:
+    """It went level and kept its speed, although the vehicle can brake."""
     with ExitStack() as stack:
         proxy = stack.enter_context(scripted())
         proxy.capabilities = msgspec.structs.replace(proxy.capabilities, cameras=(BOTTOM_CAMERA.info(),))
@@ -244,7 +244,7 @@ def test_what_holds_its_place_by_the_ground_hovers_while_it_does_not_see_it() ->
         assert "flow hover: lost the ground: hovering" in warnings
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with rehearse("sim://?world=empty&cameras=front&native=velocity,hover,takeoff,land") as drone:
         with pytest.raises(UsageError, match="no gate"):
             FlyThroughGates(drone, [])
@@ -252,7 +252,7 @@ def test_what_makes_no_sense_is_refused() -> None:
             FlyThroughGates(drone, [GateKind("grey", (100, 100, 100))])
         with pytest.raises(UsageError, match="give a Course"):
             FlyThroughGates(drone, settings=CourseSettings())
-        with pytest.raises(UsageError, match="not by GateSettings"):
+        with pytest.raises(UsageError, match="not GateSettings"):
             FlyThroughGates(drone, RACE_TRACK, settings=GateSettings())
         with pytest.raises(UnknownNameError, match="bottom"):
             LandOnMarker(drone)
@@ -266,7 +266,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         assert FlowHover(drone).off_m is None
 
 
-def test_a_course_is_that_of_a_world_by_the_names_of_its_gates() -> None:
+def test_a_course_is_built_from_a_world_by_gate_names() -> None:
     course = course_in(geometry_of(load_world("race0")))
     assert course.gates == RACE_TRACK.gates
     assert np.array(course.places) == pytest.approx(np.array(RACE_TRACK.places), abs=0.002)
@@ -274,14 +274,14 @@ def test_a_course_is_that_of_a_world_by_the_names_of_its_gates() -> None:
     assert course.start == RACE_TRACK.start
     with pytest.raises(UsageError, match="has no gate 1, gate 2"):
         course_in(geometry_of(load_world("empty")))
-    with pytest.raises(UsageError, match="each needs one"):
+    with pytest.raises(UsageError, match="each gate needs one place"):
         replace(RACE_TRACK, places=RACE_TRACK.places[:1])
     with pytest.raises(UsageError, match="has no start"):
         course_in(msgspec.structs.replace(geometry_of(load_world("race0")), starts=()))
 
 
 @pytest.mark.slow
-def test_a_course_whose_gates_are_not_seen_ends_with_a_warning() -> None:
+def test_a_course_without_visible_gates_ends_with_a_warning() -> None:
     with rehearse("sim://?world=empty&cameras=fpv&fps=15&wind=0") as drone:
         told: list[tuple[str, Severity]] = []
         drone.takeoff()

@@ -61,7 +61,7 @@ def motion(at_s: float = 1.0, **values: Any) -> Motion:
 @pytest.mark.parametrize(
     "path",
     [walk(4.0, 0.0), walk(6.5, 0.5), walk(4.0, 0.0, 1.5), walk(4.0, 0.0, 0.8, 0.8), ring(3.0, 1.3)],
-    ids=["stands", "stands farther off", "goes away", "goes across", "goes round"],
+    ids=["stands", "stands further off", "goes away", "goes across", "goes round"],
 )
 @pytest.mark.parametrize("relative", [False, True], ids=["velocity", "attitude"])
 def test_the_distance_is_kept(path: Path, relative: bool) -> None:
@@ -69,14 +69,14 @@ def test_the_distance_is_kept(path: Path, relative: bool) -> None:
     world.run(16.0)
     errors = [one - 4.0 for one in settled(world.ranges, 6.0)]
     assert rms(errors) < (0.8 if relative else 0.5)
-    assert rms(settled(world.azimuths, 4.0)) < 0.2, "it stays in the middle of the image"
+    assert rms(settled(world.azimuths, 4.0)) < 0.2, "the target stays in the middle of the image"
     assert set(world.phases[1:]) == {TargetPhase.FOLLOWING}
     kinds = {type(one) for one in world.commands}
     assert kinds == {Attitude if relative else Velocity}
 
 
 @pytest.mark.parametrize("distance_m", [3.0, 5.0, 7.0])
-def test_the_distance_is_the_one_that_was_set(distance_m: float) -> None:
+def test_the_distance_is_the_configured_one(distance_m: float) -> None:
     world = ChaseWorld(walk(5.0, 0.0, 0.0, 0.3), settings=ChaseSettings(distance_m=distance_m))
     world.run(14.0)
     assert rms([one - distance_m for one in settled(world.ranges, 9.0)]) < 0.5
@@ -85,7 +85,7 @@ def test_the_distance_is_the_one_that_was_set(distance_m: float) -> None:
 
 
 @pytest.mark.parametrize("bearing_deg", [180, 90, -90, 135, 0])
-def test_it_comes_round_to_a_bearing(bearing_deg: int) -> None:
+def test_it_moves_around_to_a_bearing(bearing_deg: int) -> None:
     bearing = math.radians(bearing_deg)
     world = ChaseWorld(walk(4.0, 0.0, 0.4, 0.8), settings=ChaseSettings(bearing_rad=bearing))
     world.run(25.0)
@@ -96,7 +96,7 @@ def test_it_comes_round_to_a_bearing(bearing_deg: int) -> None:
     assert min(world.ranges) > 2.0
 
 
-def test_a_thing_that_stands_has_no_side() -> None:
+def test_a_standing_target_has_no_side() -> None:
     world = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(bearing_rad=math.pi), seed=None)
     world.run(8.0)
     assert world.places[-1][:2] == pytest.approx([0.0, 0.0], abs=0.3)
@@ -104,7 +104,7 @@ def test_a_thing_that_stands_has_no_side() -> None:
 
 @pytest.mark.parametrize("orbit_m_s", [0.8, -0.8], ids=["counter-clockwise", "clockwise"])
 @pytest.mark.parametrize("path", [walk(4.0, 0.0), walk(4.0, 0.0, 0.5, 0.0)], ids=["stands", "walks"])
-def test_an_orbit_goes_round_at_the_distance(orbit_m_s: float, path: Path) -> None:
+def test_an_orbit_circles_at_the_distance(orbit_m_s: float, path: Path) -> None:
     world = ChaseWorld(path, mode=FollowMode.ORBIT, settings=ChaseSettings(orbit_m_s=orbit_m_s))
     world.run(24.0)
     assert rms([one - 4.0 for one in settled(world.ranges, 6.0)]) < 0.5
@@ -113,7 +113,7 @@ def test_an_orbit_goes_round_at_the_distance(orbit_m_s: float, path: Path) -> No
     assert world.phases[-1] is TargetPhase.ORBITING
 
 
-def test_an_orbit_by_attitude_goes_round_too() -> None:
+def test_an_orbit_by_attitude_circles_too() -> None:
     world = ChaseWorld(walk(4.0, 0.0), mode=FollowMode.ORBIT, relative=True)
     world.run(24.0)
     assert rms([one - 4.0 for one in settled(world.ranges, 6.0)]) < 1.0
@@ -123,21 +123,21 @@ def test_an_orbit_by_attitude_goes_round_too() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("aside", [0.0, 0.5])
-def test_it_never_comes_too_near_to_what_walks_towards_it(seed: int, aside: float) -> None:
+def test_it_never_comes_too_near_to_an_approaching_target(seed: int, aside: float) -> None:
     world = ChaseWorld(walk(7.0, aside, -1.5, 0.0), seed=seed)
     world.run(10.0)
     assert min(world.ranges) > 2.0 - 0.3
 
 
-def test_it_never_flies_into_what_stops_suddenly() -> None:
+def test_it_never_flies_into_a_target_that_stops_suddenly() -> None:
     world = ChaseWorld(lambda t: (4.0 + 2.0 * min(t, 6.0), 0.0))
     world.run(12.0)
-    assert min(world.ranges) > 1.4, "from 2 m/s at once; it takes a moment to be believed"
+    assert min(world.ranges) > 1.4, "from 2 m/s at once; the filter needs a moment"
     assert rms([one - 4.0 for one in settled(world.ranges, 10.0)]) < 0.4
 
 
 @pytest.mark.parametrize("aside", [0.4, -0.4])
-def test_it_leaves_the_way_of_what_comes_by(aside: float) -> None:
+def test_it_makes_way_for_a_passing_target(aside: float) -> None:
     law, estimator = still_law()
     coming = replace(estimator.at(nanoseconds(1.0)), velocity=np.array([-1.5, 0.0]))
 
@@ -155,7 +155,7 @@ def test_it_leaves_the_way_of_what_comes_by(aside: float) -> None:
 
 
 def pushed(place: tuple[float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
-    """How much faster to the front and to the left it flies because of somebody else at a place, after a second."""
+    """Return the change of forward and left speed after a second, caused by a person at a place."""
     found = []
     for beside in (False, True):
         law, estimator = still_law()
@@ -172,16 +172,16 @@ def pushed(place: tuple[float, float], velocity: tuple[float, float] = (0.0, 0.0
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_it_keeps_clear_of_others(side: float) -> None:
-    assert pushed((0.0, side))[1] * side < -0.1, "who stands beside it"
-    assert pushed((2.0, 0.3 * side), (-1.5, 0.0))[1] * side < -0.1, "who comes"
-    assert pushed((-1.0, 0.0))[0] > 0.1, "who stands behind it"
-    assert pushed((0.0, 5.0 * side)) == pytest.approx((0.0, 0.0), abs=1e-6), "who is far off"
-    assert pushed((-2.0, side), (-1.5, 0.0)) == pytest.approx((0.0, 0.0), abs=0.05), "who goes away"
-    assert math.isfinite(sum(pushed((0.0, 0.0)))), "who is where it is"
+    assert pushed((0.0, side))[1] * side < -0.1, "a person standing beside it"
+    assert pushed((2.0, 0.3 * side), (-1.5, 0.0))[1] * side < -0.1, "an approaching person"
+    assert pushed((-1.0, 0.0))[0] > 0.1, "a person standing behind it"
+    assert pushed((0.0, 5.0 * side)) == pytest.approx((0.0, 0.0), abs=1e-6), "a distant person"
+    assert pushed((-2.0, side), (-1.5, 0.0)) == pytest.approx((0.0, 0.0), abs=0.05), "a departing person"
+    assert math.isfinite(sum(pushed((0.0, 0.0)))), "a person at its own place"
 
 
-def test_of_somebody_whose_place_is_not_certain_it_stays_farther_off() -> None:
-    """Who has gone out of view may have turned, or stopped."""
+def test_it_stays_further_from_a_person_at_an_uncertain_place() -> None:
+    """A person out of view may have turned or stopped."""
     law, estimator = still_law(away=(8.0, 0.0))
     other = replace(estimator.at(nanoseconds(1.0)), foot=np.array([2.0, 1.9, 0.0]))
     found = []
@@ -196,12 +196,12 @@ def test_of_somebody_whose_place_is_not_certain_it_stays_farther_off() -> None:
     assert found[1] < found[0] - 0.1
 
 
-def test_of_somebody_who_comes_straight_it_keeps_the_side_that_it_took() -> None:
+def test_it_keeps_its_side_of_a_person_who_comes_head_on() -> None:
     law, estimator = still_law(away=(8.0, 0.0))
     sides = []
     for n in range(20):
         at = motion(1.0 + n * PERIOD_S)
-        aside = 0.3 if n < 3 else 0.15 * (-1.0) ** n  # as noise has it
+        aside = 0.3 if n < 3 else 0.15 * (-1.0) ** n  # alternating, as noise would
         other = still_law(at_s=at.at_ns / 1e9, away=(3.0 - n * 0.1, 0.0))[1].at(at.at_ns)
         other = replace(other, foot=np.array([3.0 - n * 0.1, -aside, 0.0]), velocity=np.array([-1.5, 0.0]))
         command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns, [other])
@@ -210,7 +210,7 @@ def test_of_somebody_who_comes_straight_it_keeps_the_side_that_it_took() -> None
     assert min(sides[3:]) > 0.1
 
 
-def test_the_first_set_point_is_one_that_the_vehicle_can_fly_on_from() -> None:
+def test_the_first_set_point_starts_from_the_vehicles_velocity() -> None:
     for speed in (0.0, 1.0):
         law, estimator = still_law(away=(8.0, 0.0))
         at = motion(velocity=np.array([speed, 0.0, 0.0]))
@@ -219,7 +219,7 @@ def test_the_first_set_point_is_one_that_the_vehicle_can_fly_on_from() -> None:
         assert command.forward == pytest.approx(speed, abs=0.05)
 
 
-def test_limits_may_be_changed_in_flight_without_a_step() -> None:
+def test_limits_can_change_in_flight_without_a_step() -> None:
     world = ChaseWorld(walk(4.0, 0.0, 1.5))
     world.run(5.0)
     world.law.settings = replace(world.law.settings, acceleration_m_s2=1.0)
@@ -229,33 +229,33 @@ def test_limits_may_be_changed_in_flight_without_a_step() -> None:
 
 
 @pytest.mark.parametrize("leash_m", [1.0, 3.0])
-def test_a_leash_is_not_left(leash_m: float) -> None:
+def test_it_stays_within_a_leash(leash_m: float) -> None:
     world = ChaseWorld(walk(4.0, 0.0, 0.6, 0.3), settings=ChaseSettings(leash_m=leash_m))
     world.run(14.0)
     out = [float(np.hypot(*place[:2])) for place in world.places]
     assert max(out) < leash_m + 0.4
     assert out[-1] > leash_m - 0.4
     assert world.law.held_by == "leash"
-    assert abs(world.azimuths[-1]) < 0.2, "it goes on to turn to the target"
+    assert abs(world.azimuths[-1]) < 0.2, "it keeps turning to the target"
     free = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(leash_m=leash_m))
     free.run(4.0)
     assert free.law.held_by == ""
 
 
-def test_a_leash_is_by_the_position_where_that_is_known() -> None:
-    """A velocity that is off by 5 cm/s led 8 m away on a leash of 5 m."""
+def test_a_leash_uses_the_position_if_known() -> None:
+    """A velocity error of 5 cm/s led it 8 m away on a leash of 5 m."""
     world = ChaseWorld(walk(8.0, 0.0), settings=ChaseSettings(leash_m=2.0), drift_m_s=-0.1)
     world.run(40.0)
     assert max(float(np.hypot(*place[:2])) for place in world.places) < 2.4
     assert world.law.held_by == "leash"
 
 
-def test_a_leash_is_not_left_to_make_way_either() -> None:
-    """Somebody who walks up from behind pushed it out beyond the leash."""
+def test_it_stays_within_a_leash_when_making_way() -> None:
+    """A person walking up from behind pushed it beyond the leash."""
 
     def behind(now_ns: int) -> list[TargetState]:
         time_s = seconds(now_ns) - 1.0
-        x, speed = (-2.5 + 0.5 * time_s, 0.5) if time_s < 8.6 else (1.8, 0.0)  # it stops beside where the leash ends
+        x, speed = (-2.5 + 0.5 * time_s, 0.5) if time_s < 8.6 else (1.8, 0.0)  # stops beside the end of the leash
         return [TargetState(now_ns, np.array([x, 0.0, 0.0]), np.array([speed, 0.0]), 1.75, 0.1, 5.0, 0.1)]
 
     world = ChaseWorld(walk(8.0, 0.0), settings=ChaseSettings(leash_m=2.0), others=behind)
@@ -263,7 +263,7 @@ def test_a_leash_is_not_left_to_make_way_either() -> None:
     assert max(float(np.hypot(*place[:2])) for place in world.places) < 2.2
 
 
-def test_to_look_is_to_stay_and_to_turn() -> None:
+def test_look_mode_stays_and_turns() -> None:
     world = ChaseWorld(walk(3.0, -2.0, 0.0, 0.7), mode=FollowMode.LOOK)
     world.run(8.0)
     assert world.places[-1][:2] == pytest.approx([0.0, 0.0], abs=1e-9)
@@ -272,14 +272,14 @@ def test_to_look_is_to_stay_and_to_turn() -> None:
     assert world.phases[-1].value == TargetPhase.WATCHING.value
 
 
-def test_to_look_by_attitude_is_to_stay_level() -> None:
+def test_look_mode_by_attitude_stays_level() -> None:
     world = ChaseWorld(walk(3.0, -1.0, 0.0, 0.4), mode=FollowMode.LOOK, relative=True)
     world.run(4.0)
     assert all(one.roll == 0.0 == one.pitch for one in world.commands if isinstance(one, Attitude))
     assert rms(settled(world.azimuths, 2.0)) < 0.15
 
 
-def test_the_mode_may_be_changed_in_flight() -> None:
+def test_the_mode_can_change_in_flight() -> None:
     world = ChaseWorld(walk(4.0, 0.0))
     world.run(2.0)
     world.law.mode = FollowMode.ORBIT
@@ -307,7 +307,7 @@ def test_set_points_are_within_the_limits() -> None:
     assert max(abs(one.up) for one in commands) <= 0.3 + 1e-9
     assert max(abs(one.yaw_rate) for one in commands) <= 0.9 + 1e-9
     steps = [math.hypot(b.forward - a.forward, b.left - a.left) for a, b in itertools.pairwise(commands)]
-    assert max(steps) <= 4 * 2.0 * PERIOD_S + 1e-6  # set-points lead the velocity, to change it
+    assert max(steps) <= 4 * 2.0 * PERIOD_S + 1e-6  # set-points lead the velocity in order to change it
 
 
 def test_the_tilt_is_within_the_limit() -> None:
@@ -326,7 +326,7 @@ def first(world: ChaseWorld, phase: TargetPhase) -> float:
 
 
 @pytest.mark.parametrize("relative", [False, True], ids=["velocity", "attitude"])
-def test_a_target_that_is_lost_is_waited_for_looked_for_and_given_up(relative: bool) -> None:
+def test_a_lost_target_is_awaited_searched_for_and_given_up(relative: bool) -> None:
     settings = ChaseSettings(predict_s=2.0, hover_s=3.0, give_up_s=12.0)
     world = ChaseWorld(walk(4.0, 0.0, 0.0, 1.0), settings=settings, hidden=after(5.0), relative=relative)
     world.run(20.0)
@@ -352,22 +352,22 @@ def test_a_target_that_is_lost_is_waited_for_looked_for_and_given_up(relative: b
         if phase is TargetPhase.GIVEN_UP:
             assert turn(command) == 0.0
         if phase in LOSSES - {TargetPhase.PREDICTING} and isinstance(command, Attitude):
-            assert math.hypot(command.roll, command.pitch) < 0.05, "no more than brings it to rest"
+            assert math.hypot(command.roll, command.pitch) < 0.05, "only what brings it to rest"
     assert translation(world.commands[-1]) < 0.01
 
 
-def test_while_it_hovers_it_looks_to_both_sides_of_where_the_target_should_be() -> None:
+def test_while_hovering_it_looks_to_both_sides_of_the_expected_place() -> None:
     settings = ChaseSettings(predict_s=1.0, hover_s=6.0, search_rad_s=0.7, sweep_rad=0.6)
     world = ChaseWorld(walk(4.0, 0.0), settings=settings, hidden=after(3.0), seed=None)
     world.run(9.0)
     azimuths = [-one for one, phase in zip(world.azimuths, world.phases, strict=True) if phase is TargetPhase.HOVERING]
     assert max(map(abs, azimuths)) == pytest.approx(0.6, abs=0.12)
-    assert min(max(azimuths), -min(azimuths)) == pytest.approx(0.24, abs=0.1), "less far to the other side"
+    assert min(max(azimuths), -min(azimuths)) == pytest.approx(0.24, abs=0.1), "a smaller angle to the other side"
     passed = [n for n, (a, b) in enumerate(itertools.pairwise(azimuths)) if a * b < 0.0]
-    assert len(passed) >= 3, "to and fro"
+    assert len(passed) >= 3, "back and forth"
 
 
-def test_somebody_who_may_be_the_lost_target_is_looked_at() -> None:
+def test_it_turns_to_a_possible_match_of_the_lost_target() -> None:
     law, estimator = still_law()
     other = still_law(away=(4.0, 2.5))[1]
     for hover_s, phase in ((10.0, TargetPhase.HOVERING), (0.1, TargetPhase.SEARCHING)):
@@ -393,20 +393,20 @@ def translation(command: object) -> float:
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.5])
-def test_it_does_not_fly_towards_where_the_target_is_hidden(speed: float) -> None:
-    """What hides it may be in the way: the set-point has no part towards it, and fades."""
+def test_it_does_not_fly_towards_a_hidden_target(speed: float) -> None:
+    """The occluder may be in the way: the set-point has no component towards it, and fades."""
     world = ChaseWorld(walk(4.0, 0.0, speed, 0.5), hidden=after(5.0))
     world.run(9.0)
     lost = [n for n, phase in enumerate(world.phases) if phase is TargetPhase.PREDICTING]
     towards = [command.forward for n in lost[10:] if isinstance(command := world.commands[n], Velocity)]
-    assert max(towards) < 0.1, "once the limit of the acceleration lets it brake"
+    assert max(towards) < 0.1, "once the acceleration limit lets it brake"
     sizes = [translation(world.commands[n]) for n in lost]
     assert sizes[-1] < 0.25 * sizes[0] + 0.05
     hovering = [n for n, phase in enumerate(world.phases) if phase is TargetPhase.HOVERING]
     assert all(translation(world.commands[n]) < 1e-6 for n in hovering[PER_S // 2 :])
 
 
-def test_a_target_that_comes_back_is_followed_again() -> None:
+def test_a_returning_target_is_followed_again() -> None:
     world = ChaseWorld(walk(4.0, 0.0, 0.0, 0.5), hidden=lambda t: 5.0 <= t < 7.0)
     world.run(14.0)
     assert TargetPhase.PREDICTING in world.phases
@@ -414,7 +414,7 @@ def test_a_target_that_comes_back_is_followed_again() -> None:
     assert world.ranges[-1] == pytest.approx(4.0, abs=0.5)
 
 
-def test_a_target_that_was_never_seen_is_looked_for_on_the_spot() -> None:
+def test_an_unseen_target_is_searched_for_on_the_spot() -> None:
     world = ChaseWorld(walk(-4.0, 0.0), hidden=lambda t: True)
     world.run(4.0)
     assert set(world.phases) == {TargetPhase.LOOKING}
@@ -451,7 +451,7 @@ def test_it_does_not_climb_out_of_sight_of_the_target() -> None:
     assert 1.5 < world.places[-1][2] < 0.86 + 4.4 * math.tan(0.25) + 0.1
 
 
-def test_without_a_height_above_the_ground_it_is_left_as_it_is() -> None:
+def test_without_a_height_above_the_ground_the_height_is_left_alone() -> None:
     world = ChaseWorld(walk(4.0, 0.0, 0.3), altitude=False, settings=ChaseSettings(height_m=2.0))
     world.run(4.0)
     assert all(one.up == 0.0 for one in world.commands if isinstance(one, Velocity))
@@ -501,7 +501,7 @@ def test_a_target_at_its_own_place_gives_a_finite_set_point() -> None:
         ({"give_up_s": -1.0}, "give_up_s is -1.0"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(given: dict[str, Any], why: str) -> None:
+def test_invalid_settings_are_refused(given: dict[str, Any], why: str) -> None:
     with pytest.raises(UsageError, match=why):
         ChaseSettings(**given)
 
@@ -509,12 +509,12 @@ def test_settings_that_make_no_sense_are_refused(given: dict[str, Any], why: str
 @pytest.mark.parametrize(
     "given", [{"bearing_rad": -3.0}, {"bearing_rad": 0}, {"orbit_m_s": -1.0}, {"velocity_gain": 0.0}, {"leash_m": 5}]
 )
-def test_settings_that_make_sense_are_taken(given: dict[str, Any]) -> None:
+def test_valid_settings_are_accepted(given: dict[str, Any]) -> None:
     settings = ChaseSettings(**given)
     assert all(getattr(settings, name) == value for name, value in given.items())
 
 
-def test_settings_are_brought_within_the_drones_limits() -> None:
+def test_settings_are_clamped_to_the_drones_limits() -> None:
     limits = {"limits.speed": 1.5, "limits.climb": 0.3, "limits.yaw_rate": 0.9, "limits.altitude": 0.7}
     found = ChaseSettings().within(limits | {"limits.tilt": 0.21, "autopilot.kind": "sim"})
     assert (found.speed_m_s, found.climb_m_s, found.turn_rad_s) == (1.5, 0.3, 0.9)
@@ -524,7 +524,7 @@ def test_settings_are_brought_within_the_drones_limits() -> None:
     assert ChaseSettings().within(wide) == ChaseSettings().within({}) == ChaseSettings()
 
 
-def test_a_vehicle_that_may_lean_less_is_not_counted_on_for_more() -> None:
-    """Else its weak answer would be taken for a trim of its loop, and it would overshoot for seconds."""
+def test_the_model_knows_a_smaller_lean_limit() -> None:
+    """Otherwise the weak response counts as a trim of its loop, and it overshoots for seconds."""
     for lean_rad, most in ((0.5, 0.5), (0.21, 0.21)):
         assert ChaseLaw(ChaseSettings(lean_rad=lean_rad))._response.settings.tilt_rad == most

@@ -1,4 +1,4 @@
-"""The loop that runs a controller, against a proxy that is played by the test."""
+"""The loop that runs a controller, against a proxy scripted by the test."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 
 class Noting(Controller):
-    """Notes what it is called with, and on which thread."""
+    """Records its calls and their threads."""
 
     def __init__(self, drone: Drone) -> None:
         super().__init__(drone)
@@ -47,12 +47,12 @@ class Noting(Controller):
 
 
 class Looking(Controller):
-    """Wants frames only."""
+    """Handles only frames."""
 
     def on_frame(self, frame: Frame) -> None: ...
 
 
-def test_callbacks_come_on_the_thread_that_runs(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_callbacks_run_on_the_thread_that_called_run(proxy: ScriptedProxy, drone: Drone) -> None:
     controller = Noting(drone)
     sending = background(
         lambda: drone.wait(lambda _: proxy.server.subscribers(video("front")) == 1, WAIT_S), lambda: proxy.frame(1)
@@ -140,7 +140,7 @@ def test_a_slow_callback_gets_the_newest_and_is_an_overrun(proxy: ScriptedProxy,
 
 
 @pytest.mark.parametrize("airborne", [True, False])
-def test_an_exception_makes_it_hover_and_comes_out(proxy: ScriptedProxy, drone: Drone, airborne: bool) -> None:
+def test_an_exception_makes_it_hover_and_propagates(proxy: ScriptedProxy, drone: Drone, airborne: bool) -> None:
     class Wrong(Controller):
         def on_feedback(self, feedback: Feedback) -> None:
             raise ZeroDivisionError("a mistake")
@@ -158,7 +158,7 @@ def test_an_exception_makes_it_hover_and_comes_out(proxy: ScriptedProxy, drone: 
         controller.run(seconds=WAIT_S)
 
 
-def test_a_take_over_is_told_once_and_the_run_goes_on(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_takeover_is_reported_once_and_the_run_continues(proxy: ScriptedProxy, drone: Drone) -> None:
     class Flying(Controller):
         def __init__(self, drone: Drone) -> None:
             super().__init__(drone)
@@ -192,7 +192,7 @@ def test_a_take_over_is_told_once_and_the_run_goes_on(proxy: ScriptedProxy, dron
     assert controller.refused > 3
 
 
-def test_flying_without_ever_asking_for_the_authority_is_an_error(proxy: ScriptedProxy) -> None:
+def test_flying_without_ever_acquiring_authority_is_an_error(proxy: ScriptedProxy) -> None:
     class Flying(Controller):
         def on_feedback(self, feedback: Feedback) -> None:
             self.drone.hover()
@@ -201,7 +201,7 @@ def test_flying_without_ever_asking_for_the_authority_is_an_error(proxy: Scripte
         Flying(drone).run(seconds=WAIT_S)
 
 
-def test_a_camera_of_ones_choice(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_a_chosen_camera(proxy: ScriptedProxy, drone: Drone) -> None:
     class Down(Noting):
         camera = "bottom"
 
@@ -240,8 +240,8 @@ class Steering(Controller):
 def test_a_misspelt_callback_is_named(drone: Drone) -> None:
     summary = Misspelt(drone).run(seconds=0)
     assert summary.notes == (
-        "Misspelt.onframe is called by nobody: is on_frame meant?",
-        "Misspelt.on_feedbacks is called by nobody: is on_feedback meant?",
+        "Misspelt.onframe is never called: did you mean on_frame?",
+        "Misspelt.on_feedbacks is never called: did you mean on_feedback?",
     )
     assert str(summary).splitlines()[1] == f"note: {summary.notes[0]}"
     nothing = "Empty has none of on_feedback, on_frame, on_result: nothing was called"
@@ -250,24 +250,24 @@ def test_a_misspelt_callback_is_named(drone: Drone) -> None:
 
 
 @pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.FLYING])
-def test_a_forgotten_take_off_is_named(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
+def test_a_forgotten_take_off_is_reported(proxy: ScriptedProxy, drone: Drone, state: FlightState) -> None:
     proxy.state = state
     drone.wait(lambda feedback: feedback.state is state, WAIT_S)
     notes = Steering(drone).run(seconds=WAIT_S, until=lambda: Velocity(forward=0.1) in proxy.actions()).notes
     if state is FlightState.FLYING:
         assert notes == ()
     else:
-        assert notes == ("it never took off: set-points went to a drone on the ground; call drone.takeoff() before",)
+        assert notes == ("the drone never took off, so its set-points had no effect: call drone.takeoff() first",)
 
 
-def test_limited_set_points_are_told_by_limit_and_number(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_limited_set_points_are_reported_by_limit_and_number(proxy: ScriptedProxy, drone: Drone) -> None:
     def limited(asked: float, app: str = drone._state.app, limit: str = "limits.yaw_rate") -> None:
         proxy.event(EventKind.COMMAND_CLAMPED, "limited", app, limit=limit, asked=asked, applied=1.75)
 
     def known(asked: float) -> bool:
         return any(event.data.get("asked") == asked for event in drone.recent_events())
 
-    limited(50.0)  # before the run, which it is not about
+    limited(50.0)  # before the run, so not part of the summary
     drone.wait(lambda _: known(50.0), WAIT_S)
 
     class Turning(Controller):
@@ -292,7 +292,7 @@ class Detector:
         return "nothing was found"
 
 
-def test_detectors_that_found_nothing_are_asked_wherever_the_controller_has_them(
+def test_detectors_without_findings_explain_themselves_wherever_they_are(
     drone: Drone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Own(Controller):

@@ -1,4 +1,4 @@
-"""The law of a course with a map in a kinematic world: gates and poles stand elsewhere than the map says."""
+"""The law of a course with a map in a kinematic world, where gates and poles are off their places on the map."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ LOOSE = replace(CourseSettings(), map_m=0.25)
 
 
 class World:
-    """A vehicle that flies what it is asked for, with a lag; everything is ``off`` from where the map says."""
+    """A vehicle that follows set-points with a lag; everything is shifted by ``off`` from the map."""
 
     def __init__(self, off: tuple[float, float] = (0.0, 0.0), settings: CourseSettings | None = None) -> None:
         self.off = np.array([*off, 0.0])
         self.position, self.yaw, self.velocity = np.array([0.0, 0.0, 1.0]), 0.0, Velocity()
         self.now_ns, self.flown = NS_PER_S, np.zeros(3)
         self.law = CourseLaw(GATES, (1.2, 1.2), POLES, settings=settings)
-        self.crossed: list[tuple[int, float]] = []  # gate, how far off its middle
+        self.crossed: list[tuple[int, float]] = []  # gate, distance from its middle
         self.nearest_m = math.inf  # to a pole
         self.passed = 0
 
@@ -87,7 +87,7 @@ class World:
 @pytest.mark.parametrize(
     ("off", "settings"), [((0.0, 0.0), None), ((0.2, -0.15), None), ((0.3, 0.25), LOOSE), ((-0.2, -0.3), LOOSE)]
 )
-def test_flies_through_all_gates_round_the_poles(off: tuple[float, float], settings: CourseSettings | None) -> None:
+def test_flies_through_all_gates_around_the_poles(off: tuple[float, float], settings: CourseSettings | None) -> None:
     world = World(off, settings)
     for _ in range(1200):
         world.step()
@@ -99,7 +99,7 @@ def test_flies_through_all_gates_round_the_poles(off: tuple[float, float], setti
     assert world.law.stuck is None
 
 
-def test_a_gate_that_is_never_seen_is_not_flown_through() -> None:
+def test_an_unseen_gate_is_not_flown_through() -> None:
     world = World()
     for _ in range(3000):
         world.step(visible=False)
@@ -121,17 +121,17 @@ def test_a_gate_far_from_its_place_is_another_one() -> None:
     assert world.law.axis.along_m == pytest.approx(before.along_m, abs=0.1)
 
 
-def test_who_does_not_get_through_gives_up() -> None:
+def test_a_vehicle_that_does_not_get_through_gives_up() -> None:
     world = World()
     while world.law.phase is not GatePhase.PASSING:
         world.step()
     for _ in range(300):
-        world.velocity, world.flown = Velocity(), np.zeros(3)  # held by something
+        world.velocity, world.flown = Velocity(), np.zeros(3)  # blocked
         world.step(visible=False)
-    assert world.law.stuck == "it does not get through"
+    assert world.law.stuck == "the vehicle does not get through the gate"
 
 
-def test_before_feedback_it_stays() -> None:
+def test_it_stays_before_the_first_feedback() -> None:
     law = CourseLaw(GATES, (1.2, 1.2))
     assert law.step(NS_PER_S) == Velocity()
     law.see(np.array([3.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), Feedback(captured_ns=NS_PER_S), NS_PER_S)

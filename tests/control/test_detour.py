@@ -1,4 +1,4 @@
-"""Ways round posts and gates: as short as may be, and never nearer than they may be."""
+"""Ways around posts and gates: as short as possible, and never nearer than allowed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def distance(wall: Wall, place: Point) -> float:
     return math.dist(place, (x + share * (u - x), y + share * (v - y)))
 
 
-def test_where_nothing_stands_the_way_is_straight() -> None:
+def test_without_obstacles_the_way_is_straight() -> None:
     assert detour((0.0, 0.0), (3.0, 4.0), []) == [(3.0, 4.0)]
     assert detour((0.0, 0.0), (3.0, 4.0), [Wall((2.0, -2.0), (2.0, -2.0), 0.5)]) == [(3.0, 4.0)]
 
@@ -37,20 +37,20 @@ def test_a_post_is_passed_on_the_nearer_side() -> None:
     assert 4.0 < length((0.0, 0.0), way) < 4.2
 
 
-def test_a_gate_is_passed_round_its_end_and_not_through() -> None:
+def test_a_gate_is_passed_around_its_end() -> None:
     gate = Wall((2.0, -0.7), (2.0, 0.7), 0.5)
     way = detour((0.0, 0.3), (4.0, 0.3), [gate])
     assert way is not None
     assert max(y for _, y in way) > 1.1
 
 
-def test_who_is_shut_in_gets_no_way() -> None:
+def test_there_is_no_way_out_of_an_enclosure() -> None:
     corners = [(2.0, 2.0), (2.0, -2.0), (-2.0, -2.0), (-2.0, 2.0)]
     fence = [Wall(a, b, 0.3) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
     assert detour((0.0, 0.0), (5.0, 0.0), fence) is None
 
 
-def test_who_stands_too_near_may_leave() -> None:
+def test_a_start_too_near_may_leave() -> None:
     post = Wall((0.0, 0.0), (0.0, 0.0), 0.6)
     way = detour((0.3, 0.0), (-2.0, 0.0), [post])
     assert way is not None
@@ -58,7 +58,7 @@ def test_who_stands_too_near_may_leave() -> None:
 
 
 @given(PLACES, PLACES, st.lists(st.tuples(PLACES, PLACES, st.floats(0.1, 0.8)), max_size=5))
-def test_no_way_leads_nearer_than_it_may(start: Point, goal: Point, walls: list[tuple[Point, Point, float]]) -> None:
+def test_no_way_comes_nearer_than_allowed(start: Point, goal: Point, walls: list[tuple[Point, Point, float]]) -> None:
     all_walls = [Wall(*wall) for wall in walls]
     assume(all(distance(wall, place) > wall.reach_m + 0.03 for wall in all_walls for place in (start, goal)))
     way = detour(start, goal, all_walls)

@@ -34,13 +34,13 @@ def test_low_pass_of_arrays_starts_with_the_first() -> None:
     assert passing.step(1.0, 0.1) == 1.0
 
 
-def test_cutoff_is_where_three_decibels_are_lost() -> None:
+def test_the_cutoff_loses_three_decibels() -> None:
     low: LowPass[float] = LowPass.from_cutoff(2.0)
     seen = [low.step(math.sin(2 * math.pi * 2.0 * k * 1e-3), 1e-3) for k in range(4000)]
     assert max(seen[2000:]) == pytest.approx(1 / math.sqrt(2), abs=0.01)
 
 
-def test_complementary_takes_the_drift_out_and_keeps_the_quickness() -> None:
+def test_complementary_removes_the_drift_and_stays_fast() -> None:
     both = Complementary(1.0)
     assert both.step(1.0, None, 0.1) is None
     rng = np.random.default_rng(1)
@@ -56,11 +56,11 @@ def test_complementary_takes_the_drift_out_and_keeps_the_quickness() -> None:
     assert np.std(errors[1000:]) < 0.02, "a fifth of the measurement's noise"
     held = Complementary(1.0, 3.0)
     for _ in range(10):
-        held.step(0.5, None, 0.1)  # nothing is measured: the rate alone
+        held.step(0.5, None, 0.1)  # no measurement: the rate alone
     assert held.angle == pytest.approx(3.5 - 2 * math.pi)
 
 
-def test_median_drops_wild_ones() -> None:
+def test_median_drops_outliers() -> None:
     median = Median(3)
     assert [median.step(x) for x in (1.0, 99.0, 2.0, 3.0, -50.0, 4.0)] == [1.0, 1.0, 2.0, 3.0, 2.0, 3.0]
 
@@ -76,7 +76,7 @@ def test_median_drops_wild_ones() -> None:
         lambda: SetpointLimits(speed_m_s=0.0),
     ],
 )
-def test_what_makes_no_sense(make: object) -> None:
+def test_invalid_arguments(make: object) -> None:
     with pytest.raises(UsageError, match="must be"):
         make()  # type: ignore[operator]
 
@@ -88,7 +88,7 @@ def test_vectors() -> None:
 
 
 @given(st.one_of(st.floats(-1e6, 1e6), st.sampled_from([math.nan, math.inf, -math.inf])), st.floats(0.0, 100.0))
-def test_nothing_that_is_no_number_passes_a_clamp(value: float, longest: float) -> None:
+def test_nan_never_passes_a_clamp(value: float, longest: float) -> None:
     assert abs(clamped(value, longest)) <= longest
     assert clamped(math.nan, longest) == 0.0
     assert within(math.nan, 2.0, 3.0) == 2.0
@@ -104,7 +104,7 @@ LIMITS = SetpointLimits(1.0, 0.5, 0.8, acceleration_m_s2=2.0, climb_acceleration
         st.tuples(st.lists(st.floats(-50, 50), min_size=4, max_size=4), st.floats(0.0, 0.2)), min_size=1, max_size=20
     )
 )
-def test_set_points_keep_to_their_limits(wanted: list[tuple[list[float], float]]) -> None:
+def test_set_points_stay_within_their_limits(wanted: list[tuple[list[float], float]]) -> None:
     limiter, last = SetpointLimiter(LIMITS), None
     for values, dt in wanted:
         new = limiter.step(np.array(values), dt)
@@ -125,7 +125,7 @@ def test_one_nan_neither_passes_the_limiter_nor_stays_in_it() -> None:
     assert limiter.step(np.array([0.1, 0.0, 0.0, 0.0]), 0.1) == Velocity(forward=0.1)
 
 
-def test_limiter_begins_where_it_is_told() -> None:
+def test_limiter_starts_from_a_given_set_point() -> None:
     limiter = SetpointLimiter(LIMITS)
     limiter.reset(Velocity(forward=0.5))
     assert limiter.step(np.zeros(4), 0.1).forward == pytest.approx(0.3)

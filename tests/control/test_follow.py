@@ -1,4 +1,4 @@
-"""The controller around the law: pictures in, commands, drawings and counts out. No simulator, no process."""
+"""The controller around the law: frames in; commands, drawings and counts out. No simulator, no process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_goes_to_its_own_marker_and_draws_it(follower: FollowMarker, drone: Reco
     follower.on_frame(frame(now, [(7, [0.3, 0.0, 2.5]), (3, [-0.5, 0.0, 2.0])]))
     assert follower.mode is Mode.FOLLOWING
     assert drone.velocities[-1]["forward"] > 0.2
-    assert drone.velocities[-1]["yaw_rate"] < -0.05, "it is to the right"
+    assert drone.velocities[-1]["yaw_rate"] < -0.05, "the marker is to the right"
     texts = [shape.text for shape in drone.drawn[-1] if isinstance(shape, Text)]
     assert texts == ["marker 7  2.52 m"]
     assert sum(isinstance(shape, Polyline) and shape.closed for shape in drone.drawn[-1]) == 2
@@ -53,7 +53,7 @@ def test_searches_for_its_own_marker_only(follower: FollowMarker, drone: Recorde
     assert any(isinstance(s, Text) and s.text == "searching marker 7" for s in drone.drawn[-1])
 
 
-def test_frame_without_state_is_looked_at_but_not_flown_by(follower: FollowMarker, drone: Recorder) -> None:
+def test_a_frame_without_state_is_searched_but_not_flown_by(follower: FollowMarker, drone: Recorder) -> None:
     now = time.monotonic_ns()
     follower.on_feedback(state(now))
     follower.on_frame(frame(now, [(7, [0.0, 0.0, 2.5])], known=False))
@@ -61,7 +61,7 @@ def test_frame_without_state_is_looked_at_but_not_flown_by(follower: FollowMarke
     assert follower.score.share_in_view == 1.0
 
 
-def test_holds_its_place_when_pictures_stop(follower: FollowMarker, drone: Recorder) -> None:
+def test_holds_its_position_when_frames_stop(follower: FollowMarker, drone: Recorder) -> None:
     now = time.monotonic_ns()
     follower.on_feedback(state(now))
     follower.on_frame(frame(now, [(7, [0.0, 0.0, 2.5])]))
@@ -71,7 +71,7 @@ def test_holds_its_place_when_pictures_stop(follower: FollowMarker, drone: Recor
     assert drone.hovers == 1
 
 
-def test_holds_its_place_and_says_so_when_the_velocity_is_not_known(
+def test_holds_its_position_and_reports_an_unknown_velocity(
     follower: FollowMarker, drone: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Frame, "age_s", 0.0)
@@ -90,11 +90,11 @@ def test_holds_its_place_and_says_so_when_the_velocity_is_not_known(
     follower.on_frame(frame(now + 1_000_000_000, [(7, [0.3, 0.0, 2.5])]))
     assert drone.told[-2:] == [
         ("follow: the vehicle's velocity is not known: hovering", Severity.WARNING),
-        ("follow: the vehicle's motion is known again: flying on", Severity.INFO),
+        ("follow: the vehicle's motion is known again: continuing", Severity.INFO),
     ]
 
 
-def test_set_points_that_others_made_moot_are_begun_from_rest(
+def test_set_points_restart_from_rest_after_another_client_flew(
     follower: FollowMarker, drone: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Frame, "age_s", 0.0)
@@ -106,7 +106,7 @@ def test_set_points_that_others_made_moot_are_begun_from_rest(
         follower.on_frame(frame(at_ns, [(7, [0.3, 0.0, 4.5])]))
     assert drone.velocities[9]["forward"] > 0.5
     assert all(sent["forward"] == 0.0 for sent in drone.velocities[10:30])
-    assert 0.0 < drone.velocities[30]["forward"] <= 0.2 + 1e-9, "what 0.1 s of acceleration gives"
+    assert 0.0 < drone.velocities[30]["forward"] <= 0.2 + 1e-9, "0.1 s of acceleration"
 
 
 def test_unknown_camera(drone: Recorder) -> None:

@@ -1,4 +1,4 @@
-"""The follower's law in a small world with lag, delay and noise; and its parts by themselves."""
+"""The follower's law in a small world with lag, delay and noise; and its parts alone."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_loss_is_followed_by_search_and_recovery() -> None:
     stopped = world.position.copy()
     world.run(4.0)
     modes.append(world.law.mode)
-    assert np.linalg.norm(world.position - stopped) < 1.2, "it must not fly where it sees nothing"
+    assert np.linalg.norm(world.position - stopped) < 1.2, "it must not fly blind"
     world.board.hidden = False
     world.run(12.0)
     modes.append(world.law.mode)
@@ -87,19 +87,19 @@ def test_directions(position: list[float], axis: str, sign: int) -> None:
     assert getattr(wanted, axis) * sign > 0.1
 
 
-def test_marker_where_it_should_be_asks_for_nothing() -> None:
+def test_a_marker_at_the_goal_needs_no_motion() -> None:
     wanted = law_that_sees([1.5, 0.0, 0.0], [-1.0, 0.0, 0.0]).step(nanoseconds(1.05))
     assert max(map(abs, (wanted.forward, wanted.left, wanted.up, wanted.yaw_rate))) < 0.02
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_comes_round_to_the_face(side: int) -> None:
-    # The face looks to the vehicle's left (side 1): the vehicle must go left to stand before it.
+def test_moves_around_to_the_face(side: int) -> None:
+    # The face points to the vehicle's left (side 1): the vehicle must go left to be in front of it.
     normal = [-math.cos(1.0), side * math.sin(1.0), 0.0]
     assert law_that_sees([1.5, 0.0, 0.0], normal).step(nanoseconds(1.05)).left * side > 0.2
 
 
-def test_tilt_is_taken_out() -> None:
+def test_tilt_is_compensated() -> None:
     # Nose down by 0.2 rad (positive pitch): a marker at the vehicle's own height is seen above the body's axis.
     law = law_that_sees([1.5 * math.cos(0.2), 0.0, 1.5 * math.sin(0.2)], [-1.0, 0.0, 0.0], pitch_rad=0.2)
     assert abs(law.step(nanoseconds(1.05)).up) < 0.02
@@ -112,7 +112,7 @@ def test_own_motion_since_the_capture_counts() -> None:
     assert law.step(nanoseconds(1.3)).forward < 0.1
 
 
-def test_without_knowing_its_motion_it_asks_for_nothing() -> None:
+def test_without_known_motion_the_set_point_is_zero() -> None:
     law = FollowLaw()
     law.feedback(Feedback(captured_ns=NS_PER_S))
     law.see(np.array([3.0, 0, 0]), np.array([-1.0, 0, 0]), Feedback(captured_ns=NS_PER_S), NS_PER_S)
@@ -142,7 +142,7 @@ def test_search_turns_and_goes_to_other_heights() -> None:
     altitude=st.one_of(st.none(), st.floats(-1, 10)),
     wait_s=st.floats(0, 5),
 )
-def test_whatever_is_seen_the_answer_is_finite_and_within_limits(
+def test_any_sighting_gives_a_finite_set_point_within_limits(
     position: list[float], normal: list[float], angles: list[float], altitude: float | None, wait_s: float
 ) -> None:
     roll, pitch, yaw = angles
@@ -165,7 +165,7 @@ def test_odometry_places_a_capture_between_samples() -> None:
     assert Airframe().at(0) is None
 
 
-def test_odometry_passes_over_what_is_old_or_incomplete() -> None:
+def test_odometry_skips_old_and_incomplete_samples() -> None:
     odometry = Airframe()
     odometry.add(still(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
     odometry.add(still(0.9, velocity_m_s=(9.0, 0.0, 0.0)))
@@ -186,7 +186,7 @@ def test_filter_learns_a_steady_velocity() -> None:
     assert place == pytest.approx([2.1, 1.0, 0.0], abs=0.06)
 
 
-def test_filter_starts_anew_after_a_jump() -> None:
+def test_filter_restarts_after_a_jump() -> None:
     target = TargetFilter()
     target.see(np.zeros(3), 0.03, 0)
     target.see(np.array([5.0, 0.0, 0.0]), 0.03, nanoseconds(0.1))

@@ -1,4 +1,4 @@
-"""The behaviour around the following law: a rehearsed flight, what it tells and draws, and what it refuses."""
+"""The behaviour around the following law: a rehearsed flight, its events and drawings, and refused arguments."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def yard(folder: Path, options: str = "") -> Iterator[Drone]:
 
 
 def truth(frame: Frame) -> tuple[float, float]:
-    """Distance and bearing from the vehicle to the walker, who is still on the first leg of the way."""
+    """Return distance and bearing from the vehicle to the walker on the first leg."""
     assert frame.feedback is not None
     native = frame.feedback.native
     assert native is not None
@@ -74,7 +74,7 @@ def truth(frame: Frame) -> tuple[float, float]:
 
 
 class Watched(FollowTarget):
-    """Notes the truth and the drawings of each frame."""
+    """Records the truth and the drawings of each frame."""
 
     def __init__(self, *args: Any, **values: Any) -> None:
         self.seen: list[tuple[float, float]] = []
@@ -119,18 +119,18 @@ def test_a_person_is_followed_from_a_box(tmp_path: Path) -> None:
     assert texts[0].startswith("person ")
     assert "following" in texts[0]
     assert any(isinstance(one, Polyline) and one.closed for one in pilot.drawn)
-    assert any(isinstance(one, Polyline) and not one.closed for one in pilot.drawn), "where it came along"
+    assert any(isinstance(one, Polyline) and not one.closed for one in pilot.drawn), "its track"
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     detector = simulated_detector()
     box = (100.0, 50.0, 40.0, 90.0)
     bad: list[tuple[dict[str, Any], str]] = [
-        ({"class_name": "person"}, "a detector is needed"),
+        ({"class_name": "person"}, "needs a detector"),
         ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
         ({"box": box, "mode": None}, "mode is None"),
-        ({"box": box, "detector": 7}, "detector is 7 and must have detect"),
-        ({"box": (math.nan, 1, 20, 20)}, "must be of finite numbers"),
+        ({"box": box, "detector": 7}, "detector is 7 and needs a detect"),
+        ({"box": (math.nan, 1, 20, 20)}, "must consist of finite numbers"),
         ({"box": (1, 2, 3)}, "must be x, y, width and height"),
         ({"box": "here"}, "must be x, y, width and height"),
         ({"box": 4}, "must be x, y, width and height"),
@@ -178,11 +178,11 @@ def test_a_target_is_needed() -> None:
         {"detections": [{"box": None, "score": 0.5, "class_id": 0, "class_name": "person"}]},
     ],
 )
-def test_what_is_no_detection_is_left_out(value: Any) -> None:
+def test_malformed_detections_are_skipped(value: Any) -> None:
     assert detections_of(value) == []
 
 
-def test_detections_of_a_processor_are_taken() -> None:
+def test_detections_of_a_processor_are_used() -> None:
     one = {"box": [1, 2.5, 3, 4], "score": 0.5, "class_id": 1, "class_name": "car"}
     assert detections_of({"detections": [one, {"box": 3}]}) == [Detection((1.0, 2.5, 3.0, 4.0), 0.5, 1, "car")]
 
@@ -194,12 +194,12 @@ def test_a_vehicle_without_velocity_is_flown_by_attitude() -> None:
     follower = follower_of(settings=ChaseSettings(distance_m=3.0, nearest_m=1.0), traits=Traits(height_m=1.72))
     command, drawn = flown(follower, 1.5, velocity_m_s=None)
     assert isinstance(command, Attitude)
-    assert command.pitch > 0.01, "forward, as it is a metre too far off"
+    assert command.pitch > 0.01, "forward, because it is a metre too far away"
     assert command.yaw_rate < -0.05, "to the right"
     assert follower.status.speed_m_s is None
     assert follower.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
-    assert not any(isinstance(one, Polyline) and not one.closed for one in drawn), "it moves with the vehicle's drift"
-    assert follower.step(nanoseconds(9.0)) == Attitude(), "the vehicle's motion is not known any longer"
+    assert not any(isinstance(one, Polyline) and not one.closed for one in drawn), "it would drift with the vehicle"
+    assert follower.step(nanoseconds(9.0)) == Attitude(), "the vehicle's motion is no longer known"
 
 
 def test_the_vehicle_is_held_while_nothing_is_known() -> None:
@@ -217,12 +217,12 @@ def test_the_vehicle_is_held_while_nothing_is_known() -> None:
     assert status.phase == TargetPhase.LOOKING.value
     assert not follower.over
     flown(follower, 1.0)
-    assert follower.step(nanoseconds(9.0)) == Velocity(), "the vehicle's motion is not known any longer"
+    assert follower.step(nanoseconds(9.0)) == Velocity(), "the vehicle's motion is no longer known"
 
 
 @pytest.mark.parametrize("mode", [FollowMode.FOLLOW, FollowMode.LOOK])
 def test_a_velocity_that_goes_missing_holds_the_vehicle_and_keeps_the_target(mode: FollowMode) -> None:
-    """It flew on for good at the velocity that it had last, and turned away from what it saw."""
+    """It kept its last velocity for good and turned away from the target."""
     follower = follower_of(mode=mode)
     flown(follower, 1.5, velocity_m_s=(0.5, 0.0, 0.0))
     assert follower.sighting.box is not None
@@ -231,11 +231,11 @@ def test_a_velocity_that_goes_missing_holds_the_vehicle_and_keeps_the_target(mod
     assert follower.status.problem == "the vehicle's velocity is not known"
     assert follower.sighting.box is not None
     command, _ = flown(follower, 0.5, start=3.5)
-    assert command != Velocity(), "it flies on"
+    assert command != Velocity(), "it continues"
     assert follower.status.problem == ""
 
 
-def test_it_says_since_when_the_target_is_lost_and_where_it_should_be() -> None:
+def test_it_reports_how_long_the_target_is_lost_and_its_expected_place() -> None:
     follower = follower_of()
     flown(follower, 1.5)
     assert follower.sighting.box is not None
@@ -245,12 +245,12 @@ def test_it_says_since_when_the_target_is_lost_and_where_it_should_be() -> None:
     status = follower.status
     assert status.box is None
     assert status.lost_s == pytest.approx(1.2, abs=0.15)
-    assert any(isinstance(one, Polyline) and one.closed for one in drawn), "where it should be"
+    assert any(isinstance(one, Polyline) and one.closed for one in drawn), "its expected place"
     assert any(isinstance(one, Points) for one in drawn)
 
 
 class Recorder:
-    """Stands for the drone: keeps what it is told."""
+    """Stands in for the drone and records calls."""
 
     def __init__(self) -> None:
         self.capabilities = Capabilities("sim", frozenset({"velocity"}), (FRONT_CAMERA.info(),))
@@ -295,7 +295,7 @@ def _no_age(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_no_age")
-def test_the_behaviour_flies_tells_and_ends_after_the_loss() -> None:
+def test_the_behaviour_flies_reports_and_ends_after_the_loss() -> None:
     drone = Recorder()
     settings = ChaseSettings(distance_m=3.0, give_up_s=1.5, predict_s=0.4, hover_s=0.3)
     pilot = FollowTarget(drone, the_box(), height_m=1.72, settings=settings)  # type: ignore[arg-type]
@@ -310,7 +310,7 @@ def test_the_behaviour_flies_tells_and_ends_after_the_loss() -> None:
     assert drone.hovers == 1
     assert drone.told == [
         ("follow target: following", Severity.INFO),
-        ("follow target: hidden: on by its last motion", Severity.WARNING),
+        ("follow target: hidden: following its predicted motion", Severity.WARNING),
         ("follow target: lost: hovering where it went out of sight", Severity.WARNING),
         ("follow target: lost: looking around", Severity.WARNING),
         ("follow target: lost for too long: given up", Severity.WARNING),
@@ -319,7 +319,7 @@ def test_the_behaviour_flies_tells_and_ends_after_the_loss() -> None:
 
 
 @pytest.mark.usefixtures("_no_age")
-def test_the_behaviour_sends_attitudes_where_there_is_no_velocity() -> None:
+def test_the_behaviour_sends_attitudes_without_a_velocity() -> None:
     drone = Recorder()
     pilot = FollowTarget(drone, the_box(), mode="look")  # type: ignore[arg-type]
     given(pilot, 0.5, velocity_m_s=None)
@@ -329,19 +329,19 @@ def test_the_behaviour_sends_attitudes_where_there_is_no_velocity() -> None:
 
 
 @pytest.mark.usefixtures("_no_age")
-def test_frames_that_end_after_one_that_was_stamped_ahead_are_missed() -> None:
+def test_frames_that_stop_after_one_stamped_ahead_are_noticed() -> None:
     pilot = FollowTarget(Recorder(), the_box(), mode="look")  # type: ignore[arg-type]
     given(pilot, 0.5)
     assert not pilot.blind
     pilot.on_frame(picture(10.0))
     pilot.on_feedback(state(2.2))
-    assert pilot.blind, "it would have flown on for eight seconds"
+    assert pilot.blind, "otherwise it flies blind for eight seconds"
 
 
 @pytest.mark.usefixtures("_no_age")
 @pytest.mark.parametrize(("camera", "phase"), [("front", TargetPhase.FOLLOWING), ("bottom", TargetPhase.LOOKING)])
-def test_the_behaviour_takes_the_results_of_a_processor(camera: str, phase: TargetPhase) -> None:
-    """Those of its own camera: a box of another one's frames is somewhere else."""
+def test_the_behaviour_uses_the_results_of_a_processor(camera: str, phase: TargetPhase) -> None:
+    """Only results of the same camera count: a box in another camera's frame is elsewhere."""
     drone = Recorder()
     pilot = FollowTarget(drone, class_name="person", detector="detect")  # type: ignore[arg-type]
     one = {"box": list(the_box()), "score": 0.9, "class_id": 0, "class_name": "person"}
@@ -355,7 +355,7 @@ def test_the_behaviour_takes_the_results_of_a_processor(camera: str, phase: Targ
     assert pilot.status.class_name == "person"
 
 
-def test_mode_and_settings_may_be_changed_in_flight() -> None:
+def test_mode_and_settings_can_change_in_flight() -> None:
     follower = follower_of(class_name="person")
     flown(follower, 0.5)
     follower.mode = FollowMode("orbit")
@@ -368,7 +368,7 @@ def test_mode_and_settings_may_be_changed_in_flight() -> None:
     assert command.left < -0.1, "counter-clockwise: it goes to the right"
 
 
-def test_detections_that_come_late_are_used() -> None:
+def test_late_detections_are_used() -> None:
     follower = follower_of(box=None, class_name="person", detects=True)
     follower.detected([], nanoseconds(1.0))
     assert follower.finder is None
@@ -385,7 +385,7 @@ def test_detections_that_come_late_are_used() -> None:
     assert follower.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
 
 
-def test_what_only_late_detections_show_is_followed() -> None:
+def test_a_target_in_late_detections_only_is_followed() -> None:
     follower = follower_of(box=None, class_name="person", detects=True)
     for n in range(12):
         at_s = 1.0 + n * PERIOD_S
@@ -403,7 +403,7 @@ def test_what_only_late_detections_show_is_followed() -> None:
     assert follower.phase is not TargetPhase.FOLLOWING
 
 
-def test_other_things_are_drawn_and_what_is_contested_is_said() -> None:
+def test_other_things_are_drawn_and_a_contested_target_is_reported() -> None:
     class Both:
         def detect(self, image: Any) -> list[Detection]:
             return [Detection(the_box(), 0.9, 0, "person"), Detection((20.0, 60.0, 30.0, 90.0), 0.8, 0, "person")]
@@ -430,7 +430,7 @@ def test_the_end_of_the_leash_is_a_problem() -> None:
     assert follower.status.problem == "at the end of the leash"
 
 
-def test_of_a_box_alone_it_says_that_the_range_is_not_known_and_only_turns() -> None:
+def test_with_only_a_box_it_turns_and_reports_an_unknown_range() -> None:
     follower = follower_of(settings=ChaseSettings(distance_m=3.0))
     command, drawn = flown(follower, 1.0)
     assert follower.phase is TargetPhase.RANGING
@@ -445,8 +445,8 @@ def test_of_a_box_alone_it_says_that_the_range_is_not_known_and_only_turns() -> 
     assert any(status.phase in one.text for one in drawn if isinstance(one, Text))
 
 
-def test_a_frame_that_was_stamped_ahead_is_not_flown_by() -> None:
-    """It counted as seen for eight seconds, and the vehicle flew on to where the target had been."""
+def test_a_frame_stamped_ahead_is_not_flown_by() -> None:
+    """It counted as fresh for eight seconds, and the vehicle flew to the target's old place."""
     follower = follower_of(class_name="person", settings=ChaseSettings(distance_m=2.5))
     flown(follower, 1.0)
     follower.look(picture(10.0))
@@ -454,21 +454,21 @@ def test_a_frame_that_was_stamped_ahead_is_not_flown_by() -> None:
     assert follower.phase is TargetPhase.HOVERING
 
 
-def test_what_was_seen_before_the_clock_was_put_right_is_not_flown_by() -> None:
+def test_sightings_before_a_clock_correction_are_not_flown_by() -> None:
     follower = follower_of(class_name="person", settings=ChaseSettings(distance_m=2.5))
     flown(follower, 1.0, start=10.0)
     flown(follower, 2.5, start=2.0, shown=False)
     assert follower.phase is TargetPhase.LOOKING
 
 
-def test_a_camera_without_intrinsics_can_not_be_used() -> None:
+def test_a_camera_without_intrinsics_is_refused() -> None:
     follower = follower_of()
     follower.feedback(state(1.0))
     with pytest.raises(UsageError, match="'front' has no intrinsics: calibrate it"):
         follower.look(picture(1.0, intrinsics=None))
 
 
-def test_a_camera_must_look_forward_and_say_how_it_is_mounted() -> None:
+def test_a_camera_must_look_forward_with_a_known_mounting() -> None:
     with pytest.raises(UsageError, match="mounted"):
         TargetFollower(CameraInfo("front", 320, 240, 15.0), box=the_box())
     down = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)

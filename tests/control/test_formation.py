@@ -68,8 +68,8 @@ def test_a_shape_is_turned_and_moved() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (lambda: line(0, 1.0), "at least one place"),
-        (lambda: line(2.5, 1.0), "at least one place"),  # type: ignore[arg-type]
+        (lambda: line(0, 1.0), "at least one position"),
+        (lambda: line(2.5, 1.0), "at least one position"),  # type: ignore[arg-type]
         (lambda: line(2, 0.0), "spacing_m is 0.0"),
         (lambda: circle(2, math.nan), "spacing_m is nan"),
         (lambda: vee(2, 1.0, angle=0.5), "angle is 0.5"),
@@ -78,12 +78,12 @@ def test_a_shape_is_turned_and_moved() -> None:
         (lambda: placed(line(2, 1.0), at=(0, 0, math.inf)), "three finite coordinates"),
         (lambda: places([(1, 2)]), r"shape \(n, 3\)"),
         (lambda: places([(1, 2, math.nan)]), "finite"),
-        (lambda: places("here"), "no array of places"),
+        (lambda: places("here"), "not an array of positions"),
         (lambda: assign(line(3, 1.0), line(2, 1.0)), "3 drones have only 2 places"),
-        (lambda: assign(line(2, 1.0), line(MOST + 1, 1.0)), "more than the 200"),
+        (lambda: assign(line(2, 1.0), line(MOST + 1, 1.0)), "at most 200"),
     ],
 )
-def test_what_makes_no_formation(wrong: Callable[[], object], words: str) -> None:
+def test_invalid_formations_are_refused(wrong: Callable[[], object], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         wrong()
 
@@ -124,21 +124,21 @@ def test_it_agrees_with_scipy() -> None:
 
 @settings(deadline=None)
 @given(st.integers(2, 6).flatmap(lambda n: st.tuples(points(n, n), points(n, n))))
-def test_assigned_ways_keep_apart_as_far_as_the_paper_says(pair: tuple[Places, Places]) -> None:
+def test_assigned_paths_stay_apart_as_far_as_the_paper_proves(pair: tuple[Places, Places]) -> None:
     starts, slots = pair
     least = min(nearest(starts), nearest(slots))
     way = closest_approach(starts, slots[assign(starts, slots)])
     assert way.distance_m >= least / math.sqrt(2) - 1e-6
 
 
-def test_ways_that_cross_are_seen() -> None:
+def test_crossing_paths_are_detected() -> None:
     starts, goals = [(0, 0, 0), (2, 0, 0), (9, 9, 0)], [(2, 0, 0), (0, 0, 0), (9, 9, 0)]
     assert closest_approach(starts, goals) == pytest.approx((0.0, 0, 1))
     assert closest_approach(starts, starts) == pytest.approx((2.0, 0, 1))
     assert closest_approach([(0, 0, 0)], [(1, 0, 0)]).distance_m == math.inf
 
 
-def test_two_that_are_too_close_part_and_others_are_left_alone() -> None:
+def test_two_drones_too_close_separate_and_others_are_left_alone() -> None:
     positions = [(0.0, 0.0, 1.0), (0.5, 0.0, 1.0), (5.0, 0.0, 1.0)]
     velocities = [(0.4, 0.3, 0.0), (-0.4, 0.0, 0.1), (1.0, 0.0, 0.0)]
     changed = kept_apart(velocities, positions, 1.0)
@@ -150,19 +150,19 @@ def test_two_that_are_too_close_part_and_others_are_left_alone() -> None:
     assert np.allclose(same_place, [(0.5, 0, 0), (-0.5, 0, 0)])
 
 
-def test_who_meets_one_that_does_not_give_way_gives_way_alone() -> None:
-    """It gave way by half, and flew through its leader."""
+def test_a_drone_that_meets_one_that_does_not_yield_yields_fully() -> None:
+    """It yielded half and flew through its leader."""
     positions = [(0.5, 0.0, 1.0), (0.0, 0.0, 1.0)]
     changed = kept_apart([(-1.0, 0.3, 0.0), (0.4, 0.0, 0.0)], positions, 1.0, fixed=1)
     assert np.allclose(changed, [(0.9, 0.3, 0.0), (0.4, 0.0, 0.0)])
     near = kept_apart([(-1.0, 0.3, 0.0), (0.0, 0.0, 0.0)], [(1.2, 0.0, 1.0), (0.0, 0.0, 1.0)], 1.0, fixed=1)
-    assert np.allclose(near, [(-0.2, 0.3, 0.0), (0.0, 0.0, 0.0)]), "it slows down before"
+    assert np.allclose(near, [(-0.2, 0.3, 0.0), (0.0, 0.0, 0.0)]), "it slows down first"
     assert np.allclose(kept_apart([(1.0, 0.0, 0.0)] * 2, positions, 1.0, fixed=2), [(1.0, 0.0, 0.0)] * 2)
 
 
 @settings(deadline=None)
 @given(points(2, 5), st.integers(1, 4), st.floats(0.1, 3.0))
-def test_nobody_comes_nearer_to_the_last_that_does_not_give_way(positions: Places, fixed: int, apart: float) -> None:
+def test_no_drone_comes_nearer_to_one_that_does_not_yield(positions: Places, fixed: int, apart: float) -> None:
     fixed = min(fixed, len(positions))
     changed = kept_apart(-positions, positions, apart, fixed=fixed)
     assert np.array_equal(changed[len(positions) - fixed :], -positions[len(positions) - fixed :])
@@ -176,8 +176,8 @@ def test_nobody_comes_nearer_to_the_last_that_does_not_give_way(positions: Place
 
 @settings(deadline=None)
 @given(points(2, 2), st.floats(0.1, 20.0))
-def test_steering_apart_never_makes_two_approach_that_are_too_close(positions: Places, apart: float) -> None:
-    velocities = -positions  # both fly to the same place
+def test_separation_never_makes_two_close_drones_approach(positions: Places, apart: float) -> None:
+    velocities = -positions  # all fly to the same place
     changed = kept_apart(velocities, positions, apart)
     between = positions[0] - positions[1]
     growing = float((changed[0] - changed[1]) @ between)

@@ -1,4 +1,4 @@
-"""Formations flown by vehicles that move as they are told, over real proxies in this process."""
+"""Formations flown by vehicles that take on each velocity at once, over real proxies in this process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ BRISK = WaypointSettings(gain=3.0, speed_m_s=2.0, climb_m_s=2.0, slow_down_m_s2=
 
 
 class Mover(FakeVehicle):
-    """Takes on each velocity at once, and tells where it is."""
+    """Takes on each velocity at once and reports its position."""
 
     def __init__(self, position: Vector, yaw: float = 0.0) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ def flying(movers: dict[str, Mover], *, on_error: str = "raise") -> Iterator[Swa
 
 
 def row(spacing: float = 1.0) -> dict[str, Mover]:
-    """Three in a row along x, each with another heading."""
+    """Three in a row along x, with different headings."""
     return {name: Mover((spacing * k, 0.0, 1.0), yaw=0.7 * k) for k, name in enumerate(NAMES)}
 
 
@@ -114,7 +114,7 @@ def test_all_fly_to_their_places_and_arrive_together() -> None:
         drones.wait_all("hovering", 5.0)
 
 
-def test_ways_that_cross_too_near_are_refused_before_anybody_moves() -> None:
+def test_paths_that_cross_too_closely_are_refused_before_any_drone_moves() -> None:
     with flying(row(0.8)) as drones:
         crowded = [(0.0, 1.0, 1.0), (0.3, 1.0, 1.0), (0.6, 1.0, 1.0)]
         with pytest.raises(UsageError, match=r"a and b would come within 0\.30 m of each other"):
@@ -128,7 +128,7 @@ def test_ways_that_cross_too_near_are_refused_before_anybody_moves() -> None:
         assert drones.spread is None or drones.feedback()["a"].state is FlightState.HOVERING
 
 
-def test_drones_that_do_not_know_where_they_are_or_stand_on_the_ground() -> None:
+def test_drones_without_position_or_on_the_ground_are_refused() -> None:
     movers = row()
     movers["b"].tells = False
     with flying(movers) as drones:
@@ -140,7 +140,7 @@ def test_drones_that_do_not_know_where_they_are_or_stand_on_the_ground() -> None
             Formation(drones).hold(1.0)
 
 
-def test_one_that_does_not_arrive_has_failed_and_the_others_are_there() -> None:
+def test_a_drone_that_does_not_arrive_fails_and_the_others_arrive() -> None:
     movers = row()
     movers["b"].stuck = True
     with flying(movers, on_error="continue") as drones:
@@ -154,7 +154,7 @@ def test_one_that_does_not_arrive_has_failed_and_the_others_are_there() -> None:
         assert "2.00 m from its place" in str(drones.errors["b"])
 
 
-def test_holding_the_place() -> None:
+def test_holding_position() -> None:
     movers = row()
     with flying(movers) as drones:
         report = Formation(drones).hold(0.3)
@@ -179,7 +179,7 @@ def test_followers_keep_their_places_beside_a_leader_that_moves_and_turns() -> N
             formation.follow("a", {"a": (0, 0, 0)}, 1.0)
 
 
-def test_a_leader_that_fails_lets_the_followers_hover() -> None:
+def test_followers_hover_when_the_leader_fails() -> None:
     movers = row()
     with flying(movers, on_error="continue") as drones:
         drones["a"].close()
@@ -194,7 +194,7 @@ def test_a_leader_that_fails_lets_the_followers_hover() -> None:
 
 @contextmanager
 def watched(movers: dict[str, Mover]) -> Iterator[list[float]]:
-    """How near the first two of them really come to each other."""
+    """Record how close the first two really come to each other."""
     nearest, over = [math.inf], threading.Event()
     first, second = list(movers.values())[:2]
 
@@ -211,8 +211,8 @@ def watched(movers: dict[str, Mover]) -> Iterator[list[float]]:
         thread.join()
 
 
-def test_a_follower_whose_leader_turns_about_does_not_fly_through_it() -> None:
-    """It gave way by half only, which its leader did not know of: 0.18 m."""
+def test_a_follower_does_not_fly_through_a_leader_that_turns_back() -> None:
+    """It yielded only half, and its leader nothing: 0.18 m."""
     movers = {"a": Mover((0.0, 0.0, 1.0)), "b": Mover((-1.0, 0.02, 1.0))}
     with flying(movers) as drones, watched(movers) as nearest:
         threading.Timer(0.3, lambda: setattr(movers["a"], "yaw", math.pi)).start()
@@ -222,8 +222,8 @@ def test_a_follower_whose_leader_turns_about_does_not_fly_through_it() -> None:
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_nobody_flies_through_one_that_was_set_aside(closed: bool) -> None:
-    """One came within 0.005 m of it, which was reported as 0.998."""
+def test_no_drone_flies_through_one_set_aside(closed: bool) -> None:
+    """One came within 0.005 m of it, and 0.998 m was reported."""
     movers = {"a": Mover((1.0, 0.0, 1.0)), "b": Mover((0.0, 0.1, 1.0))}
     with flying(movers, on_error="continue") as drones, watched(movers) as nearest:
 
@@ -244,8 +244,8 @@ def test_nobody_flies_through_one_that_was_set_aside(closed: bool) -> None:
         assert report.closest_m == pytest.approx(nearest[0], abs=0.1)
 
 
-def test_a_drone_whose_position_is_lost_is_set_aside_and_the_others_fly_on() -> None:
-    """It ended the whole formation with an error about an array, whatever on_error said."""
+def test_a_drone_that_loses_its_position_is_set_aside_and_the_others_continue() -> None:
+    """It ended the whole formation with an error about an array, regardless of on_error."""
     movers = row()
     with flying(movers, on_error="continue") as drones:
         timer = threading.Timer(0.5, lambda: setattr(movers["b"], "tells", False))
@@ -263,7 +263,7 @@ def test_a_drone_whose_position_is_lost_is_set_aside_and_the_others_fly_on() -> 
             Formation(drones).hold(10.0)
 
 
-def test_a_position_that_is_missing_for_a_moment_is_carried_on() -> None:
+def test_a_position_missing_for_a_moment_is_extrapolated() -> None:
     movers = row()
     with flying(movers) as drones:
         formation = Formation(drones)
@@ -282,7 +282,7 @@ def test_the_place_beside_a_leader() -> None:
         station(leader, (1.0, 0.0))
 
 
-def test_with_all_drones_set_aside_there_is_nobody_to_fly() -> None:
+def test_with_all_drones_set_aside_there_is_none_to_fly() -> None:
     with flying(row(), on_error="continue") as drones:
         with pytest.raises(SwarmError):
             drones.fail("a test", {name: NoAnswerError("it is tired") for name in NAMES})

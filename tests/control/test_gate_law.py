@@ -1,4 +1,4 @@
-"""The gate's law in a kinematic world, and what it does when it sees nothing."""
+"""The gate's law in a kinematic world, and its behaviour without sightings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GATE, WAY = np.array([5.0, 0.5, 1.4]), 0.3
 
 
 class World:
-    """A vehicle that flies exactly what it is asked for, and a gate."""
+    """A vehicle that follows set-points exactly, and a gate."""
 
     def __init__(self, position: tuple[float, float, float], yaw: float = 0.0) -> None:
         self.position, self.yaw = np.array(position), yaw
@@ -77,7 +77,7 @@ def test_flies_through_the_middle(start: tuple[float, float, float]) -> None:
     assert world.velocity == Velocity() or abs(world.velocity.forward) < 0.8
 
 
-def test_searches_the_way_it_is_told_and_stays() -> None:
+def test_searches_in_the_given_direction_and_stays() -> None:
     for turning in (1.0, -1.0):
         world = World((0.0, 0.0, 1.0))
         world.law.next_gate(turning=turning)
@@ -88,7 +88,7 @@ def test_searches_the_way_it_is_told_and_stays() -> None:
         assert world.phase() is GatePhase.SEARCHING
 
 
-def test_a_gate_that_is_lost_on_the_way_is_not_flown_to() -> None:
+def test_a_gate_lost_on_the_way_is_not_flown_to() -> None:
     world = World((0.0, 0.0, 1.0))
     for _ in range(15):
         world.step()
@@ -116,12 +116,12 @@ def test_next_gate_forgets_the_last() -> None:
     assert world.velocity.yaw_rate != 0.0
 
 
-def test_nothing_is_asked_for_before_the_vehicle_was_heard() -> None:
+def test_set_points_are_zero_before_the_first_feedback() -> None:
     assert GateLaw().step(NS_PER_S) == Velocity()
 
 
 @given(st.lists(st.tuples(*[st.floats(-20, 20)] * 6), min_size=1, max_size=20))
-def test_whatever_is_seen_the_answer_is_finite_and_within_limits(sights: list[tuple[float, ...]]) -> None:
+def test_any_sighting_gives_a_finite_set_point_within_limits(sights: list[tuple[float, ...]]) -> None:
     world = World((0.0, 0.0, 1.0))
     for sight in sights:
         state = world.state()

@@ -1,4 +1,4 @@
-"""The law of image-based servoing by itself: what it does with views that it can't use."""
+"""The law of image-based servoing alone: unusable views."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def phase_at(law: ImageServoLaw, at_s: float) -> ServoPhase:
     return law.phase
 
 
-def test_a_view_by_a_vehicle_that_is_tilted_too_far_is_as_good_as_none() -> None:
+def test_a_view_from_a_vehicle_tilted_too_far_is_ignored() -> None:
     law = ImageServoLaw(FORWARD, WANTED, 1.5)
     law.see(WANTED + 0.05, tilted(0.0, 0.0), 0)
     assert phase_at(law, 0.1) is ServoPhase.SERVOING
@@ -40,7 +40,7 @@ def test_a_view_by_a_vehicle_that_is_tilted_too_far_is_as_good_as_none() -> None
     assert phase_at(law, 2.0) is ServoPhase.SERVOING
 
 
-def test_a_view_that_was_stamped_ahead_is_not_flown_by_until_then() -> None:
+def test_a_view_stamped_ahead_is_not_flown_by_until_then() -> None:
     law = ImageServoLaw(FORWARD, WANTED, 1.5)
     law.see(WANTED + 0.05, tilted(9.0, 0.0), nanoseconds(9.0))
     law.feedback(tilted(1.0, 0.0))
@@ -51,6 +51,6 @@ def test_a_view_that_was_stamped_ahead_is_not_flown_by_until_then() -> None:
     assert (held.forward, held.left, held.up) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
-def test_a_camera_that_does_not_say_how_it_is_mounted_is_refused_before_the_flight() -> None:
+def test_a_camera_with_unknown_mounting_is_refused_before_the_flight() -> None:
     with pytest.raises(UsageError, match="mounted"):
         ImageServoLaw(CameraInfo("front", 320, 240, 15.0), WANTED, 1.5)

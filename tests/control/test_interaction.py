@@ -1,4 +1,4 @@
-"""The interaction matrix against the motion that it stands for, and four degrees of freedom against a camera."""
+"""The interaction matrix against the motion that it describes, and four degrees of freedom against a camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ small = st.floats(-0.5, 0.5)
 
 
 def seen(position: Array, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> tuple[Array, Array]:
-    """What the camera of a vehicle in the world sees of a square at x = 2 that faces it: points and depths."""
+    """Return a camera's view of a square at x = 2 that faces the vehicle: points and depths."""
     world = np.column_stack([np.full(4, 2.0), -SQUARE[:, 0], SQUARE[:, 1]])
     body = (world - position) @ rotation_from_euler(roll, pitch, yaw)
     assert FORWARD.position_m is not None
@@ -33,20 +33,20 @@ def seen(position: Array, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> 
 
 
 @given(st.lists(st.tuples(small, small, st.floats(0.5, 5.0)), min_size=1, max_size=4), st.tuples(*[small] * 6))
-def test_points_move_as_the_interaction_matrix_says(
+def test_points_move_as_the_interaction_matrix_predicts(
     points: list[tuple[float, float, float]], twist: tuple[float, ...]
 ) -> None:
     rays, depths = np.array([p[:2] for p in points]), np.array([p[2] for p in points])
     places = np.column_stack([rays * depths[:, None], depths])
     velocity, turning = np.array(twist[:3]), np.array(twist[3:])
     dt = 1e-6
-    moved = places - dt * (velocity + np.cross(turning, places))  # what stands still moves against the camera
+    moved = places - dt * (velocity + np.cross(turning, places))  # fixed points move relative to the camera
     expected = (moved[:, :2] / moved[:, 2:] - rays).reshape(-1) / dt
     assert interaction_matrix(rays, depths) @ np.array(twist) == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize("motion", [(1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)])
-def test_points_move_with_what_the_vehicle_does(motion: tuple[int, ...]) -> None:
+def test_points_move_with_the_vehicles_motion(motion: tuple[int, ...]) -> None:
     dt = 1e-6
     points, depths = seen(np.zeros(3), 0.0)
     after, _ = seen(np.array(motion[:3]) * dt, motion[3] * dt)
@@ -55,8 +55,8 @@ def test_points_move_with_what_the_vehicle_does(motion: tuple[int, ...]) -> None
 
 
 @given(roll=small, pitch=small)
-def test_tilt_is_taken_out(roll: float, pitch: float) -> None:
-    # About the camera's own centre nothing but the tilt differs: the lever arm is not what is asked here.
+def test_tilt_is_compensated(roll: float, pitch: float) -> None:
+    # Rotate about the camera's own centre, so that only the tilt differs and the lever arm plays no part.
     level, _ = seen(np.zeros(3), 0.0)
     assert FORWARD.position_m is not None
     lever = np.asarray(FORWARD.position_m)
@@ -67,7 +67,7 @@ def test_tilt_is_taken_out(roll: float, pitch: float) -> None:
 
 @pytest.mark.slow
 @given(st.tuples(st.floats(-1.0, 0.7), small, small), st.floats(-0.4, 0.4))
-def test_flies_to_where_the_points_look_as_wanted(start: tuple[float, float, float], yaw: float) -> None:
+def test_flies_to_the_wanted_view(start: tuple[float, float, float], yaw: float) -> None:
     wanted, _ = seen(np.zeros(3), 0.0)
     place, errors = np.array(start), []
     for _ in range(300):
@@ -81,12 +81,12 @@ def test_flies_to_where_the_points_look_as_wanted(start: tuple[float, float, flo
     assert abs(yaw) < 0.03
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(UsageError, match="shape"):
         interaction_matrix(np.zeros((2, 3)), np.ones(2))
     with pytest.raises(UsageError, match="above 0"):
         interaction_matrix(np.zeros((2, 2)), np.array([1.0, 0.0]))
-    with pytest.raises(UsageError, match="two points"):
+    with pytest.raises(UsageError, match="two or more points"):
         servo(np.zeros((1, 2)), np.zeros((1, 2)), np.ones(1), FORWARD, 1.0)
     with pytest.raises(UsageError, match="tilted too far"):
         levelled(np.array([[0.0, 0.0]]), FORWARD, 0.0, math.pi / 2)

@@ -1,4 +1,4 @@
-"""The constant-velocity filter: is it as sure as it has reason to be?"""
+"""The constant-velocity filter: is its confidence justified?"""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.errors import UsageError
 
 
-def test_errors_are_as_large_as_the_covariance_says() -> None:
+def test_errors_match_the_covariance() -> None:
     """Normalised estimation error squared over many runs of the model itself: its mean is the number of states."""
     rng = np.random.default_rng(3)
     intensity, dt, found = 0.2, 0.1, []
@@ -30,7 +30,7 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     assert np.mean(found) == pytest.approx(4.0, abs=1.1), "3 standard deviations of the mean of 60 with 4 states"
 
 
-def test_two_predictions_are_one() -> None:
+def test_two_predictions_equal_one() -> None:
     filtered = ConstantVelocityFilter(1, intensity_m2_s3=0.5)
     for k in range(5):
         filtered.update(np.array([0.3 * k]), 0.1, nanoseconds(0.5 * k))
@@ -45,7 +45,7 @@ def test_two_predictions_are_one() -> None:
     assert filtered.at(0) is filtered.newest
 
 
-def test_the_gate_refuses_what_is_wild_and_a_new_start_takes_it() -> None:
+def test_the_gate_refuses_outliers_and_a_restart_accepts_them() -> None:
     filtered = ConstantVelocityFilter(3, gate=4.0)
     for k in range(20):
         assert filtered.update(np.array([0.1 * k, 0.0, 1.0]), 0.02, nanoseconds(0.1 * k))
@@ -70,8 +70,8 @@ def test_a_covariance_counts_by_direction() -> None:
 
 
 @pytest.mark.parametrize("deviation", [1e-4, 1e-7, 1e-9, 1e-12, 0.0])
-def test_what_is_all_but_exact_is_taken(deviation: float) -> None:
-    """A simulator without noise, or motion capture that says so: the filter raised."""
+def test_nearly_exact_measurements_are_accepted(deviation: float) -> None:
+    """A simulator without noise, or such motion capture, made the filter raise."""
     filtered = ConstantVelocityFilter(3, gate=math.inf)
     for n in range(200):
         place = np.array([0.0005 * n, 0.0, 1.0]) + 1e-9 * math.sin(n)
@@ -85,7 +85,7 @@ def test_what_is_all_but_exact_is_taken(deviation: float) -> None:
     assert np.isfinite(filtered.newest.covariance).all()
 
 
-def test_what_makes_no_sense() -> None:
+def test_invalid_arguments() -> None:
     filtered = ConstantVelocityFilter(2)
     with pytest.raises(UsageError, match="never seen"):
         filtered.at(0)

@@ -1,4 +1,4 @@
-"""The landing's law over fast platforms: a vehicle that leans, with delay, lag, drag and gusts; no pictures."""
+"""The landing's law over fast platforms: a vehicle that leans, with delay, lag, drag and gusts; no images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FAST = {**LIMITS, "limits.speed": 8.0, "limits.tilt": 0.5}
 
 
 class ChaseWorld:
-    """A platform on a straight or a circle comes by below; what is asked for arrives 50 ms later."""
+    """A platform passes below on a straight line or a circle; set-points arrive 50 ms later."""
 
     def __init__(self, speed: float, radius: float = math.inf, *, gust: float = 0.0, **settings: float) -> None:
         self.rng = np.random.default_rng(4)
@@ -113,7 +113,7 @@ class ChaseWorld:
     ("speed", "radius", "gust"),
     [(2.0, math.inf, 0.0), (2.0, 10.0, 0.0), (1.0, 8.0, 1.0), (3.0, math.inf, 0.0), (3.0, 10.0, 0.0)],
 )
-def test_lands_on_a_platform_that_comes_by(speed: float, radius: float, gust: float) -> None:
+def test_lands_on_a_passing_platform(speed: float, radius: float, gust: float) -> None:
     world = ChaseWorld(speed, radius, gust=gust)
     assert world.run(40.0) is LandingPhase.DOWN
     assert world.off < 0.12
@@ -141,7 +141,7 @@ def test_a_touch_down_that_would_miss_is_aborted_with_a_climb_and_tried_again() 
     assert world.off < 0.12
 
 
-def test_a_touch_down_on_what_is_not_where_it_was_foreseen_is_aborted() -> None:
+def test_a_touch_down_on_a_platform_off_its_predicted_place_is_aborted() -> None:
     world = touching_down()
     world.shift = np.array([-0.14, 0.0])  # still in view, along the longer side of the image
     world.run(0.6)
@@ -164,7 +164,7 @@ def test_after_too_many_attempts_it_gives_up_at_a_safe_height() -> None:
     assert world.law.phase is LandingPhase.GIVEN_UP
     assert not world.law.safe(world.now_ns)
     world.run(8.0)
-    assert world.law.phase is LandingPhase.GIVEN_UP, "also when it sees the marker again"
+    assert world.law.phase is LandingPhase.GIVEN_UP, "even when it sees the marker again"
     assert world.law.safe(world.now_ns)
     assert float(np.linalg.norm(world.velocity)) < 0.1
     assert world.position[2] > 2.3
@@ -179,7 +179,7 @@ def test_after_too_long_a_time_it_gives_up() -> None:
     assert world.law.safe(world.now_ns)
 
 
-def test_asks_for_nothing_beyond_the_limits() -> None:
+def test_set_points_stay_within_the_limits() -> None:
     world = ChaseWorld(2.0, 10.0, gust=1.0)
     for _ in range(600):
         world.run(0.05)
@@ -188,7 +188,7 @@ def test_asks_for_nothing_beyond_the_limits() -> None:
         assert world.position[2] - 0.06 <= LIMITS["limits.altitude"]
 
 
-def test_settings_are_brought_within_the_limits() -> None:
+def test_settings_are_clamped_to_the_limits() -> None:
     settings = LandingSettings(search_height_m=4.0).within(LIMITS)
     assert settings.search_height_m == pytest.approx(2.8)
     assert settings.response.tilt_rad == 0.21

@@ -1,4 +1,4 @@
-"""The landing's law in a kinematic world with a platform, and what it does when it sees nothing."""
+"""The landing's law in a kinematic world with a platform, and its behaviour without sightings."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from skyloop.messages.geometry import rotation_from_euler
 
 DT = 1 / 15
 TOP_M = 0.2
-#: Of a vehicle that has the velocity that it is asked for at the next step, and does not lean for it.
+#: For a vehicle that takes on each velocity at the next step, without leaning.
 EXACT = ResponseSettings(gain_per_s=1 / DT, lag_s=0.001, delay_s=0.0)
 
 
 class World:
-    """A vehicle that flies exactly what it is asked for, over a platform that goes straight on."""
+    """A vehicle that follows set-points exactly, over a platform in straight motion."""
 
     def __init__(self, position: tuple[float, float, float], speed: float = 0.3) -> None:
         self.position, self.velocity = np.array(position), Velocity()
@@ -66,7 +66,7 @@ class World:
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.3, -0.5])
-def test_comes_down_on_what_moves(speed: float) -> None:
+def test_lands_on_a_moving_platform(speed: float) -> None:
     world = World((0.3, -0.2, 2.0), speed)
     phases = []
     for _ in range(600):
@@ -78,11 +78,11 @@ def test_comes_down_on_what_moves(speed: float) -> None:
     assert LandingPhase.COMMITTED in phases
     assert world.off < 0.08
     assert world.position[2] - 0.06 - TOP_M < 0.1
-    assert world.law.step(world.now_ns) == Velocity(), "what is down stays down"
+    assert world.law.step(world.now_ns) == Velocity(), "after touch-down it stays down"
     assert world.law.target_speed_m_s == pytest.approx(abs(speed), abs=0.08)
 
 
-def test_loses_it_high_up_and_climbs_then_searches() -> None:
+def test_after_losing_it_high_up_it_climbs_then_searches() -> None:
     world = World((0.0, 0.0, 2.0))
     for _ in range(30):
         world.step()
@@ -97,7 +97,7 @@ def test_loses_it_high_up_and_climbs_then_searches() -> None:
     assert world.law.height_m is None
 
 
-def test_what_turns_just_above_is_waited_for() -> None:
+def test_it_waits_above_a_platform_that_turns() -> None:
     world = World((0.0, 0.0, 1.4))
     for tick in range(200):
         world.speed = 0.4 * np.array([math.cos(tick * DT * 1.5), math.sin(tick * DT * 1.5), 0.0])
@@ -109,13 +109,13 @@ def test_what_turns_just_above_is_waited_for() -> None:
     assert world.phase() is LandingPhase.DOWN
 
 
-def test_who_was_down_when_others_took_over_searches_the_marker_anew() -> None:
-    """It stayed down: given back at 2 m, the vehicle was landed wherever it was."""
+def test_after_a_takeover_on_the_ground_it_searches_again() -> None:
+    """It stayed in phase DOWN: given back at 2 m, the vehicle was landed wherever it was."""
     world = World((0.0, 0.0, 2.0), 0.0)
     while world.phase() is not LandingPhase.DOWN:
         world.step()
     world.law.forget()
-    assert world.phase() is LandingPhase.DOWN, "a gap in the feedback does not abort what is all but landed"
+    assert world.phase() is LandingPhase.DOWN, "a gap in the feedback does not abort a nearly finished landing"
     world.law.pause()
     assert world.phase() is LandingPhase.SEARCHING
     world.position, world.velocity = np.array([0.4, 0.0, 2.0]), Velocity()
@@ -127,7 +127,7 @@ def test_who_was_down_when_others_took_over_searches_the_marker_anew() -> None:
 
 
 def hovering(roll_rate: float, late_s: float, sights: list[tuple[float, float, float]]) -> LandingLaw:
-    """A law that saw these places, in levelled axes, while its vehicle rolled; attitudes are from ``late_s`` before."""
+    """Return a law that saw these places, in levelled axes, while rolling; attitudes are ``late_s`` old."""
     law, rate = LandingLaw(), (roll_rate, 0.0, 0.0)
     for k, sight in enumerate(sights):
         now_ns = NS_PER_S + nanoseconds(k * DT)
@@ -146,13 +146,13 @@ def hovering(roll_rate: float, late_s: float, sights: list[tuple[float, float, f
     return law
 
 
-def test_an_attitude_from_before_the_frame_is_carried_on() -> None:
+def test_an_attitude_older_than_the_frame_is_extrapolated() -> None:
     law = hovering(1.0, 0.02, [(0.0, 0.0, -2.0)] * 15)
     assert law.off_m is not None
-    assert law.off_m < 0.01  # taken as it was, the marker were 0.04 m off
+    assert law.off_m < 0.01  # unextrapolated, the marker would be 0.04 m off
 
 
-def test_what_is_seen_while_turning_fast_counts_less() -> None:
+def test_sightings_while_turning_fast_count_less() -> None:
     sights = [(0.0, 0.0, -2.0)] * 15 + [(0.06, 0.0, -2.0)]
     steady, turning = (hovering(rate, 0.0, sights).off_m for rate in (0.0, 2.0))
     assert steady is not None
@@ -160,13 +160,13 @@ def test_what_is_seen_while_turning_fast_counts_less() -> None:
     assert turning < 0.7 * steady
 
 
-def test_nothing_is_asked_for_before_the_vehicle_was_heard() -> None:
+def test_set_points_are_zero_before_the_first_feedback() -> None:
     assert LandingLaw().step(NS_PER_S) == Velocity()
     assert LandingLaw().target_speed_m_s is None
 
 
 @given(st.lists(st.tuples(*[st.floats(-20, 20)] * 3), min_size=1, max_size=20))
-def test_whatever_is_seen_the_answer_is_finite_and_within_limits(sights: list[tuple[float, float, float]]) -> None:
+def test_any_sighting_gives_a_finite_set_point_within_limits(sights: list[tuple[float, float, float]]) -> None:
     world = World((0.0, 0.0, 1.0))
     for sight in sights:
         state = world.state()
@@ -178,7 +178,7 @@ def test_whatever_is_seen_the_answer_is_finite_and_within_limits(sights: list[tu
         world.now_ns += nanoseconds(DT)
 
 
-def test_spiral_comes_near_every_place_and_begins_anew() -> None:
+def test_the_spiral_covers_every_place_and_restarts() -> None:
     search, place = SpiralSearch(lane_m=1.0, speed_m_s=0.7, largest_m=4.0), np.zeros(2)
     way = [place]
     for _ in range(3000):
@@ -189,9 +189,9 @@ def test_spiral_comes_near_every_place_and_begins_anew() -> None:
         for y in np.arange(-1.4, 1.5, 0.4):
             assert np.linalg.norm(places - (x, y), axis=1).min() < 0.75
     assert np.abs(places).max() < 3.1
-    assert np.linalg.norm(places[1500:], axis=1).min() < 0.25, "it came back"
+    assert np.linalg.norm(places[1500:], axis=1).min() < 0.25, "it returned"
 
 
-def test_a_spiral_needs_numbers_above_0() -> None:
+def test_a_spiral_needs_positive_numbers() -> None:
     with pytest.raises(UsageError, match="lane_m"):
         SpiralSearch(lane_m=0.0)

@@ -1,4 +1,4 @@
-"""Loading a user's controller from a file, and what is said where that does not work."""
+"""Load a user's controller from a file, with errors that explain what is wrong."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_file_may_import_its_neighbours(write: Write, tmp_path: Path) -> None:
     assert load_controller(own, "One").__module__ == "neighbour"
 
 
-def test_an_imported_controller_counts_where_there_is_no_other(write: Write, tmp_path: Path) -> None:
+def test_an_imported_controller_counts_if_there_is_no_other(write: Write, tmp_path: Path) -> None:
     (tmp_path / "neighbour_two.py").write_text(ONE)
     assert load_controller(write("from neighbour_two import One\n")).__name__ == "One"
 
@@ -81,12 +81,12 @@ def test_dataclasses_work_in_the_file(write: Write) -> None:
         ("\0", r"mine\.py"),
     ],
 )
-def test_a_file_that_does_not_do_is_answered_with_the_place(write: Write, text: str, words: str) -> None:
+def test_errors_in_a_file_name_the_place(write: Write, text: str, words: str) -> None:
     with pytest.raises(FileFormatError, match=words):
         load_controller(write(text))
 
 
-def test_the_place_is_told_for_a_relative_path_too(
+def test_the_place_is_named_for_a_relative_path_too(
     write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write("import numpi\n")
@@ -101,7 +101,7 @@ def test_an_error_in_a_neighbour_names_both_files(write: Write, tmp_path: Path) 
         load_controller(write("import neighbour_bad\n"))
 
 
-def test_what_is_no_python_file_is_refused(write: Write, tmp_path: Path) -> None:
+def test_other_than_python_files_are_refused(write: Write, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"there is no file .*none\.py"):
         load_controller(tmp_path / "none.py")
     with pytest.raises(UsageError, match="is a directory"):

@@ -1,4 +1,4 @@
-"""A learnt policy: what its network is given, what it flies, and files that are none."""
+"""A learned policy: its network's inputs, its set-points, and invalid files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fly(drone: Recorder, path: Path, **options: Any) -> OnnxPolicy:
     return OnnxPolicy(drone, path, **options)  # type: ignore[arg-type]
 
 
-def test_it_is_given_red_green_blue_and_the_state_by_name(policy: Path) -> None:
+def test_the_input_is_red_green_blue_and_the_state_by_name(policy: Path) -> None:
     network = PolicyNetwork(policy)
     assert (network.camera, network.size, network.state, network.action) == (
         "front",
@@ -49,10 +49,10 @@ def test_it_is_given_red_green_blue_and_the_state_by_name(policy: Path) -> None:
     flown = network(image, [1.5, -0.5])
     assert isinstance(flown, Velocity)
     assert (flown.forward, flown.left, flown.up, flown.yaw_rate) == pytest.approx((1.0, 0.2, 1.5, -0.5))
-    assert network(np.full((12, 16), 255, np.uint8), [0, 0]) == Velocity(1.0, 1.0), "a grey picture"
+    assert network(np.full((12, 16), 255, np.uint8), [0, 0]) == Velocity(1.0, 1.0), "a grey image"
 
 
-def test_a_frame_is_flown_by_its_picture_and_the_state_at_its_capture(drone: Recorder, policy: Path) -> None:
+def test_a_set_point_comes_from_the_image_and_the_state_at_its_capture(drone: Recorder, policy: Path) -> None:
     pilot = fly(drone, policy)
     assert pilot.camera == "front"
     pilot.on_frame(frame(1_000_000_000, []))
@@ -67,7 +67,7 @@ def test_a_frame_is_flown_by_its_picture_and_the_state_at_its_capture(drone: Rec
 def counting(
     path: Path, *, shape: Sequence[Any] = (1, 4), after: Sequence[int] = (1, 4), step: float = 1.0, output: str = ""
 ) -> Path:
-    """Write a policy with a memory that counts pictures: its action is how many there were."""
+    """Write a policy with a memory that counts images: its action is the count."""
     picture = helper.make_tensor_value_info("observation.images.front", TensorProto.FLOAT, [1, 3, 12, 16])
     memory = helper.make_tensor_value_info("memory", TensorProto.FLOAT, list(shape))
     output = output or "next_memory"
@@ -88,17 +88,17 @@ def counting(
     return path
 
 
-def test_what_a_network_remembers_is_given_to_it_with_the_next_picture(tmp_path: Path) -> None:
+def test_a_networks_memory_returns_with_the_next_image(tmp_path: Path) -> None:
     network = PolicyNetwork(counting(tmp_path / "policy.onnx"))
     image = np.zeros((12, 16), np.uint8)
     assert [network(image, []).yaw_rate for _ in range(3)] == [1, 2, 3]
     network.forget()
     assert network(image, []).yaw_rate == 1
     endless = PolicyNetwork(counting(tmp_path / "endless.onnx", step=3e38))
-    assert [endless(image, []).finite for _ in range(3)] == [True, False, True], "what is not finite is forgotten"
+    assert [endless(image, []).finite for _ in range(3)] == [True, False, True], "NaN and infinity are forgotten"
 
 
-def test_after_a_gap_in_the_pictures_it_starts_anew(drone: Recorder, tmp_path: Path) -> None:
+def test_after_a_gap_in_the_frames_the_memory_restarts(drone: Recorder, tmp_path: Path) -> None:
     pilot = fly(drone, counting(tmp_path / "policy.onnx"))
     for at_s in (1.0, 1.1, 1.2, 1.8):
         pilot.on_frame(frame(round(at_s * 1e9), []))
@@ -114,22 +114,23 @@ def test_after_a_gap_in_the_pictures_it_starts_anew(drone: Recorder, tmp_path: P
         ({"after": (2, 4)}, r"takes memory as \(1, 4\) and gives next_memory as \(2, 4\): they must be alike"),
     ],
 )
-def test_a_memory_that_can_not_be_handed_on_is_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
+def test_an_unusable_memory_is_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
     with pytest.raises(FileFormatError, match=words):
         PolicyNetwork(counting(tmp_path / "policy.onnx", **how))
 
 
-def test_it_hovers_while_it_does_not_know_what_the_policy_needs(drone: Recorder, tmp_path: Path) -> None:
+def test_it_hovers_while_a_needed_value_is_missing(drone: Recorder, tmp_path: Path) -> None:
     pilot = fly(drone, write(tmp_path / "policy.onnx"))
     pilot.on_frame(frame(1_000_000_000, [], known=False))
     assert (drone.velocities, drone.hovers) == ([], 1)
     pilot.on_frame(frame(1_100_000_000, []))
     assert len(drone.velocities) == 1
     pilot.on_frame(frame(1_200_000_000, [], known=False))
-    assert drone.told[-1] == ("policy: the drone does not know all that the policy needs: hovering", Severity.WARNING)
+    missing = "policy: the drone does not report all values that the policy needs: hovering"
+    assert drone.told[-1] == (missing, Severity.WARNING)
 
 
-def test_it_hovers_where_the_state_is_from_long_before_the_picture(
+def test_it_hovers_if_the_state_is_much_older_than_the_image(
     drone: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pilot = fly(drone, write(tmp_path / "policy.onnx"))
@@ -138,7 +139,7 @@ def test_it_hovers_where_the_state_is_from_long_before_the_picture(
     assert (drone.velocities, drone.hovers, pilot.phase) == ([], 1, PolicyPhase.NO_STATE)
 
 
-def test_it_hovers_where_the_action_is_not_finite(drone: Recorder, tmp_path: Path) -> None:
+def test_it_hovers_if_the_action_is_not_finite(drone: Recorder, tmp_path: Path) -> None:
     pilot = fly(drone, write(tmp_path / "policy.onnx", weights=[[float("nan")] * 4] * 5))
     pilot.on_frame(frame(1_000_000_000, []))
     assert (drone.velocities, drone.hovers, pilot.phase) == ([], 1, PolicyPhase.NO_ACTION)
@@ -153,7 +154,7 @@ def test_a_policy_may_fly_by_attitude_and_without_state(tmp_path: Path) -> None:
         PolicyNetwork(path, state=NAMES)
 
 
-def test_names_may_be_given_where_the_file_has_none(tmp_path: Path) -> None:
+def test_names_can_be_given_if_the_file_has_none(tmp_path: Path) -> None:
     path = write(tmp_path / "policy.onnx", metadata={})
     network = PolicyNetwork(path, state=NAMES, action="velocity")
     assert network.state == tuple(NAMES)
@@ -172,7 +173,7 @@ def test_names_may_be_given_where_the_file_has_none(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "words"),
     [
-        ({"picture": "image"}, "must have one picture"),
+        ({"picture": "image"}, "must have one image"),
         ({"more": ["noise"]}, "the inputs .*noise"),
         ({"size": (1, 3, "height", 16)}, "must take float32"),
         ({"size": (1, 3, 5000, 16)}, "at most 4096"),
@@ -188,7 +189,7 @@ def test_files_that_are_no_policy_are_refused(tmp_path: Path, how: dict[str, Any
         PolicyNetwork(write(tmp_path / "policy.onnx", **how))
 
 
-def test_what_is_no_file_or_out_of_range_is_refused(
+def test_missing_files_and_values_out_of_range_are_refused(
     drone: Recorder, tmp_path: Path, policy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(UsageError, match="there is no file"):

@@ -1,4 +1,4 @@
-"""Paths: is the velocity that of the position, and are speeds, ends and corners as asked for?"""
+"""Paths: does the velocity match the position, and are speeds, ends and corners as configured?"""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def path(name: str) -> Path:
 
 
 @pytest.mark.parametrize("name", [*PATHS, "spline"])
-def test_the_velocity_is_that_of_the_position(name: str) -> None:
+def test_the_velocity_matches_the_position(name: str) -> None:
     flown = path(name)
     end, h = flown.duration_s, 1e-4
     for t in np.linspace(0.01, end - 0.01, 500):
@@ -53,11 +53,11 @@ def test_speed_and_acceleration_stay_within_their_limits(name: str, speed: float
     speeds = np.linalg.norm(velocities, axis=1)
     assert speeds.max() == pytest.approx(speed, rel=0.01)
     changes = np.linalg.norm(np.diff(velocities, axis=0), axis=1) / 0.01
-    # along 0.8 at most; across v²/r besides, on arcs as much again
+    # at most 0.8 along the path, plus v²/r across it, as much again on arcs
     assert changes.max() < 0.8 * math.sqrt(2) + 0.02
 
 
-def test_a_square_with_stops_takes_the_time_that_it_should() -> None:
+def test_a_square_with_stops_takes_the_expected_time() -> None:
     leg = 2 / 0.5 + 0.5 / 0.8  # the trapezoid loses v/a
     assert Polyline(SQUARE).duration_s == pytest.approx(4 * leg)
     assert Polyline(SQUARE).position(leg) == pytest.approx([2, 0, 1])
@@ -65,7 +65,7 @@ def test_a_square_with_stops_takes_the_time_that_it_should() -> None:
     assert Polyline(SQUARE).velocity(leg / 2) == pytest.approx([0.5, 0, 0])
 
 
-def test_corners_are_cut_as_far_as_asked() -> None:
+def test_corners_are_cut_as_configured() -> None:
     flown = PATHS["rounded"]
     points = np.array([flown.position(t) for t in np.arange(0, flown.duration_s, 0.01)])
     nearest = np.min(np.linalg.norm(points - [2, 0, 1], axis=1))
@@ -80,7 +80,7 @@ def test_a_way_back_and_a_straight_joint() -> None:
     assert straight.position(straight.duration_s) == pytest.approx([2, 0, 1])
 
 
-def test_what_can_not_be_divided_by_is_refused() -> None:
+def test_values_that_can_not_be_divided_by_are_refused() -> None:
     for numbers in (
         {"speed_m_s": 5e-324},
         {"acceleration_m_s2": 5e-324},
@@ -103,7 +103,7 @@ def test_what_can_not_be_divided_by_is_refused() -> None:
         Polyline([(0, 0, 0), (1e300, 0, 0)])
     with pytest.raises(UsageError, match="at least"):
         Spline([(0, 0, 0), (1, 0, 0)], [0.0, 5e-324])
-    with pytest.raises(UsageError, match="has no end"):
+    with pytest.raises(UsageError, match="never ends"):
         MotionProfile([(1.0, 0.0)], 1.0)
 
 
@@ -130,7 +130,7 @@ def test_profiles_keep_each_stretch_s_limit(stretches: list[tuple[float, float]]
     assert profile.at(0.0) == (0.0, 0.0)
 
 
-def test_circle_goes_round_the_right_way() -> None:
+def test_a_circle_has_the_right_direction() -> None:
     left = Circle((0, 0, 1), 1.0, begin_rad=math.pi / 2)
     assert left.position(0.0) == pytest.approx([0, 1, 1])
     assert left.velocity(1.0)[0] < 0.0, "counter-clockwise from the north is westward"
@@ -155,6 +155,6 @@ def test_circle_goes_round_the_right_way() -> None:
         lambda: Spline([(0, 0, 1), (1, 0, 1)], [1.0, 2.0]),
     ],
 )
-def test_what_makes_no_sense(make: object) -> None:
+def test_invalid_arguments(make: object) -> None:
     with pytest.raises(UsageError):
         make()  # type: ignore[operator]

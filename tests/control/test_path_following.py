@@ -1,4 +1,4 @@
-"""Paths and waypoints flown by the whole of Skyloop in simulated time, with noise, delay and loss."""
+"""Paths and waypoints flown by all of Skyloop in simulated time, with noise, delay and loss."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def truth(feedback: Feedback) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def errors() -> ModuleType:
-    """The script that measures."""
+    """The measuring script."""
     spec = importlib.util.spec_from_file_location(
         "control_errors", File(__file__).parents[2] / "scripts" / "control_errors.py"
     )
@@ -41,7 +41,7 @@ def errors() -> ModuleType:
 
 
 @pytest.mark.parametrize(("gust", "seed"), [(0.0, 0), (0.0, 1), (1.0, 0), (1.0, 4)])
-def test_waypoint_square_is_flown_as_closely_as_it_must_be(errors: ModuleType, gust: float, seed: int) -> None:
+def test_waypoint_square_is_flown_accurately(errors: ModuleType, gust: float, seed: int) -> None:
     result = errors.fly(errors.FLIGHTS["waypoint square of 2 m at 0.5 m/s"], seed, gust)
     assert result.done
     assert result.to_path.rms_m <= errors.TARGET_M
@@ -52,7 +52,7 @@ def test_waypoint_square_is_flown_as_closely_as_it_must_be(errors: ModuleType, g
 @pytest.mark.parametrize(
     "name", ["circle of 1 m at 0.7 m/s, looking ahead", "eight of 3 m at 0.8 m/s, looking at a point"]
 )
-def test_curves_are_flown_closely(errors: ModuleType, name: str) -> None:
+def test_curves_are_flown_accurately(errors: ModuleType, name: str) -> None:
     result = errors.fly(errors.FLIGHTS[name], 2)
     assert result.done
     assert result.to_path.rms_m < 0.1
@@ -64,7 +64,7 @@ def test_two_flights_with_the_same_seeds_are_the_same(errors: ModuleType) -> Non
     assert first.to_path.samples == second.to_path.samples
 
 
-def test_waypoints_are_reached_held_and_looked_from() -> None:
+def test_waypoints_are_reached_and_held_at_their_yaw() -> None:
     with rehearse(CALM) as drone:
         drone.takeoff()
         seen: list[tuple[int, float, np.ndarray, float]] = []
@@ -75,26 +75,26 @@ def test_waypoints_are_reached_held_and_looked_from() -> None:
         assert flight.done
         assert flight.reached == 2
         near = [s for s in seen if s[0] == 0 and np.linalg.norm(s[2] - [0.5, 0, 1]) < 0.2 and abs(s[3] - 1.0) < 0.2]
-        assert near[-1][1] - near[0][1] > 0.9, "it stayed for the time wanted"
+        assert near[-1][1] - near[0][1] > 0.9, "it stayed for the wanted time"
         assert np.linalg.norm(seen[-1][2] - [0.5, 0.4, 1.2]) < 0.2
         assert seen[-1][3] == pytest.approx(-0.5, abs=0.2), "without a yaw of its own, the flight's"
         assert 0.0 < flight.error.rms_m < 0.15
         assert flight.error.largest_m >= flight.error.rms_m
 
 
-def test_a_path_begins_where_it_begins() -> None:
+def test_a_path_begins_at_its_start() -> None:
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = FollowPath(drone, Polyline([(0.8, 0.5, 1.2), (0.8, -0.3, 1.2)]))
         assert flight.run(seconds=30.0).reason == "stopped"
         assert flight.on_path
         assert np.linalg.norm(truth(drone.feedback()) - [0.8, -0.3, 1.2]) < 0.25
-        assert flight.error.samples < 250, "what it flew to the begin does not count"
+        assert flight.error.samples < 250, "the flight to the start does not count"
         assert drone.wait("hovering").state == "hovering"
 
 
 class Capture:
-    """Motion capture as the test plays it: the true place, 30 ms old, and a while without."""
+    """Scripted motion capture: the true place, 30 ms old, with a gap."""
 
     def __init__(self, drone: Drone) -> None:
         self.blind = False
@@ -130,12 +130,12 @@ def test_another_source_of_positions_and_its_loss(how: str) -> None:
         assert flight.done
         texts = [event.text for event in drone.recent_events()]
         assert "the position is not known: hovering" in texts
-        assert "the position is known again: flying on" in texts
+        assert "the position is known again: continuing" in texts
         assert flight.error.rms_m < 0.2
 
 
-def test_one_fix_that_is_no_number_is_no_fix() -> None:
-    """One NaN of a source of positions, and the vehicle climbed for ever."""
+def test_a_fix_with_nan_is_ignored() -> None:
+    """One NaN from a position source made the vehicle climb forever."""
     with rehearse("sim://?world=empty&cameras=none&wind=0") as drone:
         drone.takeoff()
         capture = Capture(drone)
@@ -156,7 +156,7 @@ def test_one_fix_that_is_no_number_is_no_fix() -> None:
         assert "the position is not known: hovering" in [event.text for event in drone.recent_events()]
 
 
-def test_while_others_fly_it_a_path_waits_and_integrates_nothing() -> None:
+def test_a_path_waits_without_integrating_while_another_client_flies() -> None:
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = FollowPath(drone, Polyline([(0, 0, 1), (5, 0, 1)]))
@@ -176,7 +176,7 @@ def test_while_others_fly_it_a_path_waits_and_integrates_nothing() -> None:
 
 @pytest.mark.parametrize("taken", [{"others": "the pilot's switch"}, {"failsafe": Failsafe.HOVER}])
 def test_a_path_waits_while_its_set_points_have_no_effect(taken: dict[str, Any]) -> None:
-    """Without a word to the program: a safety pilot's mode switch leaves it the authority."""
+    """Without notice to the program: a safety pilot's mode switch leaves it the authority."""
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = FollowPath(drone, Polyline([(0, 0, 1), (5, 0, 1)]))
@@ -190,8 +190,8 @@ def test_a_path_waits_while_its_set_points_have_no_effect(taken: dict[str, Any])
         assert not flight._law._loop.integral.any()
 
 
-def test_a_finished_flight_does_not_begin_again_and_its_run_returns() -> None:
-    """The second run waited for ever for an end that had been reached before."""
+def test_a_finished_flight_does_not_restart_and_run_returns() -> None:
+    """The second run waited forever for an end already reached."""
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = Waypoints(drone, [(0.3, 0, 1)])
@@ -217,7 +217,7 @@ def test_a_vehicle_without_position_flies_by_its_velocity() -> None:
         assert reckoning() == last
 
 
-def test_the_same_place_twice_is_no_way() -> None:
+def test_the_same_waypoint_twice_works() -> None:
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = Waypoints(drone, [(0.3, 0, 1), (0.3, 0, 1)], hold_s=0.3)
@@ -225,9 +225,9 @@ def test_the_same_place_twice_is_no_way() -> None:
         assert flight.reached == 2
 
 
-def test_what_it_cannot_do_is_said() -> None:
+def test_impossible_flights_are_refused() -> None:
     with rehearse("sim://?world=empty&cameras=none&position=none") as drone:
-        with pytest.raises(UsageError, match=r"does not report its position: .*give the controller a source"):
+        with pytest.raises(UsageError, match=r"does not report its position: .*give the controller a position source"):
             FollowPath(drone, Circle((0, 0, 1), 0.5)).run(seconds=1.0)
         with pytest.raises(UsageError, match="no waypoint"):
             Waypoints(drone, [])
@@ -240,18 +240,18 @@ def test_what_it_cannot_do_is_said() -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"drop": 1.0}, {"command_delay_s": -0.1}, {"position_noise_m": math.nan}])
-def test_a_radio_that_makes_no_sense(wrong: dict[str, float]) -> None:
+def test_invalid_radio_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
         Radio(**wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("uri", ["sim://?speed=3", "replay://x.mcap", "nonsense"])
-def test_what_cannot_be_rehearsed(uri: str) -> None:
+def test_addresses_that_cannot_be_rehearsed_are_refused(uri: str) -> None:
     with pytest.raises(UsageError), rehearse(uri):
         pass
 
 
-def test_pictures_come_in_simulated_time() -> None:
+def test_frames_arrive_in_simulated_time() -> None:
     pytest.importorskip("cv2", reason="pictures are drawn with OpenCV")
     radio = Radio(drop=0.0, picture_delay_s=0.1)
     with rehearse("sim://?cameras=front&fps=10", radio=radio) as drone:
@@ -265,7 +265,7 @@ def test_pictures_come_in_simulated_time() -> None:
         assert second.feedback is not None
 
 
-def test_pictures_are_lost_on_the_way() -> None:
+def test_frames_are_lost_on_the_way() -> None:
     with rehearse("sim://?world=empty&cameras=front&fps=15", radio=Radio(drop=0.5)) as drone:
         frames = drone.frames()
         seen = [next(frames).captured_ns for _ in range(8)]

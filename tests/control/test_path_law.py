@@ -1,4 +1,4 @@
-"""The path's law by itself: directions, yaw, limits, waiting."""
+"""The path's law alone: directions, yaw, limits, waiting."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_errors_are_turned_into_the_body_s_axes() -> None:
     assert wanted.yaw_rate == pytest.approx(0.0), "the yaw that it had is kept"
 
 
-def test_the_integral_takes_out_a_wind_that_the_vehicle_does_not() -> None:
+def test_the_integral_removes_a_wind_that_the_vehicle_does_not() -> None:
     law = PathLaw(Polyline([(0, 0, 1), (0.1, 0, 1)]))
     place, t, wind = np.array([0.0, 0.0, 1.0]), 0.0, np.array([0.2, -0.3, 0.05])
     for _ in range(3000):
@@ -47,8 +47,8 @@ def test_the_integral_takes_out_a_wind_that_the_vehicle_does_not() -> None:
 
 @pytest.mark.parametrize("velocity_gain", [0.0, 1.0, 2.0])
 @pytest.mark.parametrize("wind", [0.3, -0.6])
-def test_the_integral_takes_out_a_wind_whatever_is_asked_for_on_top(velocity_gain: float, wind: float) -> None:
-    """It mirrored the error that the wind makes, -0.264 m for good, as it was told of more than it had asked for."""
+def test_the_integral_removes_a_wind_with_any_velocity_gain(velocity_gain: float, wind: float) -> None:
+    """It mirrored the wind's error, -0.264 m for good, because more was reported applied than requested."""
     law = PathLaw(Polyline([(0, 0, 1), (0.1, 0, 1)]), PathSettings(velocity_gain=velocity_gain))
     x = v = t = 0.0
     for _ in range(4000):
@@ -59,7 +59,7 @@ def test_the_integral_takes_out_a_wind_whatever_is_asked_for_on_top(velocity_gai
 
 
 def held_beside(law: PathLaw, held_s: float, *, taken_over: bool) -> tuple[float, float]:
-    """A vehicle that is held 0.4 m beside its place for a while; its fastest and farthest to the other side after."""
+    """Hold a vehicle 0.4 m beside its place for a while; return its greatest speed and overshoot afterwards."""
     x = v = fastest = farthest = 0.0
     for k in range(round((held_s + 20.0) / 0.025)):
         t = k * 0.025
@@ -78,17 +78,17 @@ def held_beside(law: PathLaw, held_s: float, *, taken_over: bool) -> tuple[float
 
 
 @pytest.mark.parametrize("held_s", [10.0, 60.0])
-def test_what_happens_in_a_take_over_is_not_integrated(held_s: float) -> None:
-    """It came back at 1.5 m/s and far beyond its place, after a minute."""
+def test_errors_during_a_takeover_are_not_integrated(held_s: float) -> None:
+    """After a minute it came back at 1.5 m/s and far beyond its place."""
     still = Polyline([(0, 0, 1), (0.001, 0, 1)])
     fastest, farthest = held_beside(PathLaw(still), held_s, taken_over=True)
     assert fastest < 0.8
     assert farthest > -0.1
-    fastest, farthest = held_beside(PathLaw(still), held_s, taken_over=False)  # by a wall: nothing tells of it
+    fastest, farthest = held_beside(PathLaw(still), held_s, taken_over=False)  # by a wall: nothing reports it
     assert farthest > -1.2, "the integral is bounded"
 
 
-def test_the_integral_does_not_grow_by_what_the_limits_take_off() -> None:
+def test_the_integral_does_not_grow_beyond_the_limits() -> None:
     settings = PathSettings(limits=SetpointLimits(speed_m_s=0.3), leash_m=5.0)
     law, x, v, farthest = PathLaw(Polyline([(0, 0, 1), (6, 0, 1)], speed_m_s=0.8), settings), 0.0, 0.0, 0.0
     for k in range(2400):
@@ -111,8 +111,8 @@ def test_the_drones_own_limits_are_those_of_the_set_points() -> None:
         max_size=20,
     )
 )
-def test_a_fix_that_is_no_number_pauses_and_leaves_nothing_behind(fixes: list[tuple[float, ...]]) -> None:
-    """One NaN of a position source, and it climbed for ever."""
+def test_a_fix_with_nan_pauses_and_leaves_no_trace(fixes: list[tuple[float, ...]]) -> None:
+    """One NaN from a position source made it climb forever."""
     law, t = PathLaw(EAST), 0.0
     for x, y, z, yaw, vx, vy, vz, dt in fixes:
         t += dt
@@ -126,13 +126,13 @@ def test_a_fix_that_is_no_number_pauses_and_leaves_nothing_behind(fixes: list[tu
     assert law.step(Fix(nanoseconds(t + 1.0), (here[0], here[1], here[2]), 0.0, (0.0, 0.0, 0.0))).up == 0.0
 
 
-def test_what_is_known_of_the_velocity_is_used() -> None:
+def test_a_known_velocity_is_used() -> None:
     law = PathLaw(EAST, PathSettings(gains=Gains(p=1.0), velocity_gain=0.5, lead_s=0.0))
     wanted = law.step(Fix(0, (0.0, -0.3, 1.0), 0.0, (0.0, -0.2, 0.0)))
     assert wanted.left == pytest.approx(0.3 + 0.5 * (0.3 + 0.2))
 
 
-def test_time_goes_on_with_the_fixes_and_waits_for_who_is_far_away() -> None:
+def test_time_advances_with_fixes_and_waits_for_a_distant_vehicle() -> None:
     law = PathLaw(EAST, PathSettings(leash_m=0.5))
     law.step(fix(1.0, 0.0, 0.0, 1.0))
     law.step(fix(1.2, 0.0, 0.0, 1.0))
@@ -140,14 +140,14 @@ def test_time_goes_on_with_the_fixes_and_waits_for_who_is_far_away() -> None:
     law.step(fix(1.2, 0.0, 0.0, 1.0))  # the same again
     assert law.time_s == pytest.approx(0.2)
     law.step(fix(1.3, 0.0, 5.0, 1.0))
-    assert law.time_s == pytest.approx(0.2), "farther than twice the leash: the path waits"
+    assert law.time_s == pytest.approx(0.2), "beyond twice the leash the path waits"
     law.step(fix(1.4, 0.0, 0.75, 1.0))
     assert law.time_s == pytest.approx(0.25, abs=0.01)
     law.step(fix(60.0, 0.0, 0.0, 1.0))
     assert law.time_s < 0.8, "a gap is no leap"
 
 
-def test_there_means_over_and_near_and_turned() -> None:
+def test_there_means_ended_near_and_turned() -> None:
     law = PathLaw(Polyline([(0, 0, 1), (0.1, 0, 1)]), yaw=FixedYaw(1.0))
     here = fix(1.0, 0.1, 0.0, 1.0, yaw=1.0)
     law.step(here)
@@ -203,7 +203,7 @@ def test_set_points_stay_within_the_limits(fixes: list[tuple[float, float, float
         assert abs(wanted.yaw_rate) <= 1.0 + 1e-9
 
 
-def test_a_fix_of_feedback_has_its_velocity_in_world_axes() -> None:
+def test_a_fix_from_feedback_has_its_velocity_in_world_axes() -> None:
     known = Feedback(captured_ns=5, position_m=(1.0, 2.0, 3.0), yaw_rad=math.pi / 2, velocity_m_s=(0.5, 0.1, 0.2))
     found = fix_of(known)
     assert found is not None
@@ -218,7 +218,7 @@ def test_a_fix_of_feedback_has_its_velocity_in_world_axes() -> None:
     "wrong",
     [{"leash_m": 0.0}, {"near_m": -1.0}, {"lead_s": math.nan}, {"velocity_gain": -0.1}, {"gains": Gains(d=0.1)}],
 )
-def test_settings_that_make_no_sense(wrong: dict[str, Any]) -> None:
+def test_invalid_settings(wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
         PathSettings(**wrong)
 
@@ -227,7 +227,7 @@ def test_settings_that_make_no_sense(wrong: dict[str, Any]) -> None:
     ("wrong", "allowed"),
     [({"lead_s": -1.0}, "a finite number, 0 or more"), ({"near_m": 0.0}, "a finite number above 0")],
 )
-def test_what_is_allowed_is_said_as_it_is(wrong: dict[str, float], allowed: str) -> None:
+def test_errors_state_the_allowed_range(wrong: dict[str, float], allowed: str) -> None:
     with pytest.raises(UsageError, match=f"must be {allowed}"):
         PathSettings(**wrong)  # type: ignore[arg-type]
     assert PathSettings(velocity_gain=0.0, yaw_gain=0.0, lead_s=0.0).lead_s == 0.0

@@ -1,4 +1,4 @@
-"""The PID loop against what is known of it in closed form, and against plants."""
+"""The PID loop against closed forms and against plants."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DT = 0.02
 
 
 def fly(pid: Pid, seconds: float, *, goal: float = 1.0, push: float = 0.0, lag_s: float = 0.3) -> list[float]:
-    """A first-order lag with a constant push on it; returns what was measured."""
+    """Fly a first-order lag with a constant push; return the measurements."""
     y, seen = 0.0, []
     for _ in range(round(seconds / DT)):
         u = pid.step(goal, y, DT)
@@ -24,19 +24,19 @@ def fly(pid: Pid, seconds: float, *, goal: float = 1.0, push: float = 0.0, lag_s
     return seen
 
 
-def test_terms_are_what_the_formula_says() -> None:
+def test_terms_match_the_formula() -> None:
     pid = Pid(Gains(p=2.0, i=0.5, d=0.1, derivative_filter_s=0.0))
-    assert pid.step(1.0, 0.0, DT) == pytest.approx(2.0)  # no slope is known yet, and nothing was summed up
+    assert pid.step(1.0, 0.0, DT) == pytest.approx(2.0)  # no slope and no integral yet
     slope = 0.1 / DT
     assert pid.step(1.0, 0.1, DT, feed_forward=3.0) == pytest.approx(3.0 + 2.0 * 0.9 + 0.5 * 0.9 * DT - 0.1 * slope)
 
 
-def test_proportional_alone_leaves_an_offset_and_the_integral_takes_it_out() -> None:
+def test_proportional_alone_leaves_an_offset_and_the_integral_removes_it() -> None:
     assert fly(Pid(Gains(p=4.0)), 10.0, push=-0.5)[-1] == pytest.approx((4.0 - 0.5) / 5.0, abs=1e-3)
     assert fly(Pid(Gains(p=4.0, i=3.0)), 20.0, push=-0.5)[-1] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_step_of_the_set_point_is_no_kick_of_the_derivative() -> None:
+def test_a_set_point_step_causes_no_derivative_kick() -> None:
     pid = Pid(Gains(p=1.0, d=5.0))
     pid.step(0.0, 0.0, DT)
     assert pid.step(1.0, 0.0, DT) == pytest.approx(1.0)
@@ -53,7 +53,7 @@ def test_derivative_is_filtered() -> None:
 
 
 def test_back_calculation_keeps_the_overshoot_small() -> None:
-    """Against the same loop whose limit is applied outside, behind its back."""
+    """Compared with the same loop with a limit outside that it does not know of."""
     gains = Gains(p=2.0, i=4.0)
     wound = Pid(gains)
     y = top = 0.0
@@ -65,11 +65,11 @@ def test_back_calculation_keeps_the_overshoot_small() -> None:
     for k in range(1500):
         z += (limited.step(1.0 if k < 500 else 0.3, z, DT) - z) * DT / 0.3
         highest = max(highest, z if k > 800 else 0.0)
-    assert top > 0.65, "the integral of the first went on growing, and keeps it up"
+    assert top > 0.65, "the other loop's integral kept growing"
     assert highest < 0.31
 
 
-def test_a_limit_outside_is_told() -> None:
+def test_a_limit_outside_is_reported() -> None:
     pid = Pid(Gains(p=1.0, i=1.0))
     for _ in range(1000):
         pid.step(1.0, 0.0, DT)
@@ -85,7 +85,7 @@ def test_without_p_the_integral_follows_the_limit_at_once() -> None:
     assert pid.integral == pytest.approx(0.5)
 
 
-def test_new_gains_are_no_jump_while_there_is_an_integral() -> None:
+def test_new_gains_cause_no_jump_with_an_integral() -> None:
     pid = Pid(Gains(p=1.0, i=0.5, d=0.2))
     y = 0.0
     for _ in range(100):
@@ -99,7 +99,7 @@ def test_new_gains_are_no_jump_while_there_is_an_integral() -> None:
     assert pid.integral == 0.0
 
 
-def test_taking_over_is_no_jump() -> None:
+def test_taking_over_causes_no_jump() -> None:
     pid = Pid(Gains(p=2.0, i=1.0))
     pid.reset(0.7, set_point=1.0, measured=0.4)
     assert pid.step(1.0, 0.4, DT) == pytest.approx(0.7, abs=0.02)
@@ -112,7 +112,7 @@ def test_rate_limit() -> None:
     assert pid.step(1.0, 0.0, 0.0) == pytest.approx(0.6), "in no time nothing changes"
 
 
-def test_angles_go_the_short_way() -> None:
+def test_angles_take_the_shorter_way() -> None:
     pid = Pid(Gains(p=1.0, d=0.1, derivative_filter_s=0.0), angle=True)
     assert pid.step(3.1, -3.1, DT) == pytest.approx(6.2 - 2 * math.pi)
     slope = (3.13 - (-3.1 + 2 * math.pi)) / DT
@@ -140,12 +140,12 @@ def test_output_stays_within_its_limits(
 
 
 @pytest.mark.parametrize("wrong", [{"p": -1.0}, {"i": math.nan}, {"d": math.inf}, {"tracking_s": -0.1}])
-def test_gains_that_make_no_sense(wrong: dict[str, float]) -> None:
+def test_invalid_gains(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
         Gains(**wrong)
 
 
-def test_limits_that_make_no_sense() -> None:
+def test_invalid_limits() -> None:
     with pytest.raises(UsageError, match="below high"):
         Pid(Gains(), low=1.0, high=1.0)
     with pytest.raises(UsageError, match="rate"):
@@ -153,7 +153,7 @@ def test_limits_that_make_no_sense() -> None:
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
-def test_one_measurement_that_is_no_number_leaves_the_loop_as_it_was(wrong: float) -> None:
+def test_a_nan_measurement_leaves_the_loop_unchanged(wrong: float) -> None:
     pid, other = (Pid(Gains(p=1.0, i=0.5, d=0.1), low=-1.0, high=1.0) for _ in range(2))
     before = [loop.step(0.0, 0.1, 0.02) for loop in (pid, other)]
     assert pid.step(0.0, wrong, 0.02) == before[0]

@@ -1,4 +1,4 @@
-"""Loading a controller's file anew when it was saved."""
+"""Reload a controller's file after a save."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_a_saved_file_is_loaded_even_within_the_same_second_and_with_the_same_si
         file.write_text(TEXT.replace("number = 1", f"number = {number}"))
         reloader.look()
         assert controller(reloader).number == int(number)  # type: ignore[attr-defined]
-    assert reloader.take() is None, "each is told once"
+    assert reloader.take() is None, "each change is reported once"
 
 
 def test_a_neighbour_that_it_imports_counts_too(file: Path) -> None:
@@ -71,7 +71,7 @@ def test_a_neighbour_that_it_imports_counts_too(file: Path) -> None:
     assert not reloader.waiting
 
 
-def test_a_broken_file_is_told_and_a_mended_one_loaded(file: Path) -> None:
+def test_a_broken_file_is_reported_and_a_fixed_one_loaded(file: Path) -> None:
     load_controller(file)
     gains = sys.modules["gains"]
     reloader = Reloader(file, look_s=0.002)
@@ -80,13 +80,13 @@ def test_a_broken_file_is_told_and_a_mended_one_loaded(file: Path) -> None:
     error = reloader.take()
     assert isinstance(error, FileFormatError)
     assert "line 1" in str(error)
-    assert sys.modules["gains"] is gains, "what flies keeps its modules"
+    assert sys.modules["gains"] is gains, "the flying controller keeps its modules"
     file.write_text(TEXT.replace("number = 1", "number = 7"))
     reloader.look()
     assert controller(reloader).number == 7  # type: ignore[attr-defined]
 
 
-def test_a_file_that_is_away_for_a_moment_is_told_and_found_again(file: Path) -> None:
+def test_a_file_missing_for_a_moment_is_reported_and_found_again(file: Path) -> None:
     load_controller(file)
     reloader = Reloader(file, look_s=0.002)
     file.rename(file.with_suffix(".old"))
@@ -97,7 +97,7 @@ def test_a_file_that_is_away_for_a_moment_is_told_and_found_again(file: Path) ->
     assert controller(reloader).number == 1  # type: ignore[attr-defined]
 
 
-def test_the_thread_looks_and_ends_with_its_block(file: Path) -> None:
+def test_the_thread_polls_and_ends_with_its_block(file: Path) -> None:
     load_controller(file)
     with Reloader(file, look_s=0.002) as reloader:
         file.write_text(TEXT.replace("number = 1", "number = 3"))

@@ -1,4 +1,4 @@
-"""The model of a vehicle's answer, against a vehicle with delay, lean, lag and wind."""
+"""The model of a vehicle's response, against a vehicle with delay, lean, lag and wind."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRAVITY = 9.80665
 
 
 class Vehicle:
-    """Leans by the velocity's error, late; one axis, forward; its lean is limited."""
+    """Leans by the velocity error, with a delay; one axis, forward; limited lean."""
 
     def __init__(self, gain: float = 2.0, lag: float = 0.1, delay: float = 0.05, wind: float = 0.0) -> None:
         self.gain, self.lag, self.wind = gain, lag, wind
@@ -48,7 +48,7 @@ class Vehicle:
 
 
 def hold(vehicle: Vehicle, seconds: float = 12.0) -> list[float]:
-    """Keep a position with gains that a loop without prediction would swing by; returns the positions."""
+    """Hold a position with gains at which a loop without prediction oscillates; return the positions."""
     response = VelocityResponse()
     most = response.settings.most_m_s2
     places, setpoint = [], 0.0
@@ -70,16 +70,14 @@ def hold(vehicle: Vehicle, seconds: float = 12.0) -> list[float]:
     ("gain", "lag", "delay"),
     [(2.0, 0.1, 0.05), (1.5, 0.1, 0.05), (2.6, 0.1, 0.05), (2.0, 0.16, 0.05), (2.0, 0.1, 0.1), (2.0, 0.1, 0.0)],
 )
-def test_holds_a_position_against_wind_also_by_a_model_that_is_a_little_wrong(
-    gain: float, lag: float, delay: float
-) -> None:
+def test_holds_a_position_against_wind_even_with_a_slightly_wrong_model(gain: float, lag: float, delay: float) -> None:
     late = hold(Vehicle(gain, lag, delay, wind=0.8))[round(8.0 / DT) :]
     assert max(late) - 1.0 < 0.02
     assert 1.0 - min(late) < 0.02
 
 
 @pytest.mark.parametrize("push", [0.0, 0.8, -0.8])
-def test_takes_up_a_velocity_whatever_pushes(push: float) -> None:
+def test_reaches_a_velocity_against_any_push(push: float) -> None:
     vehicle, response = Vehicle(delay=0.1, wind=push), VelocityResponse(ResponseSettings(delay_s=0.1))
     velocities = []
     for k in range(round(6.0 / DT)):
@@ -95,7 +93,7 @@ def test_takes_up_a_velocity_whatever_pushes(push: float) -> None:
     assert max(velocities) < 1.35
 
 
-def test_learns_what_the_wind_does() -> None:
+def test_learns_the_wind() -> None:
     vehicle, response = Vehicle(wind=-1.2), VelocityResponse()
     for k in range(600):
         vehicle.step(0.5, 3.0)
@@ -108,7 +106,7 @@ def test_learns_what_the_wind_does() -> None:
     assert motion.at_ns == vehicle.now_ns + nanoseconds(0.05)
 
 
-def test_what_is_asked_for_is_within_the_lean() -> None:
+def test_set_points_stay_within_the_lean() -> None:
     response = VelocityResponse(ResponseSettings(tilt_rad=0.2))
     response.add(Vehicle().feedback())
     motion = response.predict(2 * NS_PER_S)
@@ -117,15 +115,15 @@ def test_what_is_asked_for_is_within_the_lean() -> None:
     assert setpoint == pytest.approx([GRAVITY * math.tan(0.2) / 2.0, 0.0])
 
 
-def test_knows_nothing_before_it_has_heard() -> None:
+def test_predicts_nothing_before_feedback() -> None:
     response = VelocityResponse()
     assert response.predict(0) is None
     response.add(Feedback(captured_ns=1, velocity_m_s=(1.0, 0.0, 0.0), yaw_rad=0.0))
     assert response.predict(NS_PER_S) is None, "without an attitude"
 
 
-def test_a_sample_that_was_stamped_ahead_freezes_nothing() -> None:
-    """For as long it believed the velocity of then, and asked for one the other way, whatever the vehicle did."""
+def test_a_sample_stamped_ahead_freezes_nothing() -> None:
+    """Until then it kept that velocity and commanded the opposite one, whatever the vehicle did."""
     vehicle, response = Vehicle(), VelocityResponse()
     for _ in range(200):
         vehicle.step(1.0, 5.0)

@@ -1,4 +1,4 @@
-"""Controllers that are told what processors find."""
+"""Controllers that receive processors' results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
 
 
 class Noting(Controller):
-    """Notes what it gets; ``then`` is called with each."""
+    """Records the results; ``then`` is called with each."""
 
     def __init__(self, drone: Drone, then: Callable[[Result], object] = lambda _: None) -> None:
         super().__init__(drone)
@@ -43,7 +43,7 @@ class Noting(Controller):
 def run(
     proxy: ScriptedProxy, controller: Controller, topic: str, *steps: Callable[[], object], until: Callable[[], bool]
 ) -> RunSummary:
-    """Run it while a thread takes the steps, the first one when the controller listens."""
+    """Run it while a thread takes the steps, the first one once the controller listens."""
     drone = controller.drone
     thread = background(lambda: drone.wait(lambda _: proxy.server.subscribers(topic) == 1, WAIT_S), *steps)
     summary = controller.run(WAIT_S, until)
@@ -53,7 +53,7 @@ def run(
     return summary
 
 
-def test_results_of_all_processors_come(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_results_of_all_processors_arrive(proxy: ScriptedProxy, drone: Drone) -> None:
     controller = Noting(drone)
     one, two = Sender(proxy), Sender(proxy, "finder")
     summary = run(
@@ -64,7 +64,7 @@ def test_results_of_all_processors_come(proxy: ScriptedProxy, drone: Drone) -> N
     assert "2 results (0 dropped, 0 too old)" in str(summary)
 
 
-def test_only_the_processors_that_are_named(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_only_the_named_processors(proxy: ScriptedProxy, drone: Drone) -> None:
     controller = Noting(drone)
     controller.processors = ("finder",)
     one, two = Sender(proxy), Sender(proxy, "finder")
@@ -75,7 +75,7 @@ def test_only_the_processors_that_are_named(proxy: ScriptedProxy, drone: Drone) 
         controller.run(0.0)
 
 
-def test_one_slot_a_processor_and_the_newest_wins(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_one_slot_per_processor_and_the_newest_wins(proxy: ScriptedProxy, drone: Drone) -> None:
     one, two = Sender(proxy), Sender(proxy, "finder")
 
     def busy(result: Result) -> None:
@@ -93,7 +93,7 @@ def test_one_slot_a_processor_and_the_newest_wins(proxy: ScriptedProxy, drone: D
     assert (summary.results, summary.results_dropped, summary.overruns) == (3, 3, 1)
 
 
-def test_old_results_and_overtaken_ones_are_not_flown_on(proxy: ScriptedProxy, drone: Drone) -> None:
+def test_old_and_overtaken_results_are_not_flown_by(proxy: ScriptedProxy, drone: Drone) -> None:
     sender = Sender(proxy)
 
     def late(result: Result) -> None:
@@ -105,7 +105,7 @@ def test_old_results_and_overtaken_ones_are_not_flown_on(proxy: ScriptedProxy, d
     steps = (lambda: sender.send(0, age_s=2.0), lambda: sender.send(2))
     summary = run(proxy, controller, RESULTS, *steps, until=lambda: ("detector", 3) in controller.got)
     assert controller.got == [("detector", 2), ("detector", 3)]
-    assert summary.results_expired + summary.results_dropped == 1  # the first one, whichever was faster
+    assert summary.results_expired + summary.results_dropped == 1  # the first one, depending on timing
     assert drone.stats["results/detector"].dropped == 1  # the overtaken one; the other was this controller's own limit
 
 

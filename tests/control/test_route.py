@@ -44,7 +44,7 @@ TOUR = Route(
 # The file --------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_saved_is_loaded_again(tmp_path: Path) -> None:
+def test_a_saved_route_is_loaded_again(tmp_path: Path) -> None:
     path = tmp_path / "tour.route.json"
     save_route(TOUR, path)
     assert load_route(path) == TOUR
@@ -90,14 +90,14 @@ ONE = '{"x": 1, "y": 2, "z": 1}'
         (f'{{"waypoints": [{",".join([ONE] * 201)}]}}', "length <= 200"),
     ],
 )
-def test_what_is_no_route_is_refused_with_the_place(text: str, words: str, tmp_path: Path) -> None:
+def test_invalid_routes_are_refused_with_the_place(text: str, words: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.route.json"
     path.write_text(text)
     with pytest.raises(UsageError, match=f"bad.route.json.*({words})"):
         load_route(path)
 
 
-def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_too_large_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="can't be read"):
         load_route(tmp_path / "none.route.json")
     (tmp_path / "big").write_bytes(b" " * 100_000)
@@ -135,15 +135,15 @@ def places(*points: tuple[float, float, float], **more: Any) -> Route:
         (places((3.5, 0, 1)), HERE, [(1, "blocks the straight line")]),
         (places((1, 0, -0.5)), Conditions(start=(0, 0, 1), ground_m=0.0, battery=1.0), [(1, "below the ground")]),
         (places((1, 0, 6)), Conditions(start=(0, 0, 1), ground_m=0.0, battery=1.0), [(1, "at most 5.00 m")]),
-        (places((1, 1, 1), speed=3.0), HERE, [(1, "at most 2 m/s flown")]),
+        (places((1, 1, 1), speed=3.0), HERE, [(1, "flown at 2 m/s")]),
         (places((1, 1, 1)), Conditions(problem="no position", battery=1.0), [(None, "no position")]),
-        (places((1, 1, 1)), Conditions(start=(0, 0, 1)), [(None, "not known")]),
+        (places((1, 1, 1)), Conditions(start=(0, 0, 1)), [(None, "is unknown")]),
         (places((3, 2, 1), (-3, 2, 1), speed=0.1), Conditions(start=(0, 0, 1), battery=0.2), [(None, "battery ends")]),
         (places((1, 1, 1)), Conditions(start=(0, 0, 1), battery=0.2), [(None, "at about 19%, below 20%")]),
         (places((1, 2, 1), (3.5, 0, 1), end="return"), HERE, [(2, "on the way back, a no-fly zone")]),
     ],
 )
-def test_what_speaks_against_a_route(route: Route, conditions: Conditions, found: list[tuple[int | None, str]]) -> None:
+def test_findings_of_a_check(route: Route, conditions: Conditions, found: list[tuple[int | None, str]]) -> None:
     check = check_route(route, conditions)
     assert [one.waypoint for one in check.findings] == [number for number, _ in found]
     for one, (_, words) in zip(check.findings, found, strict=True):
@@ -216,7 +216,7 @@ def test_a_whole_flight() -> None:
     assert actions_of(turned) == [Position(1.0, 1.0, 1.5, -1.0, 0.3)]
     assert actions_of(law.update(at(1, 1, 1.5, -1.0), 14 * NS_PER_S)) == [Position(1.0, 1.0, 1.5, math.pi, 0.3)]
     late = law.update(at(1, 1, 1.5, -1.0), 30 * NS_PER_S)
-    assert (kinds(late), actions_of(late)) == (["look"], [Position(0.0, 1.0, 1.0, None, 0.5)]), "the turn is given up"
+    assert (kinds(late), actions_of(late)) == (["look"], [Position(0.0, 1.0, 1.0, None, 0.5)]), "the turn timed out"
     done = law.update(at(0, 1, 1), 40 * NS_PER_S)
     assert (kinds(done), actions_of(done)) == (["waypoint_reached", "done"], [Hover()])
     assert law.over
@@ -237,8 +237,8 @@ def test_pause_resume_skip_and_stop() -> None:
 
 
 @pytest.mark.parametrize(("end", "last"), [("land", Land()), ("hover", Hover()), ("return", Land())])
-def test_a_paused_route_whose_last_waypoint_is_left_out_stays_paused(end: Any, last: Any) -> None:
-    """It landed, though a person had paused it."""
+def test_a_paused_route_whose_last_waypoint_is_skipped_stays_paused(end: Any, last: Any) -> None:
+    """It landed although a person had paused it."""
     law = RouteLaw(places((1, 0, 1), end=end))
     law.start(at(0, 0, 1))
     law.pause()
@@ -251,7 +251,7 @@ def test_a_paused_route_whose_last_waypoint_is_left_out_stays_paused(end: Any, l
     assert (kinds(on), actions_of(on), law.state) == (["resumed", "done"], [last], RouteState.DONE)
 
 
-def test_actions_go_on_after_a_pause_and_are_not_told_twice() -> None:
+def test_actions_continue_after_a_pause_and_are_not_reported_twice() -> None:
     law = RouteLaw(TOUR)
     law.start(at(0, 0, 1))
     there = at(1, 0, 1, math.pi / 2)
@@ -260,8 +260,8 @@ def test_actions_go_on_after_a_pause_and_are_not_told_twice() -> None:
     law.pause("somebody is in the way")
     assert law.problem == "somebody is in the way"
     assert actions_of(law.resume()) == [Position(1.0, 0.0, 1.0, math.pi / 2, 0.5)]
-    assert law.update(there, 9 * NS_PER_S) == [TakePhoto(1, None)], "it has waited already"
-    assert kinds(law.update(there, 15 * NS_PER_S)) == ["photo"], "and does not wait for a frame for ever"
+    assert law.update(there, 9 * NS_PER_S) == [TakePhoto(1, None)], "it has already waited"
+    assert kinds(law.update(there, 15 * NS_PER_S)) == ["photo"], "it does not wait for a frame forever"
 
 
 def test_a_leg_that_takes_too_long_pauses_it() -> None:
@@ -273,7 +273,7 @@ def test_a_leg_that_takes_too_long_pauses_it() -> None:
     assert "waypoint 1 of 3 was not reached in time" in law.problem
 
 
-def test_the_way_back_begins_at_the_last_and_ends_on_the_ground() -> None:
+def test_the_way_back_starts_at_the_last_waypoint_and_ends_on_the_ground() -> None:
     law = RouteLaw(places((1, 0, 2), end="return"))
     law.start(at(0, 0, 1))
     assert actions_of(law.update(at(1, 0, 2), 0)) == [Position(0.0, 0.0, 2.0, None, 0.5)]
@@ -289,14 +289,14 @@ def test_the_way_back_begins_at_the_last_and_ends_on_the_ground() -> None:
         (at(0, 0, 0, yaw_rad=None), "its yaw"),
     ],
 )
-def test_it_begins_in_the_air_with_a_position(feedback: Feedback, words: str) -> None:
+def test_it_starts_in_the_air_with_a_position(feedback: Feedback, words: str) -> None:
     law = RouteLaw(TOUR)
     with pytest.raises(UsageError, match=words):
         law.start(feedback)
     assert law.state is RouteState.READY
 
 
-def test_who_lands_it_ends_it_and_without_a_position_it_waits() -> None:
+def test_a_landing_ends_it_and_without_a_position_it_waits() -> None:
     law = RouteLaw(TOUR)
     law.start(at(0, 0, 1))
     assert law.update(at(0, 0, 1, position_m=None), NS_PER_S) == []
@@ -304,7 +304,7 @@ def test_who_lands_it_ends_it_and_without_a_position_it_waits() -> None:
 
 
 @given(st.lists(st.sampled_from(["pause", "resume", "skip", "stop", "there", "away", "photo"]), max_size=40))
-def test_whatever_happens_nothing_is_commanded_while_it_is_paused_or_over(happens: list[str]) -> None:
+def test_nothing_is_commanded_while_paused_or_over(happens: list[str]) -> None:
     law = RouteLaw(TOUR)
     law.start(at(0, 0, 1))
     for second, what in enumerate(happens):

@@ -1,4 +1,4 @@
-"""Routes are flown: in simulated time by the controller, refused legs and photos included."""
+"""Routes flown by the controller in simulated time, including refused legs and photos."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
 @pytest.mark.parametrize(
     ("fate", "told"), [(Fate.FAILSAFE, ENDED), (Fate.REFUSED, "position refused: a zone"), (Fate.REPLACED, TAKEN)]
 )
-def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stall_of_this_program_is_reported_as_such(fate: Fate, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with rehearse(CALM) as drone:
         flight = FlyRoute(drone, TRIANGLE)
         flight._leg = 7
@@ -95,7 +95,7 @@ def test_a_stall_of_this_program_is_told_as_what_it_was(fate: Fate, told: str, m
 
 
 def test_a_hover_of_the_same_program_is_not_ended_by_the_next_leg() -> None:
-    """It hovered through the rest of a wait at a waypoint, then flew on by itself."""
+    """It hovered through the rest of a wait at a waypoint, then continued unasked."""
     told: list[Progress] = []
     route = Route(waypoints=(RouteWaypoint(0.0, 0.0, 1.0, actions=(Wait(1.0),)), RouteWaypoint(3.0, 0.0, 1.0)))
     with rehearse(CALM) as drone:
@@ -110,11 +110,11 @@ def test_a_hover_of_the_same_program_is_not_ended_by_the_next_leg() -> None:
         flight.run(seconds=10.0)
         assert flight.law.state == "paused"
         assert math.hypot(*(drone.feedback().position_m or ())[:2]) < 0.4
-        assert not drone._commands._schedule.automatic, "the hover that was asked for goes on"
+        assert not drone._commands._schedule.automatic, "the requested hover continues"
     assert told[-1].text == TAKEN
 
 
-def test_it_is_paused_and_ended_from_another_place() -> None:
+def test_it_is_paused_and_ended_from_another_thread() -> None:
     with rehearse(CALM) as drone:
         drone.takeoff()
         flight = FlyRoute(drone, TRIANGLE)
@@ -131,7 +131,7 @@ def test_it_is_paused_and_ended_from_another_place() -> None:
         assert flight.law.state == "stopped"
 
 
-def test_a_vehicle_without_a_position_is_told_how_to_get_one() -> None:
+def test_the_error_without_a_position_says_how_to_get_one() -> None:
     with rehearse(f"{CALM}&position=none") as drone:
         drone.takeoff()
         [finding] = check_for(drone, TRIANGLE).findings
@@ -152,5 +152,5 @@ def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path, monkeypatc
         with pytest.raises(UnknownNameError, match="rear"):
             save_photo(drone, tmp_path, TakePhoto(1, "rear"))
         (tmp_path / "file").touch()
-        with pytest.raises(UsageError, match="can't be made"):
+        with pytest.raises(UsageError, match="can't be created"):
             save_photo(drone, tmp_path / "file", TakePhoto(1, None))

@@ -1,4 +1,4 @@
-"""Where a thing is, from its boxes: with what is known of it, with the ground, and with neither."""
+"""The position of a target from its boxes: with prior knowledge, with the ground, and with neither."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def watched(
     eye: Callable[[float], tuple[float, float]] = lambda t: (0.0, 0.0),
     at: list[TargetState] | None = None,
 ) -> TargetEstimator:
-    """A filter that was given the boxes of a person who walks along a path, seen from a vehicle that moves."""
+    """Return a filter after the boxes of a person on a path, seen from a moving vehicle."""
     estimator, rng = TargetEstimator(traits), np.random.default_rng(seed)
     for n in range(round(seconds / PERIOD_S) + 1):
         now = n * PERIOD_S
@@ -57,7 +57,7 @@ def off(state: TargetState, path: Path, seconds: float) -> float:
     ids=["size", "ground", "both"],
 )
 @pytest.mark.parametrize("path", [walk(5.0, -2.0, 0.0, 0.8), walk(6.0, 1.0, -0.5, -0.3)], ids=["across", "nearer"])
-def test_place_and_velocity_become_true(traits: Traits, ground: bool, path: Path) -> None:
+def test_place_and_velocity_converge(traits: Traits, ground: bool, path: Path) -> None:
     found = watched(traits, path, ground=ground).at(nanoseconds(6.0))
     assert off(found, path, 6.0) < 0.5
     velocity = np.subtract(path(1.0), path(0.0))
@@ -67,7 +67,7 @@ def test_place_and_velocity_become_true(traits: Traits, ground: bool, path: Path
     assert found.middle == pytest.approx(np.add(found.foot, [0.0, 0.0, found.height_m / 2]))
 
 
-def test_what_nothing_is_known_of_is_taken_to_be_at_the_nominal_distance() -> None:
+def test_an_unknown_target_starts_at_the_nominal_distance() -> None:
     camera = camera_at()
     for nominal_m in (2.0, 4.0, 7.0):
         estimator = TargetEstimator(nominal_m=nominal_m)
@@ -77,7 +77,7 @@ def test_what_nothing_is_known_of_is_taken_to_be_at_the_nominal_distance() -> No
         assert found.range_deviation_m > 0.3 * nominal_m
 
 
-def test_the_vehicles_own_motion_tells_the_range_of_what_nothing_is_known_of() -> None:
+def test_the_vehicles_own_motion_reveals_the_range_of_an_unknown_target() -> None:
     still, path = replace(UNKNOWN, intensity_m2_s3=0.02), walk(6.5, 0.0)
     for seed in range(3):
         standing = watched(still, path, seconds=7.0, seed=seed).at(nanoseconds(7.0))
@@ -102,14 +102,14 @@ def test_the_deviation_is_honest(traits: Traits, ground: bool) -> None:
     assert within / total > 0.9
 
 
-def test_a_thing_that_is_larger_than_its_class_is_not_far_off_with_the_ground() -> None:
+def test_with_the_ground_an_oversized_target_does_not_seem_far() -> None:
     tall = replace(PERSON, height_m=1.5)
     found = watched(tall, walk(5.0, 0.0), ground=True).at(nanoseconds(6.0))
     assert found.range_m == pytest.approx(5.0 - 0.12, abs=0.7)
 
 
-def test_what_is_hidden_goes_on_as_it_went_before_its_boxes_were_cut() -> None:
-    """The middle of what is left of a box stays behind where a wall begins."""
+def test_a_hidden_target_keeps_its_motion_from_before_its_boxes_were_cut() -> None:
+    """The middle of a cut-off box lags behind at the edge of a wall."""
     path, camera = walk(5.0, -1.0, 0.0, 1.2), camera_at()
     estimator = watched(PERSON, path, ground=True, seconds=2.0, eye=lambda t: (0.0, 0.0))
     last_s = 2.0
@@ -123,11 +123,11 @@ def test_what_is_hidden_goes_on_as_it_went_before_its_boxes_were_cut() -> None:
     found = estimator.at(nanoseconds(last_s + 2.0))
     assert off(found, path, last_s + 2.0) < 0.6 * float(np.hypot(*(naive - path(last_s + 2.0))))
     assert off(estimator.at(nanoseconds(last_s + 0.1)), path, last_s + 0.1) > 0.1, (
-        "a missed image or two change nothing"
+        "one or two missed images change nothing"
     )
 
 
-def test_nothing_is_added_to_a_thing_but_parts_may_be_hidden() -> None:
+def test_a_box_may_be_too_small_but_not_too_large() -> None:
     path, camera = walk(6.0, 0.0), camera_at()
     estimator = watched(PERSON, path, ground=True, seconds=2.0)
     x, y, width, height = box_of(camera, np.array([6.0, 0.0, 0.0])) or (0.0, 0.0, 0.0, 0.0)
@@ -146,9 +146,9 @@ def test_nothing_is_added_to_a_thing_but_parts_may_be_hidden() -> None:
     assert math.isfinite(fits["its upper half"])
 
 
-def test_seldom_boxes_are_no_hiding() -> None:
+def test_infrequent_boxes_do_not_mean_hiding() -> None:
     path, estimator = walk(5.0, -1.0, 0.0, 0.6), TargetEstimator(PERSON)
-    for n in range(12):  # two images a second
+    for n in range(12):  # two images per second
         x, y = path(n / 2)
         view = view_of(camera_at(yaw=math.atan2(y, x)), np.array([x, y, 0.0]))
         if n == 0:
@@ -158,12 +158,12 @@ def test_seldom_boxes_are_no_hiding() -> None:
     assert estimator.at(nanoseconds(6.0)).foot[:2] == pytest.approx(now.foot[:2] + 0.5 * now.velocity)
 
 
-def test_it_is_less_and_less_certain_of_what_it_does_not_see() -> None:
+def test_an_unseen_target_becomes_less_and_less_certain() -> None:
     estimator = watched(PERSON, walk(5.0, 0.0, 0.0, 0.5), ground=True, seconds=3.0)
     states = [estimator.at(nanoseconds(3.0 + later)) for later in (0.0, 1.0, 2.0, 5.0)]
     assert [one.place_m for one in states] == sorted(one.place_m for one in states)
     assert states[-1].place_m > 3 * states[0].place_m
-    # It is not moved on for ever.
+    # The prediction does not move it forever.
     way = states[3].foot[:2] - states[0].foot[:2]
     assert float(np.hypot(*way)) == pytest.approx(3.8 * float(np.hypot(*states[0].velocity)), rel=0.1)
 
@@ -184,7 +184,7 @@ def test_a_box_in_another_direction_is_refused() -> None:
 
 
 @pytest.mark.parametrize("hidden", ["foot", "head"])
-def test_an_edge_that_something_hides_is_left_out(hidden: str) -> None:
+def test_a_hidden_edge_is_ignored(hidden: str) -> None:
     estimator = watched(PERSON, walk(5.0, 0.0), ground=True, seconds=3.0)
     camera = camera_at()
     whole = view_of(camera, np.array([5.0, 0.0, 0.0]))
@@ -199,7 +199,7 @@ def test_an_edge_that_something_hides_is_left_out(hidden: str) -> None:
     assert found.height_m == pytest.approx(1.72, rel=0.1)
 
 
-def test_a_bound_moves_only_what_is_beyond_it() -> None:
+def test_a_bound_moves_only_an_edge_beyond_it() -> None:
     camera = camera_at()
     foot = np.array([4.0, 0.0, 0.0])
     for below, nearer in ((-0.28, False), (-0.37, True)):
@@ -213,7 +213,7 @@ def test_a_bound_moves_only_what_is_beyond_it() -> None:
 
 
 @pytest.mark.parametrize(("late_s", "used"), [(0.1, True), (0.3, True), (0.45, True), (0.55, False), (3.0, False)])
-def test_a_box_that_comes_late_is_used_for_half_a_second(late_s: float, used: bool) -> None:
+def test_a_late_box_is_used_for_half_a_second(late_s: float, used: bool) -> None:
     path = walk(5.0, -1.0, 0.0, 1.0)
     estimator, camera = watched(CASE_OF_SIZE, path, seconds=2.0), camera_at()
     before = estimator.at(nanoseconds(2.0))
@@ -222,10 +222,10 @@ def test_a_box_that_comes_late_is_used_for_half_a_second(late_s: float, used: bo
     after = estimator.at(nanoseconds(2.0))
     assert (after.place_m < before.place_m) is used
     assert off(after, path, 2.0) < off(before, path, 2.0) + 0.1
-    assert estimator.seen_ns == nanoseconds(2.0), "a newer box was seen"
+    assert estimator.seen_ns == nanoseconds(2.0), "there was a newer box"
 
 
-def test_a_thing_that_turns_is_caught_up_with() -> None:
+def test_it_catches_up_with_a_turning_target() -> None:
     def path(t: float) -> tuple[float, float]:
         return (5.0, -1.5 + 1.2 * t) if t < 3.0 else (5.0 - 1.2 * (t - 3.0), 2.1)
 
@@ -256,7 +256,7 @@ def cut_off(**edges: float | None) -> tuple[BoxView, Camera]:
     [{"bottom": None}, {"top": None}, {"bottom": None, "top": None}, {"bottom": 0.01}, {"top": -0.01}, {"top": 0.0}],
     ids=["no foot", "no head", "neither", "level foot", "head below", "level head"],
 )
-def test_it_starts_with_whatever_is_seen(traits: Traits, ground: bool, edges: dict[str, float | None]) -> None:
+def test_it_starts_with_any_visible_edges(traits: Traits, ground: bool, edges: dict[str, float | None]) -> None:
     view, camera = cut_off(**edges)
     estimator = TargetEstimator(traits)
     estimator.start(view, camera, 0, ground=ground)
@@ -271,21 +271,21 @@ def test_it_starts_with_whatever_is_seen(traits: Traits, ground: bool, edges: di
     assert np.isfinite(estimator.at(nanoseconds(1.0)).foot).all()
 
 
-def test_the_head_and_the_ground_tell_the_range_of_a_person_whose_feet_are_not_seen() -> None:
+def test_head_and_ground_give_the_range_of_a_person_with_hidden_feet() -> None:
     camera = camera_at()
     estimator = TargetEstimator(PERSON)
     view = replace(view_of(camera, np.array([3.0, 0.0, 0.0])), bottom=None, below=-0.2)
     estimator.start(view, camera, 0, ground=True)
     found = estimator.at(0)
     assert found.range_m == pytest.approx(2.88, rel=0.15)
-    assert found.range_deviation_m < 1.5, "without, it is 2 m"
+    assert found.range_deviation_m < 1.5, "2 m without them"
 
 
-def test_a_filter_that_was_not_started_says_so() -> None:
+def test_a_filter_not_started_raises() -> None:
     estimator, camera = TargetEstimator(), camera_at()
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator.at(0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator.update(view_of(camera, np.array([4.0, 0.0, 0.0])), camera, 0)
 
 
@@ -305,12 +305,12 @@ def test_a_filter_that_was_not_started_says_so() -> None:
         ({"intensity_m2_s3": -1.0}, "intensity_m2_s3 is -1"),
     ],
 )
-def test_traits_that_make_no_sense_are_refused(given: dict[str, object], why: str) -> None:
+def test_invalid_traits_are_refused(given: dict[str, object], why: str) -> None:
     with pytest.raises(UsageError, match=why):
         Traits(**given)  # type: ignore[arg-type]
 
 
-def test_known_kinds_are_sensible() -> None:
+def test_known_classes_are_plausible() -> None:
     assert {"person", "car"} <= set(TRAITS)
     assert all(each.radius_m < 3.0 for each in TRAITS.values())
     assert UNKNOWN.height_m is None

@@ -1,4 +1,4 @@
-"""One target in drawn pictures: by box, by class, hidden and back, among look-alikes, with a tracker that drifts."""
+"""One target in rendered images: by box, by class, hidden and returning, among look-alikes, with a drifting tracker."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STANDS = Traits(radius_m=0.1, on_ground=True)
 
 
 class Walker:
-    """A textured, upright thing on a way."""
+    """A textured, upright thing on a path."""
 
     def __init__(self, path: Path, colour: tuple[int, int, int], seed: int) -> None:
         self.path = path
@@ -45,12 +45,12 @@ class Walker:
 
 
 class Film:
-    """Pictures of walkers, what a detector finds in them, and a finder that is given both.
+    """Images of walkers, a detector's findings in them, and a finder that gets both.
 
-    Of two that overlap the detector finds the nearer one.
+    If two overlap, the detector finds only the nearer one.
 
     Attributes:
-        sightings: With the true box of the first walker, of each picture.
+        sightings: One per image, each with the true box of the first walker.
     """
 
     def __init__(self, finder: TargetFinder, *walkers: Walker, detects: bool = True) -> None:
@@ -88,11 +88,11 @@ class Film:
             self.sightings.append((found, self.walkers[0].box(camera_at(), self.time_s)))
 
     def agreement(self, last: int = 10) -> float:
-        """The worst overlap with the true box in the last pictures."""
+        """Return the worst overlap with the true box in the last images."""
         return min(0.0 if one.box is None else overlap(one.box, truth) for one, truth in self.sightings[-last:])
 
     def is_kept(self, n: int = 0) -> bool:
-        """Whether the finder's target is where a walker is."""
+        """Return whether the finder's target is at a walker's place."""
         assert self.finder.estimator is not None
         foot = self.finder.estimator.at(self.at_ns).foot
         return math.dist(foot[:2], self.walkers[n].path(self.time_s)) < 0.6
@@ -103,7 +103,7 @@ def start_box(walker: Walker) -> Box:
 
 
 @pytest.mark.parametrize("traits", [None, STANDS])
-def test_a_box_is_enough(traits: Traits | None) -> None:
+def test_a_box_suffices(traits: Traits | None) -> None:
     walker = Walker(walk(4.0, -1.0, 0.0, 0.8), BLUE, 1)
     film = Film(TargetFinder(box=start_box(walker), traits=traits), walker, detects=False)
     film.run(2.0)
@@ -118,7 +118,7 @@ def test_a_box_is_enough(traits: Traits | None) -> None:
     assert all(0.0 < (one.confidence or 0.0) <= 1.0 for one, _ in film.sightings)
 
 
-def test_a_box_on_a_detection_makes_its_thing_the_target_at_once() -> None:
+def test_a_box_on_a_detection_selects_it_at_once() -> None:
     walker, other = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1), Walker(walk(4.5, 1.4), RED, 2)
     x, y, width, height = start_box(walker)
     film = Film(TargetFinder(box=(x - 5, y - 4, width + 8, height + 6)), walker, other)
@@ -134,7 +134,7 @@ def test_a_box_on_a_detection_makes_its_thing_the_target_at_once() -> None:
     assert film.finder.others(film.at_ns + nanoseconds(1.5)) == []
 
 
-def test_a_box_is_enough_until_the_detector_agrees() -> None:
+def test_a_box_suffices_until_the_detector_agrees() -> None:
     walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
     film = Film(TargetFinder(box=start_box(walker)), walker, detects=False)
     film.run(0.5)
@@ -149,7 +149,7 @@ def test_a_box_is_enough_until_the_detector_agrees() -> None:
 
 @pytest.mark.parametrize("class_name", [None, "person"])
 @pytest.mark.parametrize("detects_s", [0.0, 0.5])
-def test_traits_that_are_given_go_before_those_of_the_class(class_name: str | None, detects_s: float) -> None:
+def test_given_traits_take_precedence_over_the_class(class_name: str | None, detects_s: float) -> None:
     walker = Walker(walk(4.0, -0.8, 0.0, 0.4), BLUE, 1)
     small = Traits(height_m=0.86, height_share=0.02, on_ground=False)
     film = Film(TargetFinder(box=start_box(walker), class_name=class_name, traits=small), walker, detects=False)
@@ -163,11 +163,11 @@ def test_traits_that_are_given_go_before_those_of_the_class(class_name: str | No
     film.run(2.5, hidden=[0])
     film.run(0.7)
     assert film.finder.target is not None
-    assert film.finder.target.estimator.traits is small, "also after it was recognised"
+    assert film.finder.target.estimator.traits is small, "even after it was recognised"
 
 
 @pytest.mark.parametrize("box", [None, (138.0, 82.0, 40.0, 40.0)])
-def test_a_target_of_a_class_that_nothing_is_known_of_may_hang_on_a_wall(box: Box | None) -> None:
+def test_a_target_of_an_unknown_class_may_hang_on_a_wall(box: Box | None) -> None:
     finder = TargetFinder(box=box, class_name=None if box else "clock")
     image, camera = texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at()
     clock, other = (Detection((x, 85.0, 40.0, 40.0), 0.9, 0, "clock") for x in (140.0, 30.0))
@@ -178,10 +178,10 @@ def test_a_target_of_a_class_that_nothing_is_known_of_may_hang_on_a_wall(box: Bo
     assert isinstance(finder.estimator, RangeEstimator)
     assert not finder.estimator.at(nanoseconds(1.4)).range_known
     (beside,) = finder.others(nanoseconds(1.4))
-    assert beside.range_known, "others are kept clear of as if they stood on the ground"
+    assert beside.range_known, "other things count as standing on the ground"
 
 
-def test_of_a_class_the_largest_is_taken_once_it_is_believed() -> None:
+def test_the_largest_of_a_class_is_chosen_once_confirmed() -> None:
     near, far = Walker(walk(3.5, 0.8), BLUE, 1), Walker(walk(5.0, -1.0), RED, 2)
     film = Film(TargetFinder(class_name="person"), near, far)
     film.run(2 / 15)
@@ -193,7 +193,7 @@ def test_of_a_class_the_largest_is_taken_once_it_is_believed() -> None:
     assert film.sightings[-1][0].confidence is not None
 
 
-def test_what_is_too_small_to_be_tracked_is_followed_by_its_detections() -> None:
+def test_a_target_too_small_to_track_is_followed_by_detections() -> None:
     finder, image = TargetFinder(class_name="person"), texture(np.random.default_rng(7), WIDTH, HEIGHT)
     small = Detection((150.0, 115.0, 4.0, 12.0), 0.9, 0, "person")
     for n in range(6):
@@ -203,7 +203,7 @@ def test_what_is_too_small_to_be_tracked_is_followed_by_its_detections() -> None
     assert nothing == Sighting(None, None)
 
 
-def test_a_detection_that_the_tracker_does_not_agree_with_is_not_taken() -> None:
+def test_a_detection_against_the_tracker_is_not_used() -> None:
     walker, other = Walker(walk(4.0, 0.0), BLUE, 1), Walker(walk(4.5, 1.6), RED, 2)
     film = Film(TargetFinder(box=start_box(walker)), walker, other, detects=False)
     film.run(0.3)
@@ -217,14 +217,14 @@ def test_a_detection_that_the_tracker_does_not_agree_with_is_not_taken() -> None
     assert overlap(found.box, start_box(walker)) > 0.7
 
 
-def test_nothing_of_another_class_is_taken() -> None:
+def test_other_classes_are_not_used() -> None:
     film = Film(TargetFinder(class_name="dog"), Walker(walk(3.5, 0.8), BLUE, 1))
     film.run(1.0)
     assert film.finder.estimator is None
     assert all(one.box is None for one, _ in film.sightings)
 
 
-def test_what_crosses_the_target_is_not_taken_for_it() -> None:
+def test_a_crossing_thing_is_not_taken_for_the_target() -> None:
     for colour in (BLUE, RED):
         walker, other = Walker(walk(4.5, -0.9, 0.0, 0.6), BLUE, 1), Walker(walk(3.6, 0.9, 0.0, -0.6), colour, 1)
         film = Film(TargetFinder(box=start_box(walker)), walker, other)
@@ -234,7 +234,7 @@ def test_what_crosses_the_target_is_not_taken_for_it() -> None:
 
 
 @pytest.mark.parametrize("detects", [True, False], ids=["detector", "tracker"])
-def test_what_was_hidden_for_three_seconds_is_recognised(detects: bool) -> None:
+def test_a_target_hidden_for_three_seconds_is_recognised(detects: bool) -> None:
     walker = Walker(walk(4.0, -1.0, 0.0, 0.4), BLUE, 1)
     film = Film(TargetFinder(box=start_box(walker), class_name="person"), walker, detects=detects)
     film.run(1.5)
@@ -245,7 +245,7 @@ def test_what_was_hidden_for_three_seconds_is_recognised(detects: bool) -> None:
     assert film.agreement(5) > 0.6
 
 
-def test_what_has_other_colours_is_not_recognised() -> None:
+def test_other_colours_are_not_recognised() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     film = Film(TargetFinder(box=start_box(walker)), walker, Walker(walk(4.2, 0.4), RED, 2))
     film.run(1.5, hidden=[1])
@@ -270,7 +270,7 @@ def jumping(t: float) -> tuple[float, float]:
     return 4.0, -1.0 if t < 2.5 else 1.1
 
 
-def test_the_tracker_recognises_what_may_have_gone_there() -> None:
+def test_the_tracker_recognises_a_target_that_could_have_moved_there() -> None:
     walker = Walker(jumping, BLUE, 1)
     slow = Traits(height_m=1.72, intensity_m2_s3=0.01)
     film = Film(TargetFinder(box=start_box(walker), traits=slow), walker, detects=False)
@@ -282,7 +282,7 @@ def test_the_tracker_recognises_what_may_have_gone_there() -> None:
 
 
 def test_without_a_height_nothing_is_recognised_as_if_the_camera_were_on_the_ground() -> None:
-    """It was thought to be 0.3 m away then, and backed off from."""
+    """It seemed 0.3 m away, and the vehicle backed off."""
     here, there = (start_box(Walker(walk(4.0, side), BLUE, 1)) for side in (-1.9, 1.9))
     finder, drifting = TargetFinder(box=here, class_name="box", nominal_m=4.0), Drifting()
     image, camera = texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at(z=0.1)
@@ -295,7 +295,7 @@ def test_without_a_height_nothing_is_recognised_as_if_the_camera_were_on_the_gro
     assert finder.estimator.at(nanoseconds(6.0)).range_m > 2.0
 
 
-def test_what_comes_where_the_target_can_not_be_is_not_recognised() -> None:
+def test_a_newcomer_where_the_target_can_not_be_is_not_recognised() -> None:
     walker = Walker(walk(4.0, 1.6), BLUE, 1)
     slow = Traits(height_m=1.72, intensity_m2_s3=0.01)
     finder = TargetFinder(box=start_box(walker), class_name="person", traits=slow)
@@ -306,7 +306,7 @@ def test_what_comes_where_the_target_can_not_be_is_not_recognised() -> None:
     assert all(one.box is None for one, _ in film.sightings[-24:])
 
 
-def test_detections_may_come_later_than_their_picture() -> None:
+def test_detections_can_arrive_after_their_image() -> None:
     walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
     finder = TargetFinder(class_name="person")
     film = Film(finder, walker, detects=False)
@@ -322,7 +322,7 @@ def test_detections_may_come_later_than_their_picture() -> None:
     assert film.agreement(10) > 0.6, "between the detections it is tracked"
 
 
-def test_late_detections_agree_with_a_box_as_those_in_time_do() -> None:
+def test_late_detections_confirm_a_box_like_prompt_ones() -> None:
     walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
     finder = TargetFinder(box=start_box(walker))
     film = Film(finder, walker, detects=False)
@@ -335,7 +335,7 @@ def test_late_detections_agree_with_a_box_as_those_in_time_do() -> None:
     assert finder.target is not None
 
 
-def test_what_is_too_small_to_be_tracked_is_seen_by_late_detections() -> None:
+def test_a_target_too_small_to_track_is_seen_by_late_detections() -> None:
     finder, image = TargetFinder(class_name="person"), texture(np.random.default_rng(7), WIDTH, HEIGHT)
     small = Detection((150.0, 115.0, 4.0, 12.0), 0.9, 0, "person")
     seen = []
@@ -346,7 +346,7 @@ def test_what_is_too_small_to_be_tracked_is_seen_by_late_detections() -> None:
     assert not finder.detected([], at_ns, ground=False)
 
 
-def test_detections_of_an_unknown_picture_are_ignored() -> None:
+def test_detections_of_an_unknown_image_are_ignored() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder = TargetFinder(class_name="person")
     film = Film(finder, walker, detects=False)
@@ -358,7 +358,7 @@ def test_detections_of_an_unknown_picture_are_ignored() -> None:
 
 
 class Drifting:
-    """Stands for the tracker: returns a box that it is told, and counts what it is asked for."""
+    """Stands in for the tracker: returns a given box and counts calls."""
 
     def __init__(self) -> None:
         self.box: Box | None = None
@@ -380,7 +380,7 @@ class Drifting:
         self.started += 1
 
 
-def test_a_tracker_that_drifted_away_is_refused() -> None:
+def test_a_drifted_tracker_is_refused() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder, drifting = TargetFinder(box=start_box(walker), traits=Traits(height_m=1.72)), Drifting()
     film = Film(finder, walker, detects=False)
@@ -390,10 +390,10 @@ def test_a_tracker_that_drifted_away_is_refused() -> None:
     film.run(0.8)
     assert drifting.refused >= 1
     assert all(one.box is None for one, _ in film.sightings[-12:])
-    assert film.is_kept(), "its estimate is left alone"
+    assert film.is_kept(), "its estimate is unaffected"
 
 
-def test_late_detections_bring_a_tracker_back_that_lost_the_target_or_went_elsewhere() -> None:
+def test_late_detections_bring_back_a_lost_or_drifted_tracker() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder, drifting = TargetFinder(class_name="person"), Drifting()
     film = Film(finder, walker, detects=False)
@@ -407,10 +407,10 @@ def test_late_detections_bring_a_tracker_back_that_lost_the_target_or_went_elsew
         drifting.box = box
         film.run(PERIOD_S)
         assert finder.detected(film.picture()[1], film.at_ns, ground=True)
-        assert (drifting.started, drifting.resumed) == counts, "with new looks where it was lost"
+        assert (drifting.started, drifting.resumed) == counts, "with a new appearance where it was lost"
 
 
-def test_late_detections_tell_the_size_and_not_the_tracker() -> None:
+def test_late_detections_give_the_size_instead_of_the_tracker() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder, drifting = TargetFinder(class_name="person"), Drifting()
     film = Film(finder, walker, detects=False)
@@ -427,8 +427,8 @@ def test_late_detections_tell_the_size_and_not_the_tracker() -> None:
 
 
 @pytest.mark.parametrize(("hidden_s", "taken"), [(0.5, False), (1.2, True)])
-def test_what_was_hidden_may_be_where_it_could_have_gone_in_the_meantime(hidden_s: float, taken: bool) -> None:
-    """Nobody expects it there by its motion; but a tracker recognised it."""
+def test_a_hidden_target_can_be_anywhere_within_reach(hidden_s: float, taken: bool) -> None:
+    """Its motion does not predict it there, but the tracker recognised it."""
     walker, there = Walker(walk(4.0, -1.9), BLUE, 1), Walker(walk(4.0, 1.9), BLUE, 1)
     slow = Traits(height_m=1.72, intensity_m2_s3=0.001)
     finder, drifting = TargetFinder(box=start_box(walker), traits=slow), Drifting()
@@ -442,7 +442,7 @@ def test_what_was_hidden_may_be_where_it_could_have_gone_in_the_meantime(hidden_
     assert film.is_kept(1 if taken else 0)
 
 
-def test_the_box_of_another_thing_is_not_the_targets() -> None:
+def test_the_box_of_another_thing_is_not_the_target() -> None:
     walker, other = Walker(walk(4.0, 0.0), BLUE, 1), Walker(walk(4.0, 1.2), RED, 2)
     finder, drifting = TargetFinder(box=start_box(walker)), Drifting()
     film = Film(finder, walker, other)
@@ -451,12 +451,12 @@ def test_the_box_of_another_thing_is_not_the_targets() -> None:
     drifting.box = other.box(camera_at(), 0.0)
     film.run(0.2)
     assert film.agreement(3) == pytest.approx(1.0)
-    assert drifting.resumed == 3, "the tracker is put right by the detection"
+    assert drifting.resumed == 3, "the detection corrects the tracker"
     film.run(0.5, hidden=[0])
     assert all(one.box is None for one, _ in film.sightings[-7:])
 
 
-def test_of_a_detected_target_the_tracker_is_believed_between_the_images_that_are_searched() -> None:
+def test_with_a_detected_target_the_tracker_counts_between_searched_images() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder, drifting = TargetFinder(box=start_box(walker)), Drifting()
     film = Film(finder, walker)
@@ -472,10 +472,10 @@ def test_of_a_detected_target_the_tracker_is_believed_between_the_images_that_ar
     film.run(1.2, hidden=[0])
     film.detects = False
     film.run(0.2)
-    assert all(one.box is None for one, _ in film.sightings[-3:]), "nor later, before it was recognised"
+    assert all(one.box is None for one, _ in film.sightings[-3:]), "nor later, until it was recognised"
 
 
-def test_a_newcomer_is_looked_at_before_it_is_taken_for_the_target() -> None:
+def test_a_newcomer_is_observed_before_it_counts_as_the_target() -> None:
     walker, back = Walker(walk(4.0, -1.0), BLUE, 1), Walker(walk(4.0, 1.0), BLUE, 1)
     film = Film(TargetFinder(box=start_box(walker)), walker, back)
     film.run(1.0, hidden=[1])
@@ -491,7 +491,7 @@ def test_a_newcomer_is_looked_at_before_it_is_taken_for_the_target() -> None:
     assert film.finder.candidate(film.at_ns) is None
 
 
-def test_somebody_in_other_clothes_is_not_even_looked_at() -> None:
+def test_a_person_in_other_clothes_is_not_even_considered() -> None:
     walker, other = Walker(walk(4.0, -1.0), BLUE, 1), Walker(walk(4.0, 1.0), RED, 1)
     film = Film(TargetFinder(box=start_box(walker)), walker, other)
     film.run(1.0, hidden=[1])
@@ -508,7 +508,7 @@ def test_a_box_without_a_bearing_is_refused() -> None:
         finder.see(picture, camera_at(pitch=1.4), 1, ground=True, detections=None)
 
 
-def test_a_box_outside_of_the_picture_is_refused() -> None:
+def test_a_box_outside_the_image_is_refused() -> None:
     finder = TargetFinder(box=(400.0, 100.0, 40.0, 40.0))
     with pytest.raises(UsageError, match="at least half"):
         finder.see(texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at(), 1, ground=True, detections=None)

@@ -1,4 +1,4 @@
-"""The range of a target that may not stand on the ground, learnt from the vehicle's own motion alone."""
+"""The range of a target that may not stand on the ground, learned from the vehicle's own motion alone."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from skyloop.vision import simulated_detector
 from skyloop.vision.tracking import Box
 from tests.support.target_world import PERIOD_S, ChaseWorld, box_of, camera_at, walk
 
-PICTURE, PERSON = (3.5, 1.7, 0.6), (5.0, 0.0, 1.7)  # how far away, the lower edge's height, and how high [m]
+PICTURE, PERSON = (3.5, 1.7, 0.6), (5.0, 0.0, 1.7)  # distance, height of the lower edge, and height [m]
 
 
 def still(at_s: float) -> float:
@@ -38,7 +38,7 @@ def bobbing(at_s: float) -> float:
 
 
 class Watching:
-    """A vehicle that watches a thing before it, by a tracker's boxes, whose errors last."""
+    """A vehicle that watches a thing by a tracker's boxes, whose errors persist."""
 
     def __init__(
         self,
@@ -53,8 +53,8 @@ class Watching:
         self.estimator = estimator or estimator_of(None, None)
         self.at_s, self._z, self._speed = 0.0, z, speed_m_s
         self._rng, self._error = np.random.default_rng(seed), np.zeros(2)
-        self.misread = still  # by how much its altimeter is wrong [m], by the time [s]
-        self.strayed: Callable[[float], float] | None = None  # the same of its velocity, added up; None: unknown
+        self.misread = still  # error of its altimeter [m] by time [s]
+        self.strayed: Callable[[float], float] | None = None  # error of its integrated velocity; None: unknown
 
     def view(self, up_m: float) -> tuple[BoxView, Camera]:
         self._error = 0.9 * self._error + self._rng.normal(0.0, 0.44, 2)
@@ -82,10 +82,10 @@ class Watching:
         return self.estimator.at(at_ns)
 
 
-def test_a_picture_on_a_wall_is_not_surely_as_far_away_as_if_it_stood_on_the_ground() -> None:
-    """It was 14.7 ± 1.0 m away, in a room of 8 m."""
+def test_a_picture_on_a_wall_is_not_assumed_to_stand_on_the_ground() -> None:
+    """It seemed 14.7 ± 1.0 m away, in a room of 8 m."""
     by_ground = Watching(PICTURE, estimator=TargetEstimator(UNKNOWN)).run(1.0)
-    assert by_ground.range_m > 3 * PICTURE[0], "that is what the lower edge says"
+    assert by_ground.range_m > 3 * PICTURE[0], "the lower edge alone suggests that"
     assert by_ground.range_deviation_m < 0.25 * by_ground.range_m
     watching = Watching(PICTURE)
     for seconds in (PERIOD_S, 1.0, 3.0):
@@ -103,14 +103,14 @@ def test_the_vehicles_own_climb_shows_that_a_picture_hangs_on_the_wall(seed: int
     assert abs(found.range_m - PICTURE[0]) < 3.0 * found.range_deviation_m
     assert found.range_m == pytest.approx(PICTURE[0], rel=0.3)
     assert isinstance(watching.estimator, RangeEstimator)
-    assert watching.estimator.on_ground is False, "that guess is dropped"
+    assert watching.estimator.on_ground is False, "that hypothesis is dropped"
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.6])
-def test_of_what_stands_on_the_ground_it_confirms_the_range(seed: int, speed_m_s: float) -> None:
+def test_the_climb_confirms_the_range_of_a_target_on_the_ground(seed: int, speed_m_s: float) -> None:
     watching = Watching(PERSON, z=1.2, seed=seed, speed_m_s=speed_m_s)
-    assert not watching.run(2.0).range_known, "not before it has moved"
+    assert not watching.run(2.0).range_known, "not before the vehicle has moved"
     found = watching.run(10.0, bobbing)
     away_m = math.hypot(PERSON[0], speed_m_s * (watching.at_s - PERIOD_S))
     assert found.range_known
@@ -120,8 +120,8 @@ def test_of_what_stands_on_the_ground_it_confirms_the_range(seed: int, speed_m_s
     assert watching.estimator.on_ground is not False
 
 
-def test_while_the_vehicle_stays_no_guess_wins() -> None:
-    """The one that counted on the least motion did: a person came to hang in the air, and nearer."""
+def test_while_the_vehicle_stays_no_hypothesis_wins() -> None:
+    """The one with the least motion won: a person seemed to hang in the air, and nearer."""
     watching = Watching(PERSON, z=1.2)
     watching.run(12.0, bobbing)
     found = watching.run(20.0)
@@ -138,10 +138,10 @@ def test_while_the_vehicle_stays_no_guess_wins() -> None:
         lambda at_s: 0.7 * (at_s > 3.0),
         lambda at_s: -1.7 * min(1.0, max(0.0, 4.0 * (at_s - 3.0))),
     ],
-    ids=["not known for a second", "over a table", "beyond a table", "somebody below, by a filtered altimeter"],
+    ids=["unknown for a second", "over a table", "beyond a table", "a person below, by a filtered altimeter"],
 )
-def test_a_jump_of_the_altimeter_is_no_motion_that_shows_the_range(misread: Callable[[float], float]) -> None:
-    """A picture came to be known to be 40 m away, and would have been flown into."""
+def test_a_jump_of_the_altimeter_does_not_reveal_the_range(misread: Callable[[float], float]) -> None:
+    """A picture was "known" to be 40 m away and would have been flown into."""
     watching = Watching(PICTURE)
     watching.misread = lambda at_s: misread(at_s + 2.0)
     for _ in range(6):
@@ -152,22 +152,22 @@ def test_a_jump_of_the_altimeter_is_no_motion_that_shows_the_range(misread: Call
 
 @pytest.mark.parametrize("ramp_m_s", [-0.3, -0.2, -0.1, 0.05, 0.1, 0.2, 0.3])
 @pytest.mark.parametrize("thing", [PICTURE, PERSON], ids=["picture", "person"])
-def test_a_slow_drift_of_the_altimeter_is_no_motion_that_shows_the_range(
+def test_a_slow_drift_of_the_altimeter_does_not_reveal_the_range(
     thing: tuple[float, float, float], ramp_m_s: float
 ) -> None:
-    """Where the ground rises or falls, or the altimeter drifts: a picture 3.5 m away was known to be 16 m away."""
+    """Over sloping ground, or with altimeter drift, a picture 3.5 m away was "known" to be 16 m away."""
     watching = Watching(thing, z=2.1 if thing is PICTURE else 1.2)
     watching.strayed = lambda at_s: 0.015 * at_s
     watching.misread = lambda at_s: ramp_m_s * max(0.0, at_s - 1.0) if at_s < 8.0 else 7.0 * ramp_m_s
     for _ in range(16):
-        assert not watching.run(0.5).range_known, "it has not moved"
+        assert not watching.run(0.5).range_known, "the vehicle has not moved"
     found = watching.run(8.0, bobbing)
     assert not found.range_known or found.range_m == pytest.approx(thing[0], rel=0.4)
 
 
 @pytest.mark.parametrize("thing", [PICTURE, PERSON], ids=["picture", "person"])
 @pytest.mark.parametrize("drift_m_s", [-0.04, 0.04])
-def test_a_climb_that_is_known_with_an_error_shows_the_range_all_the_same(
+def test_a_climb_known_with_an_error_still_reveals_the_range(
     thing: tuple[float, float, float], drift_m_s: float
 ) -> None:
     watching = Watching(thing, z=2.1 if thing is PICTURE else 1.2)
@@ -177,22 +177,22 @@ def test_a_climb_that_is_known_with_an_error_shows_the_range_all_the_same(
     assert found.range_m == pytest.approx(thing[0], rel=0.4)
 
 
-def test_a_climb_that_is_added_up_anew_is_no_motion_that_shows_the_range() -> None:
-    """As after states that were stamped ahead."""
+def test_a_restarted_climb_does_not_reveal_the_range() -> None:
+    """As after states stamped ahead."""
     watching = Watching(PICTURE)
     watching.strayed = lambda at_s: -4.0 * (at_s > 12.0)
     assert watching.run(12.0, bobbing).range_known
     assert not watching.run(1.0).range_known
 
 
-def test_what_hangs_above_the_vehicle_does_not_stand_on_the_ground() -> None:
+def test_a_target_above_the_vehicle_does_not_stand_on_the_ground() -> None:
     watching = Watching((4.0, 2.2, 0.3), z=1.2)
     watching.run(PERIOD_S)
     assert isinstance(watching.estimator, RangeEstimator)
     assert watching.estimator.on_ground is False
 
 
-def test_a_known_size_tells_the_range_and_whether_it_stands_on_the_ground() -> None:
+def test_a_known_size_gives_the_range_and_whether_it_stands_on_the_ground() -> None:
     tall, flat = Traits(height_m=1.7, height_share=0.05), Traits(height_m=0.6, height_share=0.05)
     assert Watching(PERSON, z=1.2, estimator=estimator_of(None, tall)).run(PERIOD_S).range_known, "both agree"
     watching = Watching(PICTURE, estimator=estimator_of(None, flat))
@@ -201,7 +201,7 @@ def test_a_known_size_tells_the_range_and_whether_it_stands_on_the_ground() -> N
     assert found.range_m == pytest.approx(PICTURE[0], rel=0.15)
 
 
-def test_what_is_lost_is_found_again_where_it_can_be() -> None:
+def test_a_lost_target_is_found_again_where_it_can_be() -> None:
     watching = Watching(PICTURE)
     watching.run(8.0, bobbing)
     again = watching.estimator.again(nanoseconds(watching.at_s))
@@ -209,11 +209,11 @@ def test_what_is_lost_is_found_again_where_it_can_be() -> None:
     found = watching.run(1.0)
     assert isinstance(again, RangeEstimator)
     assert again.on_ground is False, "it does not stand there now"
-    assert not found.range_known, "it may be another one, or have been moved"
+    assert not found.range_known, "it may be another one, or someone moved it"
     assert found.range_m == pytest.approx(PICTURE[0], rel=0.5)
 
 
-def test_what_was_seen_to_stand_on_the_ground_does_so_again() -> None:
+def test_a_target_seen_standing_on_the_ground_does_so_again() -> None:
     watching = Watching(PERSON, z=1.2, seed=2)
     watching.run(12.0, bobbing)
     assert isinstance(watching.estimator, RangeEstimator)
@@ -223,12 +223,12 @@ def test_what_was_seen_to_stand_on_the_ground_does_so_again() -> None:
     assert watching.run(PERIOD_S).range_known
 
 
-def test_a_person_who_is_known_as_one_is_followed_at_once() -> None:
+def test_a_target_known_to_be_a_person_is_followed_at_once() -> None:
     for name, traits in (("person", TRAITS["person"]), (None, replace(UNKNOWN, on_ground=True))):
         estimator = estimator_of(name, traits)
         assert type(estimator) is TargetEstimator
         assert Watching(PERSON, z=1.2, estimator=estimator).run(PERIOD_S).range_known
-    assert isinstance(estimator_of("clock", None), RangeEstimator), "of what a detector knows much hangs on walls"
+    assert isinstance(estimator_of("clock", None), RangeEstimator), "many detectable things hang on walls"
 
 
 def test_a_vehicle_that_does_not_know_its_height_keeps_the_apparent_size() -> None:
@@ -254,24 +254,24 @@ def test_a_box_in_another_direction_is_refused() -> None:
     assert watching.estimator.distance(elsewhere, camera, nanoseconds(1.1))[0] > 20.0
 
 
-def test_a_filter_that_was_not_started_says_so() -> None:
+def test_a_filter_not_started_raises() -> None:
     view, camera = Watching(PERSON).view(0.0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator_of(None, None).at(0)
-    with pytest.raises(UsageError, match="never seen"):
+    with pytest.raises(UsageError, match="no target yet"):
         estimator_of(None, None).update(view, camera, 0)
 
 
 # The law -----------------------------------------------------------------------------------------------------------
 
 
-def test_until_the_range_is_known_it_turns_and_rises_a_little_and_follows_then() -> None:
+def test_it_turns_and_rises_a_little_until_the_range_is_known() -> None:
     world = ChaseWorld(walk(6.0, 1.5), traits=UNKNOWN, settings=ChaseSettings(distance_m=3.5))
     world.run(1.0)
     assert set(world.phases[1:]) == {TargetPhase.RANGING}
     world.run(19.0)
     ranging = [place for place, phase in zip(world.places, world.phases, strict=True) if phase is TargetPhase.RANGING]
-    assert max(float(np.hypot(*place[:2])) for place in ranging) < 0.1, "it holds its place"
+    assert max(float(np.hypot(*place[:2])) for place in ranging) < 0.1, "it holds its position"
     assert max(float(place[2]) for place in ranging) < 1.2 + 0.45
     assert min(float(place[2]) for place in ranging) > 1.2 - 0.1
     assert world.phases[-1] is TargetPhase.FOLLOWING
@@ -325,7 +325,7 @@ path = { kind = "still", position = [6, -0.5, 0] }
 
 
 class Noted(FollowTarget):
-    """Notes where it really is, and what it says, at each frame."""
+    """Records its true position and its status at each frame."""
 
     def __init__(self, *args: Any, **values: Any) -> None:
         self.places: list[tuple[float, float]] = []
@@ -346,7 +346,7 @@ class Noted(FollowTarget):
 
 @pytest.mark.slow
 def test_a_picture_on_a_wall_is_not_flown_into(tmp_path: File) -> None:
-    """It flew to 0.5 m before the wall."""
+    """It flew to within 0.5 m of the wall."""
     file, distance_m = tmp_path / "room.toml", 2.0
     file.write_text(ROOM)
     with rehearse(f"sim://?world={file}&cameras=front&fps=10&seed=1&wind=0") as drone:
@@ -366,15 +366,15 @@ def test_a_picture_on_a_wall_is_not_flown_into(tmp_path: File) -> None:
         drone.land()
     wall_m, phases = [4.0 - x for x, _ in pilot.places], [phase for phase, _, _ in pilot.said]
     known = phases.index(TargetPhase.FOLLOWING) if TargetPhase.FOLLOWING in phases else len(phases)
-    assert TargetPhase.RANGING in phases[:known], "it says why it does not approach"
-    assert min(wall_m[:known]) > 3.3, "and holds its place"
+    assert TargetPhase.RANGING in phases[:known], "the phase says why it does not approach"
+    assert min(wall_m[:known]) > 3.3, "it holds its position"
     for at_m, (_, range_m, deviation_m) in zip(wall_m, pilot.said, strict=True):
         assert at_m > distance_m - deviation_m
-        assert range_m - 3.0 * deviation_m < at_m, "what it says of the range is honest"
+        assert range_m - 3.0 * deviation_m < at_m, "the reported range is honest"
 
 
 @pytest.mark.slow
-def test_somebody_on_the_ground_is_followed_by_a_box_alone(tmp_path: File) -> None:
+def test_a_person_on_the_ground_is_followed_by_a_box_alone(tmp_path: File) -> None:
     file = tmp_path / "lawn.toml"
     file.write_text(LAWN)
     detector = simulated_detector()

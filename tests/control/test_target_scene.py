@@ -1,4 +1,4 @@
-"""Which detection is which thing: people who cross, hide, return and look alike, without pictures."""
+"""Matching detections to things: people who cross, hide, return and look alike, without images."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def detected(camera: Camera, x: float, y: float, *, name: str = "person", score:
 
 
 class People:
-    """A scene of people, each on a way and in clothes, of whom some may be hidden."""
+    """A scene of people with paths and clothes, some of them hidden at times."""
 
     def __init__(self, *ways: tuple[Path, Looks], seed: int = 1, scene: Scene | None = None) -> None:
         self.scene = scene or Scene()
@@ -43,7 +43,7 @@ class People:
         return self.steps * PERIOD_S
 
     def run(self, seconds: float, *, hidden: frozenset[int] = frozenset(), one_box: float = 0.0) -> None:
-        """Go on; where two boxes overlap by ``one_box``, a detector sees the nearer one alone."""
+        """Advance; if two boxes overlap by ``one_box``, the detector sees only the nearer one."""
         for _ in range(round(seconds / PERIOD_S)):
             self.steps += 1
             found = [
@@ -64,7 +64,7 @@ class People:
             self.scene.update(boxes, looks, self.camera, nanoseconds(self.time_s), ground=True)
 
     def who(self, n: int) -> SceneObject:
-        """The thing that is nearest to where a person is."""
+        """Return the thing nearest to a person."""
         x, y = self._ways[n][0](self.time_s)
 
         def off(each: SceneObject) -> float:
@@ -92,7 +92,7 @@ def test_two_that_cross_keep_their_numbers(clothes: tuple[Looks, Looks], one_box
 
 
 @pytest.mark.parametrize("mistaken", [False, True])
-def test_two_that_were_seen_as_one_and_taken_for_each_other_are_exchanged(mistaken: bool) -> None:
+def test_two_things_confused_while_merged_are_exchanged(mistaken: bool) -> None:
     people = People((walk(4.5, -1.6, 0.0, 0.8), BLUE), (walk(5.0, 1.8, 0.0, -0.9), BLUE))
     people.run(1.0)
     first, second = people.who(0), people.who(1)
@@ -106,8 +106,8 @@ def test_two_that_were_seen_as_one_and_taken_for_each_other_are_exchanged(mistak
     assert (people.who(0).number, people.who(1).number) == (first.number, second.number)
 
 
-def test_what_hides_another_is_not_taken_for_it() -> None:
-    """The one behind stays hidden for a second: its filter goes on, and the other's is left alone."""
+def test_an_occluder_is_not_taken_for_the_hidden_thing() -> None:
+    """The one behind stays hidden for a second: its filter continues, and the other's is unaffected."""
     people = People((walk(4.0, 0.0), BLUE), (walk(5.5, 1.0, 0.0, -0.6), BLUE))
     people.run(1.0)
     before = [people.who(n).number for n in (0, 1)]
@@ -118,7 +118,7 @@ def test_what_hides_another_is_not_taken_for_it() -> None:
     assert [people.who(n).number for n in (0, 1)] == before
 
 
-def test_a_detection_that_two_could_explain_is_used_for_neither() -> None:
+def test_an_ambiguous_detection_updates_neither_thing() -> None:
     ways = (walk(5.0, -0.25), walk(5.0, 0.25))
     people = People((ways[0], BLUE), (ways[1], BLUE))
     people.run(1.0)
@@ -131,13 +131,13 @@ def test_a_detection_that_two_could_explain_is_used_for_neither() -> None:
     assert not first.seen
     assert not second.seen
     assert [one.estimator.seen_ns for one in (first, second)] == before
-    assert sorted(people.scene.objects) == [1, 2], "it is no third one either"
+    assert sorted(people.scene.objects) == [1, 2], "nor does it start a third"
     people.run(0.2)
     assert first.seen
     assert not first.contested
 
 
-def test_a_detection_that_two_could_explain_is_used_if_one_of_them_looks_like_it() -> None:
+def test_an_ambiguous_detection_is_used_if_one_thing_looks_like_it() -> None:
     people = People((walk(5.0, -0.25), BLUE), (walk(5.0, 0.25), RED))
     people.run(1.0)
     first, second = (people.who(n) for n in (0, 1))
@@ -147,7 +147,7 @@ def test_a_detection_that_two_could_explain_is_used_if_one_of_them_looks_like_it
     assert not first.contested
 
 
-def test_what_has_other_colours_is_another_thing() -> None:
+def test_other_colours_mean_another_thing() -> None:
     people = People((walk(5.0, 0.0), BLUE))
     people.run(1.0)
     detection = detected(people.camera, 5.0, 0.05)
@@ -159,7 +159,7 @@ def test_what_has_other_colours_is_another_thing() -> None:
     assert unlikeness(BLUE, RED) > 16.0 > 1.0 > unlikeness(BLUE, BLUE + 2.0)
 
 
-def test_what_is_of_another_class_is_another_thing() -> None:
+def test_another_class_means_another_thing() -> None:
     people = People((walk(5.0, 0.0), BLUE))
     people.run(1.0)
     dog = detected(people.camera, 5.0, 0.05, name="dog")
@@ -167,7 +167,7 @@ def test_what_is_of_another_class_is_another_thing() -> None:
     assert [one.class_name for one in people.scene.objects.values()] == ["person", "dog"]
 
 
-def test_light_that_changes_slowly_is_learned() -> None:
+def test_slow_changes_of_light_are_learned() -> None:
     scene, camera = Scene(), camera_at()
     for n in range(120):
         looks = BLUE + np.float32(n) * np.array([0.5, 0, 0, 0.5, 0, 0], np.float32)
@@ -177,7 +177,7 @@ def test_light_that_changes_slowly_is_learned() -> None:
     assert scene.objects[1].hits == 120
 
 
-def test_what_is_hidden_is_forgotten_after_two_seconds_unless_it_is_kept() -> None:
+def test_a_hidden_thing_is_forgotten_after_two_seconds_unless_kept() -> None:
     for kept in (False, True):
         people = People((walk(5.0, -1.0), BLUE), (walk(5.0, 1.0), RED))
         people.run(1.0)
@@ -191,7 +191,7 @@ def test_what_is_hidden_is_forgotten_after_two_seconds_unless_it_is_kept() -> No
         assert (number in people.scene.objects) is kept
 
 
-def test_what_was_seen_once_is_forgotten_sooner_and_numbers_are_not_given_again() -> None:
+def test_a_thing_seen_once_is_forgotten_sooner_and_numbers_are_not_reused() -> None:
     people = People((walk(5.0, -1.0), BLUE), (walk(5.0, 1.0), RED))
     people.run(PERIOD_S)
     assert sorted(people.scene.objects) == [1, 2]
@@ -204,7 +204,7 @@ def test_what_was_seen_once_is_forgotten_sooner_and_numbers_are_not_given_again(
     assert all(each.confirmed for each in people.scene.objects.values())
 
 
-def test_what_is_dormant_is_matched_with_nothing() -> None:
+def test_dormant_things_are_not_matched() -> None:
     people = People((walk(5.0, 0.0), BLUE))
     people.run(1.0)
     people.scene.kept = people.scene.dormant = {1}
@@ -218,7 +218,7 @@ def test_what_is_dormant_is_matched_with_nothing() -> None:
     assert people.scene.objects[1].seen
 
 
-def test_a_detection_that_is_not_sure_starts_nothing_but_continues() -> None:
+def test_an_uncertain_detection_continues_a_thing_but_starts_none() -> None:
     scene, camera = Scene(), camera_at()
     unsure, sure = (detected(camera, 5.0, 0.0, score=score) for score in (0.2, 0.9))
     scene.update([unsure], [BLUE], camera, nanoseconds(0.0), ground=True)
@@ -228,14 +228,14 @@ def test_a_detection_that_is_not_sure_starts_nothing_but_continues() -> None:
     assert scene.objects[1].hits == 2
 
 
-def test_what_has_no_bearing_is_left_out() -> None:
+def test_detections_without_a_bearing_are_skipped() -> None:
     scene, camera = Scene(), camera_at(pitch=1.4)
     scene.update([Detection((140, 100, 40, 40), 0.9, 0, "person")], [BLUE], camera, 0, ground=True)
     assert not scene.objects
     scene.update([], [], camera, 1, ground=True)
 
 
-def test_traits_may_be_given_for_a_class() -> None:
+def test_traits_can_be_given_for_a_class() -> None:
     scene, camera = Scene(traits={"person": Traits(height_m=1.0)}), camera_at()
     detection = detected(camera, 5.0, 0.0)
     scene.update([detection, replace(detection, class_name="yeti")], [BLUE, RED], camera, 0, ground=False)

@@ -1,4 +1,4 @@
-"""What boxes say about directions: against points of a known thing that the simulator's camera projects."""
+"""Directions from boxes, against points of a known thing projected by the simulator's camera."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ANGLES = {
 
 
 @given(**ANGLES)
-def test_azimuth_and_slopes_are_those_of_the_thing_whatever_the_attitude(
+def test_azimuth_and_slopes_match_the_thing_at_any_attitude(
     roll: float, pitch: float, yaw: float, aside: float, distance: float, height: float
 ) -> None:
     camera = camera_at(3.0, -2.0, height, roll=roll, pitch=pitch, yaw=yaw)
@@ -38,7 +38,7 @@ def test_azimuth_and_slopes_are_those_of_the_thing_whatever_the_attitude(
     assert box is not None
     view = BoxView.of(box, camera)
     assert view is not None
-    # The box of what leans in the image, or is bent by the lens, is wider: its middle is beside the thing's ends.
+    # A thing that leans in the image, or is bent by the lens, has a wider box, whose middle is off its ends.
     slack = 0.01 + 0.1 * abs(aside) + 0.6 * abs(roll) / distance
     assert wrap_angle(view.azimuth - (yaw + aside)) == pytest.approx(0.0, abs=slack)
     if view.bottom is not None:
@@ -48,7 +48,7 @@ def test_azimuth_and_slopes_are_those_of_the_thing_whatever_the_attitude(
 
 
 @given(**ANGLES)
-def test_a_predicted_box_is_where_the_thing_is_seen(
+def test_a_predicted_box_matches_the_view(
     roll: float, pitch: float, yaw: float, aside: float, distance: float, height: float
 ) -> None:
     camera = camera_at(1.0, 2.0, height, pitch=pitch, yaw=yaw)
@@ -68,7 +68,7 @@ def test_a_predicted_box_is_where_the_thing_is_seen(
     ("distance", "pitch", "cut"),
     [(4.0, 0.0, ""), (4.0, -0.35, "below"), (4.0, 0.35, "above"), (0.9, 0.0, "both")],
 )
-def test_of_an_edge_that_the_image_cuts_off_there_is_only_a_bound(distance: float, pitch: float, cut: str) -> None:
+def test_an_edge_cut_off_by_the_image_gives_only_a_bound(distance: float, pitch: float, cut: str) -> None:
     camera = camera_at(pitch=pitch)
     box = box_of(camera, np.array([distance + 0.12, 0.0, 0.0]))
     assert box is not None
@@ -78,9 +78,9 @@ def test_of_an_edge_that_the_image_cuts_off_there_is_only_a_bound(distance: floa
     assert (view.bottom is None, view.below is not None) == ((cut in ("below", "both")),) * 2
     assert (view.top is None, view.above is not None) == ((cut in ("above", "both")),) * 2
     if view.below is not None:
-        assert view.below > low - 0.02, "its foot is farther down than what is seen"
+        assert view.below > low - 0.02, "its foot is below the visible part"
     if view.above is not None:
-        assert view.above < high + 0.02, "its head is farther up than what is seen"
+        assert view.above < high + 0.02, "its head is above the visible part"
 
 
 def test_a_box_at_the_side_of_the_image_has_an_uncertain_middle() -> None:
@@ -94,11 +94,11 @@ def test_a_box_at_the_side_of_the_image_has_an_uncertain_middle() -> None:
 
 
 @pytest.mark.parametrize("pitch", [1.4, -1.4])
-def test_what_is_straight_above_or_below_has_no_azimuth(pitch: float) -> None:
+def test_a_thing_straight_above_or_below_has_no_azimuth(pitch: float) -> None:
     assert BoxView.of((140, 100, 40, 40), camera_at(pitch=pitch)) is None
 
 
-def test_a_box_that_is_no_number_shows_nothing() -> None:
+def test_a_box_with_nan_shows_nothing() -> None:
     assert BoxView.of((math.nan, 10.0, 20.0, 20.0), camera_at()) is None
 
 
@@ -112,7 +112,7 @@ def test_a_box_that_is_no_number_shows_nothing() -> None:
         ((1.12, 0.0, -3.0), None, False),
     ],
 )
-def test_only_what_is_before_the_camera_has_a_pixel(
+def test_only_points_in_front_of_the_camera_have_a_pixel(
     point: tuple[float, float, float], pixel: tuple[float, float] | None, shown: bool
 ) -> None:
     camera = camera_at()
@@ -121,7 +121,7 @@ def test_only_what_is_before_the_camera_has_a_pixel(
     assert camera.shows(np.array(point)) is shown
 
 
-def test_what_is_a_little_beside_the_image_has_a_pixel_and_is_not_shown() -> None:
+def test_a_point_just_outside_the_image_has_a_pixel_but_is_not_shown() -> None:
     camera = camera_at(yaw=0.72)
     point = np.array([5.0, 0.0, 1.2])
     pixel = camera.pixel(point)
@@ -131,20 +131,20 @@ def test_what_is_a_little_beside_the_image_has_a_pixel_and_is_not_shown() -> Non
 
 
 @pytest.mark.parametrize("foot", [(-4.0, 0.0, 0.0), (0.5, 0.0, 0.0), (4.0, 9.0, 0.0)])
-def test_what_can_not_be_shown_whole_has_no_predicted_box(foot: tuple[float, float, float]) -> None:
+def test_a_thing_not_entirely_visible_has_no_predicted_box(foot: tuple[float, float, float]) -> None:
     assert predicted_box(camera_at(), np.array(foot), 1.7) is None
 
 
-def test_what_is_too_small_to_be_seen_has_no_predicted_box() -> None:
+def test_a_thing_too_small_to_see_has_no_predicted_box() -> None:
     assert predicted_box(camera_at(), np.array([400.0, 0.0, 0.0]), 0.5) is None
 
 
-def test_a_camera_has_no_place_before_the_attitude_is_known() -> None:
+def test_a_camera_has_no_pose_before_the_attitude_is_known() -> None:
     lens, origin = FRONT_CAMERA.intrinsics(), np.zeros(3)
     assert Camera.at(FRONT_CAMERA.info(), Feedback(captured_ns=1, yaw_rad=0.0), origin, lens, SIZE) is None
 
 
-def test_a_camera_must_say_how_it_is_mounted_but_not_where() -> None:
+def test_a_camera_needs_a_known_orientation_but_no_position() -> None:
     lens, origin = FRONT_CAMERA.intrinsics(), np.zeros(3)
     with pytest.raises(UsageError, match="mounted"):
         Camera.at(CameraInfo("front", 320, 240, 15.0), state(), origin, lens, SIZE)

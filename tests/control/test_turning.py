@@ -1,4 +1,4 @@
-"""The filter of a point that goes straight, turns or speeds up: how well it predicts each."""
+"""The filter of a point in straight, turning or accelerated motion: how well it predicts each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def watched(path: Path, seconds: float = 4.0, deviation: float = 0.01) -> Turnin
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_where_it_will_be_in_most_of_a_second(name: str) -> None:
+def test_prediction_of_most_of_a_second(name: str) -> None:
     expected = watched(PATHS[name]).at(nanoseconds(4.0 + 0.7))
     assert math.dist(expected.position[:2], PATHS[name](4.7)) < 0.1
     assert expected.position[2] == pytest.approx(0.2, abs=0.03)
@@ -57,7 +57,7 @@ def test_a_restart_remembers_that_it_turned() -> None:
 
 
 def test_the_linearised_covariance_is_that_of_the_motion() -> None:
-    """The derivative of a short prediction by each part of the state, by differences."""
+    """Differentiate a short prediction by each part of the state numerically."""
     watching = watched(PATHS["a circle of 8 m at 3 m/s, clockwise"])
     last = watching.newest
     assert last is not None
@@ -79,7 +79,7 @@ def test_the_linearised_covariance_is_that_of_the_motion() -> None:
     assert end == pytest.approx(spread, rel=0.15, abs=1e-5)
 
 
-def test_what_is_wild_is_refused() -> None:
+def test_outliers_are_refused() -> None:
     watching = watched(PATHS["standing"])
     assert not watching.update(np.array([4.0, 4.0, 0.2]), 0.01, nanoseconds(4.0))
     assert watching.refused == 1
@@ -96,7 +96,7 @@ def test_settings_out_of_range_are_refused(arguments: dict[str, float], message:
         TurningTargetFilter(**arguments)
 
 
-def test_measurements_that_make_no_sense_are_refused() -> None:
+def test_invalid_measurements_are_refused() -> None:
     watching = TurningTargetFilter()
     with pytest.raises(UsageError, match="never seen"):
         watching.at(0)

@@ -1,4 +1,4 @@
-"""Flying to a place."""
+"""Flying to a waypoint."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_limits_hold_everywhere(x: float, y: float, z: float, yaw: float, goal_y
     asked = velocity_to(Waypoint(x, y, z, goal_yaw), at(yaw=yaw))
     speed = math.hypot(asked.forward, asked.left)
     assert speed <= SETTINGS.speed_m_s + 1e-9
-    assert speed**2 <= 2 * SETTINGS.slow_down_m_s2 * math.hypot(x, y) + 1e-9, "it can come to rest there"
+    assert speed**2 <= 2 * SETTINGS.slow_down_m_s2 * math.hypot(x, y) + 1e-9, "it can stop there"
     assert abs(asked.up) <= SETTINGS.climb_m_s + 1e-9
     assert abs(asked.yaw_rate) <= SETTINGS.turn_rad_s + 1e-9
     assert asked.finite
@@ -85,13 +85,13 @@ def test_an_ideal_vehicle_gets_there(x: float, y: float, z: float, yaw: float, h
 def test_there_means_at_rest() -> None:
     goal = Waypoint(0.05, 0, 0, yaw=0.05)
     assert reached(goal, at())
-    assert reached(goal, at(velocity=None)), "where the velocity is not known, the place decides"
+    assert reached(goal, at(velocity=None)), "without a known velocity the position decides"
     assert not reached(goal, at(velocity=(0.5, 0.0, 0.0)))
     assert not reached(Waypoint(0.2, 0, 0), at())
     assert not reached(Waypoint(0, 0, 0, yaw=0.2), at())
 
 
-def test_what_is_not_known_is_told() -> None:
+def test_missing_values_are_reported() -> None:
     assert lacking(at()) == ""
     for blind in (at(position=None), at(yaw=None)):
         assert lacking(blind)
@@ -102,6 +102,6 @@ def test_what_is_not_known_is_told() -> None:
 
 
 @pytest.mark.parametrize("values", [(math.nan, 0, 0, None), (0, math.inf, 0, None), (0, 0, 0, math.nan)])
-def test_a_place_is_finite(values: tuple[float, float, float, float | None]) -> None:
+def test_a_waypoint_must_be_finite(values: tuple[float, float, float, float | None]) -> None:
     with pytest.raises(UsageError, match="must be finite"):
         Waypoint(*values)

@@ -1,4 +1,4 @@
-"""Each example runs by itself: it starts what it needs, or says in one line what to start."""
+"""Each example runs alone: it starts what it needs, or says in one line what to start."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 import skyloop
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-#: Those that join drones which others share, and what they say to start.
+#: Examples that join shared drones, and the commands that they tell the user to run.
 JOINING = {
     "shared_drone": "start the drone first: skyloop sim --name alpha",
     "swarm_formation": "start three drones first: skyloop sim --drones 3 --name drone --option cameras=none",
@@ -22,12 +22,12 @@ JOINING = {
 }
 
 
-class Starts(Exception):  # noqa: N818  it is how a test ends, and no error
-    """The example starts a simulation of its own; the other tests of this folder, and of ``tests/gym``, fly it."""
+class Starts(Exception):  # noqa: N818  the end of a test, not an error
+    """The example starts its own simulation; other tests of this folder, and of ``tests/gym``, fly it."""
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_alone_it_starts_what_it_needs_or_says_what_to_start(
+def test_alone_it_starts_its_own_simulation_or_says_what_to_start(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     join = skyloop.connect
@@ -46,6 +46,6 @@ def test_alone_it_starts_what_it_needs_or_says_what_to_start(
     monkeypatch.setattr(sys, "argv", [str(path)])
     with pytest.raises((Starts, SystemExit)) as ended:
         runpy.run_path(str(path), run_name="__main__")
-    said = str(ended.value)  # an exit with words prints them alone, on standard error, with exit code 1
+    said = str(ended.value)  # an exit with a text prints only that, on standard error, with exit code 1
     assert said == JOINING.get(path.stem, "")
     assert "\n" not in said

@@ -1,4 +1,4 @@
-"""The examples of behaviours, each run whole, in simulated time."""
+"""The examples of behaviours, each run completely in simulated time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Run = Callable[[str], str]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs an example as it is, but for time, which is simulated; returns what it printed."""
+    """Runs an example unchanged, except for simulated time; returns its output."""
 
     def connect(target: str) -> AbstractContextManager[Drone]:
         return rehearse(target)
@@ -31,7 +31,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
-        monkeypatch.setitem(sys.modules, module.__name__, module)  # where dataclasses look for it
+        monkeypatch.setitem(sys.modules, module.__name__, module)  # dataclasses look it up there
         spec.loader.exec_module(module)
         monkeypatch.setattr(skyloop, "connect", connect)
         module.main()
@@ -49,13 +49,13 @@ def test_an_example_is_short_and_says_how_to_run_it(name: str) -> None:
 
 def test_gates(run: Run) -> None:
     printed = run("fly_gates")
-    assert "through gate 1, on to gate 2" in printed
+    assert "through gate 1, next is gate 2" in printed
     assert printed.splitlines()[-1] == "passed 5 of 5 gates"
 
 
 def test_landing(run: Run) -> None:
     printed = run("land_on_platform")
-    assert "it stands" in printed
+    assert "landed on the platform" in printed
     off = re.search(r"([\d.]+) m from the marker's centre", printed)
     assert off is not None
     assert float(off[1]) < 0.2

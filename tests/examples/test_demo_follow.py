@@ -26,7 +26,7 @@ SCRIPT = str(Path(__file__).parents[2] / "scripts" / "demo_follow.py")
 
 
 def truth(**visible: float | None) -> FrameTruth:
-    """Of people by name: how much of each is to be seen; None: not in the image."""
+    """Visible share of people by name; None: not in the image."""
     boxes = {
         name: TargetBox(name, "person", (100 * number, 50, 30, 80), share, False)
         for number, (name, share) in enumerate(visible.items())
@@ -50,7 +50,7 @@ def test_what_counts() -> None:
     assert (figures["distance_median_m"], figures["distance_error_p95_m"]) == (4.5, 0.5)
 
 
-def test_a_loss_counts_once_however_many_phases_it_has() -> None:
+def test_a_loss_counts_once_even_with_several_phases() -> None:
     report = FollowReport("looks", 4.0)
     for phase in (
         TargetPhase.LOOKING,
@@ -64,7 +64,7 @@ def test_a_loss_counts_once_however_many_phases_it_has() -> None:
     assert report.times_lost == 2
 
 
-def test_the_table_tells_what_is_known_and_what_is_not() -> None:
+def test_the_table_shows_known_and_unknown_figures() -> None:
     def shown(report: FollowReport) -> str:
         text = io.StringIO()
         Console(file=text, width=160).print(report.table())
@@ -76,7 +76,7 @@ def test_the_table_tells_what_is_known_and_what_is_not() -> None:
         assert words in shown(report)
 
 
-def test_a_box_shows_who_it_is_on() -> None:
+def test_a_box_identifies_its_person() -> None:
     true = truth(anna=1.0, bert=0.5)
     assert true.shown_in((2.0, 50.0, 30.0, 80.0)) == "anna"
     assert true.shown_in((200.0, 50.0, 30.0, 80.0)) is None
@@ -112,7 +112,7 @@ def test_without_scipy_or_onnx_runtime_there_is_no_detector(monkeypatch: pytest.
 
 
 @pytest.mark.process
-def test_what_is_wrong_is_told_before_anything_flies() -> None:
+def test_errors_are_reported_before_take_off() -> None:
     for words, said in (
         (("--world", "empty"), "nobody walks about in the world 'empty'"),
         (("--world", "prak"), "did you mean 'park'"),
@@ -126,7 +126,7 @@ def test_what_is_wrong_is_told_before_anything_flies() -> None:
 
 
 @pytest.mark.process
-def test_ctrl_c_lands_and_tells_the_figures() -> None:
+def test_ctrl_c_lands_and_prints_the_figures() -> None:
     process = Process(SCRIPT, "--headless", "--json")
     try:
         process.until("following at 4 m until Ctrl-C", 30.0)

@@ -1,4 +1,4 @@
-"""The examples, each run as its own first lines say, on simulated drones."""
+"""The examples, each run as its first lines say, on simulated drones."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_an_example_is_short_and_says_how_to_run_it(path: Path) -> None:
 
 
 def numbers(pattern: str, process: Process) -> list[float]:
-    """The numbers that it said in such words, in order."""
+    """Return the numbers in the process's output that match, in order."""
     return [float(found) for found in re.findall(pattern, process.text)]
 
 
@@ -73,14 +73,14 @@ def test_paths(start: Start) -> None:
     assert process.wait(30.0) == 0
     errors = numbers(r"off by ([\d.]+) m RMS", process)
     assert len(errors) == 3
-    assert max(errors) < 0.2  # 0.133, 0.096 and 0.099; in simulated time, so that they are the same each time
+    assert max(errors) < 0.2  # 0.133, 0.096 and 0.099; the same each time, because time is simulated
 
 
-def test_a_recording_tells_two_controllers_apart(start: Start, tmp_path: Path) -> None:
+def test_a_recording_distinguishes_two_controllers(start: Start, tmp_path: Path) -> None:
     process = example(start, "replay_and_compare", str(tmp_path / "flights"), "4")
     process.until("skyloop log compare", 90.0)
     assert process.wait(30.0) == 0
-    assert numbers(r"forward: ([\d.]+) m/s RMS", process) == [0.0]  # that part of both is the same
+    assert numbers(r"forward: ([\d.]+) m/s RMS", process) == [0.0]  # that part is the same in both
     [turning] = numbers(r"yaw_rate: ([\d.]+) rad/s RMS", process)
     assert turning > 0.01
 

@@ -1,4 +1,4 @@
-"""The notebook, run from its first cell to its last by a Jupyter kernel."""
+"""The notebook, run from first to last cell by a Jupyter kernel."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def outputs(notebook: Any, kind: str) -> list[Any]:
     return [output for cell in notebook.cells for output in cell.get("outputs", ()) if output.output_type == kind]
 
 
-def test_it_is_kept_without_outputs(notebook: Any) -> None:
+def test_it_is_committed_without_outputs(notebook: Any) -> None:
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
     assert code

@@ -1,4 +1,4 @@
-"""Fuzzy inference by table, the rules of see-and-avoid by what they must never do, and its law."""
+"""Fuzzy inference by table, properties of the see-and-avoid rules, and its law."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def test_output_is_between_the_rules_by_their_truth() -> None:
     assert heater.step(t=10.0) == 0.0
 
 
-def test_conditions_multiply_and_silence_is_nothing() -> None:
+def test_conditions_multiply_and_without_rules_the_output_is_zero() -> None:
     terms = {"on": Trapezoid(0, 1, 1, 2)}
     both = FuzzyController({"a": terms, "b": terms}, [Rule({"a": "on", "b": "on"}, 2.0), Rule({"a": "on"}, 0.0)])
     assert both.step(a=1.0, b=0.5) == pytest.approx(2.0 * 0.5 / 1.5)
     assert both.step(a=5.0, b=1.0) == 0.0
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     terms = triangles({"low": 0.0, "high": 1.0})
     with pytest.raises(UnknownNameError, match="variable"):
         FuzzyController({"a": terms}, [Rule({"b": "low"}, 1.0)])
@@ -55,15 +55,15 @@ def test_what_makes_no_sense_is_refused() -> None:
 
 
 @given(st.floats(0.03, 1.5), st.floats(0.0, 1.5))
-def test_goes_away_from_what_is_in_the_way(bearing: float, width: float) -> None:
+def test_moves_away_from_an_obstacle(bearing: float, width: float) -> None:
     rules = avoidance()
     right, left = rules.step(bearing=bearing, width=width), rules.step(bearing=-bearing, width=width)
     assert -1.0 <= right <= 1.0
-    assert right <= 1e-9, "what is to the left is never flown to"
+    assert right <= 1e-9, "it never flies towards an obstacle on the left"
     if bearing > 0.2:
         assert left == pytest.approx(-right)
 
 
 @given(st.floats(0.3, 1.0))
-def test_what_is_straight_ahead_and_near_is_passed_on_the_right(width: float) -> None:
+def test_a_near_obstacle_straight_ahead_is_passed_on_the_right(width: float) -> None:
     assert avoidance().step(bearing=0.0, width=width) < -0.5

@@ -1,4 +1,4 @@
-"""The Gymnasium environment over the simulator."""
+"""The Gymnasium environments on the simulator."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "learn_to_reach.py"
 
 
 def steer(seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """A plain controller: towards the goal, and turning to its heading; shape (…, 4)."""
+    """Return the actions of a plain controller: towards the goal, turning to its heading; shape (…, 4)."""
     turn = np.arctan2(seen[..., 8], seen[..., 9])
     wanted = np.concatenate([1.2 * seen[..., :3] - 0.3 * seen[..., 3:6], turn[..., None]], axis=-1)
     action: np.ndarray[Any, Any] = np.clip(wanted, -1, 1).astype(np.float32)
@@ -43,7 +43,7 @@ def steer(seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize(
     ("task", "observe"), [("Reach", "state"), ("Hover", "state"), ("Follow", "both"), ("Gates", "pixels")]
 )
-def test_gymnasiums_own_checker_is_content(task: str, observe: str) -> None:
+def test_gymnasiums_own_checker_passes(task: str, observe: str) -> None:
     register()
     register()
     env = gymnasium.make(f"skyloop/{task}-v0", render_mode="rgb_array", seconds=2.0, observe=observe)
@@ -63,12 +63,12 @@ def test_observations_are_numbers_pictures_or_both() -> None:
     assert seen["pixels"].shape == (64, 64, 3)
     assert seen["pixels"].dtype == np.uint8
     assert np.array_equal(seen["both"]["pixels"], seen["pixels"])
-    assert np.array_equal(seen["both"]["motion"], seen["state"][3:8]), "what a picture does not tell, and not the goal"
+    assert np.array_equal(seen["both"]["motion"], seen["state"][3:8]), "values that a picture lacks, without the goal"
     pixels = seen["pixels"].astype(int)
     red = (pixels[..., 0] > 150) & (pixels[..., 1] < 110) & (pixels[..., 2] < 110)
     across = np.flatnonzero(red.any(axis=0))
     left, ahead = seen["state"][1], seen["state"][0]
-    assert across.mean() == pytest.approx(32 - 40 * left / ahead, abs=3.0), "the target is where the numbers say"
+    assert across.mean() == pytest.approx(32 - 40 * left / ahead, abs=3.0), "the target's position matches the numbers"
     envs = GatesVectorEnv(2, observe="both")
     many, told = envs.reset(seed=1)
     assert envs.observation_space.contains(many)
@@ -78,8 +78,8 @@ def test_observations_are_numbers_pictures_or_both() -> None:
 
 
 @pytest.mark.parametrize("kind", [FollowVectorEnv, GatesVectorEnv, HoverVectorEnv, ReachVectorEnv])
-def test_an_episode_begins_the_same_whatever_was_before(kind: Any) -> None:
-    """Targets began where the last episode had left them, and the velocity was that of its end."""
+def test_an_episode_begins_the_same_whatever_came_before(kind: Any) -> None:
+    """Targets once began where the last episode had left them, and the velocity was that of its end."""
     fresh, used = kind(3), kind(3)
     seen, _ = used.reset(seed=5)
     for _ in range(40):
@@ -99,13 +99,13 @@ def test_an_episode_begins_the_same_whatever_was_before(kind: Any) -> None:
     assert np.array_equal(before, used._task.goals)
 
 
-def test_pictures_have_the_size_asked_for_and_show_no_other_drone() -> None:
+def test_pictures_have_the_requested_size_and_show_no_other_drone() -> None:
     envs = ReachVectorEnv(4, observe="pixels", size_px=84)
     many, _ = envs.reset(seed=1)
     assert many.shape == (4, 84, 84, 3)
     assert envs.observation_space.contains(many)
     arena = envs._task.arena
-    for drone in range(4):  # each looks across its cell's middle at where its neighbours are
+    for drone in range(4):  # each looks across its cell's middle towards its neighbours
         arena.put(drone, np.array([0.0, 0.0, 2.0]), [0.0, math.pi / 2, -math.pi / 2, math.pi][drone])
     camera = OnBoard(arena, 84)
     none: list[Any] = []
@@ -113,7 +113,7 @@ def test_pictures_have_the_size_asked_for_and_show_no_other_drone() -> None:
     arena.put(1, np.array([-3.0, 0.0, 2.0]), 0.0)
     assert np.array_equal(camera.draw(0, none), before)
     arena.put(0, np.array([0.0, 0.0, 2.5]), 0.0)
-    assert not np.array_equal(camera.draw(0, none), before), "its own place is seen"
+    assert not np.array_equal(camera.draw(0, none), before), "its own cell is visible"
     for wrong in (15, 513, 84.0, True):
         with pytest.raises(UsageError, match=r"size_px is .* and must be a whole number from 16 to 512"):
             ReachEnv(observe="pixels", size_px=wrong)  # type: ignore[arg-type]
@@ -129,7 +129,7 @@ def test_a_ring_is_round_and_square_to_its_normal(normal: list[float]) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_actions_that_are_no_numbers_count_as_none() -> None:
+def test_nan_actions_count_as_zero() -> None:
     first, second = ReachEnv(), ReachEnv()
     for env in (first, second):
         env.reset(seed=1)
@@ -167,7 +167,7 @@ def test_a_plain_controller_hovers_follows_and_flies_the_gates() -> None:
         seen, rewards, ended, _, told = racing.step(steer(beyond))
         total += float(rewards.mean())
         assert ((told["gates_passed"] == GATES) == told["is_success"]).all()
-        assert (ended <= told["is_success"]).all(), "nothing ends it but the last gate"
+        assert (ended <= told["is_success"]).all(), "only the last gate ends it"
         passed |= told["is_success"]
         if passed.all():
             break
@@ -216,7 +216,7 @@ def test_a_drone_that_leaves_its_cell_has_failed() -> None:
     assert reward < -4.0
 
 
-def test_many_drones_begin_anew_on_their_own() -> None:
+def test_many_drones_restart_independently() -> None:
     register()
     envs = gymnasium.make_vec("skyloop/Reach-v0", num_envs=5, seconds=2.0)
     assert isinstance(envs.unwrapped, ReachVectorEnv)
@@ -255,7 +255,7 @@ def test_a_picture_shows_the_goal() -> None:
     ("wrong", "said"),
     [({"render_mode": "human"}, "render_mode"), ({"seconds": 0.0}, "seconds"), ({"gusts_m_s": math.nan}, "gusts_m_s")],
 )
-def test_wrong_arguments_are_told(wrong: dict[str, Any], said: str) -> None:
+def test_wrong_arguments_are_refused(wrong: dict[str, Any], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         ReachEnv(**wrong)
 
@@ -266,13 +266,13 @@ def test_it_must_be_reset_first() -> None:
 
 
 def test_a_short_run_learns() -> None:
-    """A linear policy by the cross-entropy method: seconds on one core, and no framework."""
+    """Train a linear policy by the cross-entropy method, in seconds on one core and without a framework."""
     learn = runpy.run_path(str(EXAMPLE))["learn"]
     curve = learn(8, seconds=3.0)
     assert curve[-1] > curve[0] + 1.0
 
 
-def test_a_rotor_level_vehicle_reaches_too() -> None:
+def test_a_rotor_level_vehicle_also_reaches_the_goal() -> None:
     env = ReachEnv(vehicle="crazyflie", gusts_m_s=0.0)
     seen, _ = env.reset(seed=3)
     for _ in range(150):

@@ -1,4 +1,4 @@
-"""The endpoint over HTTP: what it answers, to whom, and that a reader that stalls harms nobody."""
+"""The endpoint over HTTP: its answers, its access rules, and its independence from stalled readers."""
 
 from __future__ import annotations
 
@@ -79,29 +79,29 @@ def test_other_paths_and_other_hosts(endpoint: Endpoint) -> None:
         assert get(endpoint, Host=host)[0] == 200, host
 
 
-def test_readers_that_stall_neither_stay_nor_keep_others_out(endpoint: Endpoint) -> None:
+def test_stalled_readers_neither_stay_nor_keep_others_out(endpoint: Endpoint) -> None:
     stalled = []
     for number in range(MAX_SCRAPES):
         one = socket.create_connection(("127.0.0.1", endpoint.port), timeout=10)
         if number % 2:
-            one.sendall(b"GET /metr")  # and no more
+            one.sendall(b"GET /metr")  # an incomplete request
         stalled.append(one)
     for _ in range(20):
-        assert get(endpoint)[0] == 200, "one that asks takes the place of the oldest that does not"
+        assert get(endpoint)[0] == 200, "a request takes the place of the oldest silent connection"
     for one in stalled:
         while one.recv(100):
-            pass  # hung up when its time is over
+            pass  # closed at its deadline
         one.close()
     deadline = time.monotonic() + 10
     while True:
         try:
             assert get(endpoint)[0] == 200
             break
-        except OSError:  # the last place is given back in a moment
+        except OSError:  # the last place is freed in a moment
             assert time.monotonic() < deadline
 
 
-def test_a_byte_now_and_then_does_not_hold_a_place(endpoint: Endpoint) -> None:
+def test_an_occasional_byte_does_not_hold_a_place(endpoint: Endpoint) -> None:
     def drip() -> None:
         with socket.create_connection(("127.0.0.1", endpoint.port), timeout=10) as one:
             deadline = time.monotonic() + 10
@@ -137,7 +137,7 @@ def test_proxies_come_and_go() -> None:
         urllib.request.urlopen(endpoint.url, timeout=5)
 
 
-def test_all_that_a_proxy_reads_can_be_parsed() -> None:
+def test_all_readings_of_a_proxy_can_be_parsed() -> None:
     with Bench() as bench:
         bench.airborne()
         with serve(lambda: [lambda: proxy_readings(bench.proxy)], "0") as endpoint:
@@ -155,17 +155,17 @@ def test_all_that_a_proxy_reads_can_be_parsed() -> None:
         ("lab.example:1", ("lab.example", 1)),
     ],
 )
-def test_places(where: str, found: tuple[str, int]) -> None:
+def test_addresses(where: str, found: tuple[str, int]) -> None:
     assert parse_where(where) == found
 
 
 @pytest.mark.parametrize("where", ["", "x", ":", ":80", "127.0.0.1", "127.0.0.1:", "1:65536", "-1", "٣"])
-def test_places_that_are_none(where: str) -> None:
-    with pytest.raises(UsageError, match="is no place for metrics"):
+def test_invalid_addresses(where: str) -> None:
+    with pytest.raises(UsageError, match="is not an address for metrics"):
         serve(list, where)
 
 
-def test_a_port_that_is_taken_and_a_host_that_is_not_here(endpoint: Endpoint) -> None:
+def test_a_taken_port_and_a_foreign_host(endpoint: Endpoint) -> None:
     with pytest.raises(UsageError, match=f"metrics can't be served at 127.0.0.1, port {endpoint.port}"):
         serve(list, str(endpoint.port))
     with pytest.raises(UsageError, match=r"metrics can't be served at 192\.0\.2\.1"):
@@ -178,7 +178,7 @@ def test_beyond_loopback_there_is_a_warning() -> None:
         pass
     with serving_beside("0", said.append)([]):
         pass
-    assert "WARNING: whoever reaches this address can read them" in said[0]
+    assert "WARNING: anyone who reaches this address can read them" in said[0]
     assert "WARNING" not in said[1]
 
 

@@ -1,4 +1,4 @@
-"""``docs/operations.md`` and the dashboard name the metrics that there are, as they are."""
+"""``docs/operations.md`` and the dashboard name exactly the existing metrics."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ def test_queries_name_metrics_labels_and_values_that_exist(query: str) -> None:
             if known is not None and not text.startswith("$"):
                 assert set(text.split("|")) <= known, f"{label}{operator}{text}"
         counted = f"rate({name}" in query or f"increase({name}" in query
-        assert counted == (family.kind == "counter"), "counters are looked at by their rate, and nothing else is"
+        assert counted == (family.kind == "counter"), "counters are shown as rates, and only counters"
 
 
-def test_each_alert_has_what_to_do() -> None:
+def test_each_alert_says_what_to_do() -> None:
     alerts = re.findall(r"- alert: (\w+)", PAGE)
     assert len(alerts) == len(ALERTS) > 5
     assert re.findall(r"^\| ([A-Z]\w+) \|", PAGE, re.MULTILINE) == alerts

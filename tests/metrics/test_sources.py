@@ -1,4 +1,4 @@
-"""What the metrics say of proxies, connections and routers, and that all of it is in the catalogue."""
+"""Metrics of proxies, connections and routers, all of them in the catalogue."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def bench() -> Iterator[Bench]:
 
 
 def values(readings: Iterator[Reading]) -> Values:
-    """By name and labels, each once, and each as the catalogue has it."""
+    """Return values by name and labels, after checking each against the catalogue."""
     found: Values = {}
     for reading in readings:
         family = FAMILIES[reading.name]
@@ -55,7 +55,7 @@ def test_a_vehicle_on_the_ground_without_applications(bench: Bench) -> None:
     assert found["skyloop_vehicle_link_state", "bench", "up"] == 1
     assert found["skyloop_failsafe", "bench", "none"] == 1
     assert found["skyloop_vehicle_battery_ratio", "bench"] == 0.9
-    assert ("skyloop_vehicle_battery_volts", "bench") not in found, "it is not known"
+    assert ("skyloop_vehicle_battery_volts", "bench") not in found, "unknown voltage"
     assert found["skyloop_feedback_age_seconds", "bench"] == pytest.approx(0.5)
     assert found["skyloop_applications", "bench"] == 0
     assert found["skyloop_authority_held", "bench"] == 0
@@ -88,7 +88,7 @@ def test_a_flight(bench: Bench) -> None:
     assert found["skyloop_frames_published_total", "bench", "front"] == 1
 
 
-def test_a_pilot_that_falls_silent(bench: Bench) -> None:
+def test_a_silent_pilot(bench: Bench) -> None:
     bench.airborne()
     bench.run(2.5)
     found = of(bench)

@@ -1,4 +1,4 @@
-"""What the servers written from public facts show: one body that climbs and turns, and one that is hidden."""
+"""The content of the servers written from public facts: one body that climbs and turns, and a hidden one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ PERIOD_S: Final = 0.01
 
 
 def pose(frame: int) -> tuple[tuple[float, float, float], float]:
-    """Where the first body is in a frame: its place [m], with z up, and its yaw [rad]. Its height tells the frame."""
+    """Return the first body's position [m], z up, and yaw [rad] in a frame. Its height encodes the frame."""
     return (1.5, -0.25, 1.0 + 0.001 * (frame % 1000)), math.remainder(0.01 * (frame % 1000), math.tau)
 
 
 def frame_of(height_m: float) -> int:
-    """The frame in which the body was so high."""
+    """Return the frame in which the body had this height."""
     return round((height_m - 1.0) * 1000)

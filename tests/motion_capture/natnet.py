@@ -1,6 +1,6 @@
 """A small OptiTrack server that replays a recorded session: ``python -m tests.motion_capture.natnet PORT``.
 
-Reads the recording (pcapng) and answers as Motive did: a description of the server, its model definitions, and then the
+Reads the recording (pcapng) and answers as Motive did: a description of the server, its model definitions, then the
 recorded frames, by multicast on the loopback interface. Layouts: https://docs.optitrack.com/developer-tools/natnet-sdk.
 """
 
@@ -15,8 +15,8 @@ from typing import Final, NamedTuple
 
 from tests.support.recordings import recorded
 
-SERVER_INFO, MODEL_DEFINITIONS, FRAME = 1, 5, 7  # what the server sends
-CONNECT, REQUEST_MODELS = 0, 4  # what a client asks
+SERVER_INFO, MODEL_DEFINITIONS, FRAME = 1, 5, 7  # messages of the server
+CONNECT, REQUEST_MODELS = 0, 4  # requests of a client
 SESSION: Final = "mocap/natnet3-motive2.1.pcapng"
 BODY: Final = "RaceQuad"
 _DATA_PORT_AT: Final = 4 + 256 + 4 + 4 + 8  # in the server's description: after name, versions and clock frequency
@@ -31,7 +31,7 @@ class Recorded(NamedTuple):
 
 
 def datagrams() -> Iterator[bytes]:
-    """What was sent over UDP, in order."""
+    """Yield the payloads sent over UDP, in order."""
     data, at = recorded(SESSION).read_bytes(), 0
     while at < len(data):
         kind, size = struct.unpack_from("<II", data, at)
@@ -52,7 +52,7 @@ def frames() -> list[bytes]:
 
 
 def rigid_body(frame: bytes) -> Recorded:
-    """The only rigid body of a recorded frame (NatNet 3.0)."""
+    """Return the only rigid body of a recorded frame (NatNet 3.0)."""
     at = 8  # message, size, number of the frame
     (sets,) = struct.unpack_from("<i", frame, at)
     at += 4
@@ -69,7 +69,7 @@ def rigid_body(frame: bytes) -> Recorded:
 
 
 def serve(port: int, pause_s: float = 1 / 240) -> None:
-    """Answer on a port of loopback, and once asked for the models send the frames over and over."""
+    """Answer on a loopback port; after a request for the models, send the frames in a loop."""
     found = {message(datagram): datagram for datagram in datagrams()}
     recorded = frames()
     with (

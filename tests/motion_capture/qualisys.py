@@ -1,9 +1,9 @@
 """A small Qualisys server: ``python -m tests.motion_capture.qualisys PORT``.
 
 Written from the public source of Qualisys' own client (https://github.com/qualisys/qualisys_cpp_sdk, MIT licence):
-packets with their length and type before them, little endian on the base port plus one. Commands are texts, settings
-XML, and frames come by UDP to the port that the client names. Places are in millimetres; the angles, in degrees, are
-about the axes x, y and z, one after the other, of the body.
+packets preceded by length and type, little endian, on the base port plus one. Commands are texts, settings are XML, and
+frames arrive by UDP on the port that the client names. Places are in millimetres; the angles, in degrees, are about the
+body's axes x, y and z in turn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.motion_capture.moving import BODIES, PERIOD_S, pose
 
 TEXT, XML, DATA, EVENT = 1, 2, 3, 6
 POINTS_UNLABELLED, BODIES_EULER = 2, 6
-CONNECTED: Final = b"\1"  #: the event that tells the state
+CONNECTED: Final = b"\1"  #: the state event
 HEADER: Final = struct.Struct("<II")
 
 
@@ -45,7 +45,7 @@ def component(kind: int, count: int, data: bytes) -> bytes:
 
 
 def frame(number: int) -> bytes:
-    """Both bodies; what is hidden is not a number."""
+    """Encode both bodies; a hidden one is NaN."""
     place, yaw = pose(number)
     seen = struct.pack("<6f", *(1000.0 * value for value in place), 0.0, 0.0, math.degrees(yaw))
     hidden = struct.pack("<6f", *[math.nan] * 6)
@@ -54,7 +54,7 @@ def frame(number: int) -> bytes:
 
 
 def talk(client: socket.socket) -> int:
-    """Answer until frames are asked for and the client knows with whom it talks; the port for the frames."""
+    """Answer until the client has identified the server and requests frames; return the port for them."""
     client.sendall(text("QTM RT Interface connected"))
     version, port, known = "", 0, False
     with client.makefile("rb") as stream:
@@ -80,7 +80,7 @@ def talk(client: socket.socket) -> int:
 
 
 def serve(port: int) -> None:
-    """One client, until it goes. ``port`` 0: a free one; the base port that is told is one less than that."""
+    """Serve one client until it leaves. ``port`` 0: a free one; the announced base port is one less."""
     with (
         socket.create_server(("127.0.0.1", port + 1 if port else 0)) as server,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as frames,

@@ -1,5 +1,5 @@
-"""Vicon and Qualisys by the clients that the ``motioncapture`` package carries, and VRPN by ours, against small servers
-that are written from public facts."""
+"""Vicon and Qualisys through the clients in the ``motioncapture`` package, and VRPN through ours, against small servers
+written from public facts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.processes import Process
 pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
 pytestmark = pytest.mark.process
 ENOUGH = 50
-QUALISYS_FRAMES_PORT = 6734  #: the UDP port of this host on which the package takes frames, whatever the address says
+QUALISYS_FRAMES_PORT = 6734  #: UDP port of this host where the package receives frames, regardless of the address
 
 
 def busy(port: int) -> bool:
@@ -32,7 +32,7 @@ def busy(port: int) -> bool:
 
 @pytest.fixture(params=["vicon", "qualisys", "vrpn"])
 def address(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Of a server that runs."""
+    """The address of a running server."""
     system = str(request.param)
     if system == "qualisys" and busy(QUALISYS_FRAMES_PORT):
         pytest.skip(f"UDP port {QUALISYS_FRAMES_PORT} of this host, which the package uses, is taken")
@@ -44,21 +44,21 @@ def address(request: pytest.FixtureRequest) -> Iterator[str]:
         process.end()
 
 
-def test_the_poses_that_the_server_sends_come_out(address: str) -> None:
+def test_the_servers_poses_arrive(address: str) -> None:
     body, hidden = BODIES
     seen: list[BodyPose] = []
     with mocap(address, {"alpha": body, "beta": hidden}) as capture:
         capture.wait("alpha", 20.0)
         with capture.on_pose(seen.append, inline=True):
             wait_until(lambda: len(seen) >= ENOUGH, "poses came")
-        assert capture.state("beta") is TrackState.WAITING, "it is hidden"
+        assert capture.state("beta") is TrackState.WAITING, "beta is hidden"
         assert capture.unknown == set()
     assert {one.body for one in seen} == {"alpha"}
     for one in seen:
         place, yaw = pose(frame_of(one.position_m[2]))
         assert one.position_m == pytest.approx(place, abs=1e-6), "metres, z up"
         assert math.remainder(one.yaw_rad - yaw, math.tau) == pytest.approx(0.0, abs=1e-5)
-    assert len({one.position_m for one in seen}) > ENOUGH / 2, "they are not one and the same"
+    assert len({one.position_m for one in seen}) > ENOUGH / 2, "the poses differ"
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def vicon() -> Iterator[Process]:
         process.end()
 
 
-def test_a_vicon_that_ends_is_told_and_its_last_pose_not_kept(vicon: Process) -> None:
+def test_the_end_of_a_vicon_server_is_reported_and_its_last_pose_dropped(vicon: Process) -> None:
     with mocap(f"vicon://127.0.0.1:{vicon.text.split('ready ')[1].split()[0]}", {"alpha": BODIES[0]}) as capture:
         capture.wait("alpha", 20.0)
         vicon.end()
@@ -80,6 +80,6 @@ def test_a_vicon_that_ends_is_told_and_its_last_pose_not_kept(vicon: Process) ->
 
 
 @pytest.mark.parametrize("system", ["vicon", "qualisys", "vrpn"])
-def test_nobody_there_is_a_link_error(system: str) -> None:
+def test_a_missing_server_is_a_link_error(system: str) -> None:
     with pytest.raises(LinkError, match=r"sent no frame within 0\.3 s"):
         mocap(f"{system}://127.0.0.1:9", {"alpha": "x"}, timeout_s=0.3)

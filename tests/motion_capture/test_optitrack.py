@@ -1,4 +1,4 @@
-"""The recorded OptiTrack session, through the ``motioncapture`` package and our process that listens to it."""
+"""The recorded OptiTrack session, through the ``motioncapture`` package and our listening process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def connect(server: Process) -> MotionCapture:
     return mocap(address(server), {"alpha": natnet.BODY})
 
 
-def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
+def test_the_recorded_poses_arrive_in_our_axes(server: Process) -> None:
     bodies = [natnet.rigid_body(frame) for frame in natnet.frames()]
     assert len(bodies) == 518
     expected = {z_up(body.position, body.quaternion) for body in bodies if body.tracked}
@@ -55,19 +55,19 @@ def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
         assert capture.state("alpha") is TrackState.TRACKED
         assert capture.unknown == set()
     assert all((pose.position_m, pose.quaternion) in expected for pose in seen)
-    assert len({pose.position_m for pose in seen}) > ENOUGH / 2, "they are not one and the same"
+    assert len({pose.position_m for pose in seen}) > ENOUGH / 2, "the poses differ"
     assert [pose.captured_ns for pose in seen] == sorted({pose.captured_ns for pose in seen})
     assert 1.3 < pose.position_m[2] < 1.6, "it flew at head height: z is up"
     assert pose.transform.rotation.as_matrix().shape == (3, 3)
 
 
-def test_a_server_that_stops_is_told_and_a_frozen_pose_never_given(server: Process) -> None:
+def test_a_stopped_server_is_reported_and_a_frozen_pose_never_returned(server: Process) -> None:
     with connect(server) as capture:
         capture.wait("alpha")
         told: list[str] = []
         with capture.on_event(lambda event: told.append(event.text)):
             server.signal(signal.SIGSTOP)
-            wait_until(lambda: "alpha is not tracked any more" in told, "it was told")
+            wait_until(lambda: "alpha is no longer tracked" in told, "it was told")
             assert capture.pose("alpha") is None
             assert capture.state("alpha") is TrackState.LOST
             server.signal(signal.SIGCONT)
@@ -75,7 +75,7 @@ def test_a_server_that_stops_is_told_and_a_frozen_pose_never_given(server: Proce
             assert capture.pose("alpha") is not None
 
 
-def test_the_process_that_listens_is_replaced_when_it_dies(server: Process) -> None:
+def test_the_listening_process_is_replaced_when_it_dies(server: Process) -> None:
     with connect(server) as capture:
         capture.wait("alpha")
         source = capture._source
@@ -90,13 +90,13 @@ def test_the_process_that_listens_is_replaced_when_it_dies(server: Process) -> N
         capture.wait("alpha", 0.1)
 
 
-def test_a_body_that_it_does_not_know_names_those_that_it_sees(server: Process) -> None:
+def test_the_error_about_an_unknown_body_lists_the_visible_ones(server: Process) -> None:
     with mocap(address(server), {"alpha": "RaceQuadd"}) as capture:
         wait_until(lambda: capture.unknown, "it saw another one")
         with pytest.raises(NoAnswerError, match=r"does not track 'RaceQuadd'.*it sees RaceQuad"):
             capture.wait("alpha", 0.2)
 
 
-def test_nobody_there_is_a_link_error() -> None:
+def test_a_missing_server_is_a_link_error() -> None:
     with pytest.raises(LinkError, match=r"sent no frame within 0\.3 s"):
         mocap("optitrack://127.0.0.1?interface=127.0.0.1&port=9", {"alpha": "x"}, timeout_s=0.3)

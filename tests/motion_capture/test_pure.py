@@ -49,9 +49,9 @@ def test_addresses(address: str, kind: str, up: str, configuration: dict[str, st
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        ("host", "no motion capture system"),
-        ("vicon:host", "no motion capture system"),
-        ("vicon://", "names no host"),
+        ("host", "not a motion capture system"),
+        ("vicon:host", "not a motion capture system"),
+        ("vicon://", "has no host"),
         ("vikon://h", "did you mean 'vicon'"),
         ("vicon://h?latncy=1", "did you mean 'latency'"),
         ("vicon://h?latency=nan", "latency is 'nan'"),
@@ -61,20 +61,20 @@ def test_addresses(address: str, kind: str, up: str, configuration: dict[str, st
         ("vicon://h?port=1510", "for optitrack:// only"),
         ("vicon://h:90000", "port must be a whole number"),
         ("optitrack://h:1510", r"an option, \?port=1510"),
-        ("sim://alpha", "takes no host"),
-        (3, "no motion capture system"),
+        ("sim://alpha", "takes neither host"),
+        (3, "not a motion capture system"),
     ],
 )
-def test_wrong_addresses_say_what_would_be_right(address: str, said: str) -> None:
+def test_errors_about_addresses_say_what_is_right(address: str, said: str) -> None:
     with pytest.raises((UsageError, UnknownNameError), match=said):
         parse_system(address)
 
 
-def test_y_up_becomes_z_up_and_what_stands_keeps_standing() -> None:
+def test_y_up_becomes_z_up_and_upright_bodies_stay_upright() -> None:
     position, quaternion = z_up((1.0, 2.0, 3.0), UPRIGHT)
     assert position == (1.0, -3.0, 2.0)
     assert quaternion == UPRIGHT
-    about_y = (0.0, math.sin(0.3), 0.0, math.cos(0.3))  # turned by 0.6 rad about what was up
+    about_y = (0.0, math.sin(0.3), 0.0, math.cos(0.3))  # turned by 0.6 rad about the former up axis
     pose = BodyPose("a", 0, *z_up((0.0, 0.0, 0.0), about_y))
     assert pose.yaw_rad == pytest.approx(0.6)
 
@@ -95,7 +95,7 @@ def test_quaternions_agree_with_scipy(roll: float, pitch: float, yaw: float) -> 
     ("position", "quaternion"),
     [((math.nan, 0.0, 0.0), UPRIGHT), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0))],
 )
-def test_what_can_be_no_pose(position: Vector, quaternion: Quaternion) -> None:
+def test_implausible_poses(position: Vector, quaternion: Quaternion) -> None:
     assert not plausible(position, quaternion)
 
 
@@ -108,7 +108,7 @@ def fed(speed: float, count: int = 30, step_ms: int = 10) -> Track:
     return track
 
 
-def test_velocity_is_that_of_the_body_in_spite_of_noise() -> None:
+def test_the_velocity_is_right_in_spite_of_noise() -> None:
     pose = fed(0.7).pose
     assert pose is not None
     assert pose.velocity_m_s is not None
@@ -119,10 +119,10 @@ def test_velocity_is_that_of_the_body_in_spite_of_noise() -> None:
     assert few.velocity_m_s is None
 
 
-def test_a_body_that_is_not_seen_has_no_pose_and_is_lost_once() -> None:
+def test_an_unseen_body_has_no_pose_and_is_lost_once() -> None:
     track = Track("a")
     assert track.state is TrackState.WAITING
-    assert not track.look(10**12), "what was never seen is not lost"
+    assert not track.look(10**12), "a body never seen is not lost"
     track = fed(0.1)
     assert track.state == "tracked"
     assert not track.look(499 * MS)
@@ -132,12 +132,12 @@ def test_a_body_that_is_not_seen_has_no_pose_and_is_lost_once() -> None:
     assert not track.look(900 * MS)
     found = track.add(1000 * MS, (0.0, 0.0, 1.0), UPRIGHT)
     assert found is not None
-    assert found.velocity_m_s is None, "nothing is known across a gap"
+    assert found.velocity_m_s is None, "no velocity across a gap"
     assert track.add(1000 * MS, (0.1, 0.0, 1.0), UPRIGHT) is None, "not newer"
 
 
 @pytest.mark.parametrize("may_freeze", [True, False])
-def test_the_same_pose_over_and_over_is_no_measurement(may_freeze: bool) -> None:
+def test_an_unchanging_pose_is_not_a_measurement(may_freeze: bool) -> None:
     track = Track("a", may_freeze=may_freeze)
     for n in range(1, 101):
         track.add(n * 10 * MS, (1.0, 2.0, 3.0), UPRIGHT)
@@ -154,7 +154,7 @@ def at_rest(turn: Quaternion, *, noise_m: float = 0.0002, noise_rad: float = 0.0
     for n in range(count):
         shake = quaternion_from_euler(*rng.normal(0.0, noise_rad, 3).tolist())
         x, y, z = (np.array([1.0, 2.0, 0.1]) + rng.normal(0.0, noise_m, 3)).tolist()
-        sign = 1.0 if n % 2 else -1.0  # both signs are one turn
+        sign = 1.0 if n % 2 else -1.0  # both signs are the same rotation
         a, b, c, d = multiply(turn, shake)
         poses.append(BodyPose("a", n, (x, y, z), (sign * a, sign * b, sign * c, sign * d)))
     return poses
@@ -173,17 +173,17 @@ def test_a_calibration_finds_the_drones_attitude_whatever_the_bodys_axes(
     assert found.poses == 40
 
 
-def test_the_mean_turn_is_that_of_the_middle() -> None:
+def test_the_mean_rotation_is_the_middle_one() -> None:
     mean = mean_quaternion([pose.quaternion for pose in at_rest(quaternion_from_euler(0.1, 0.2, 0.3))])
     apart = Rotation.from_quat(mean).inv() * Rotation.from_quat(quaternion_from_euler(0.1, 0.2, 0.3))
     assert apart.magnitude() < 0.0005
 
 
 @pytest.mark.parametrize(("noise_m", "noise_rad"), [(0.01, 0.001), (0.0002, 0.05)])
-def test_a_calibration_of_what_moves_is_refused_with_its_spread(noise_m: float, noise_rad: float) -> None:
-    with pytest.raises(UsageError, match=r"spread by .* mm and .*°.*let it stand still"):
+def test_a_calibration_in_motion_is_refused_with_its_spread(noise_m: float, noise_rad: float) -> None:
+    with pytest.raises(UsageError, match=r"spread by .* mm and .*°.*keep the drone still"):
         calibrate(at_rest(UPRIGHT, noise_m=noise_m, noise_rad=noise_rad))
-    with pytest.raises(UsageError, match="too few"):
+    with pytest.raises(UsageError, match="at least 20 poses"):
         calibrate(at_rest(UPRIGHT, count=5))
 
 

@@ -1,4 +1,4 @@
-"""The simulator's truth as motion capture: a flight by it, recorded, and shown in the cockpit."""
+"""The simulator's truth as motion capture: a flight by it, recorded and shown in the cockpit."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_path_is_flown_by_motion_capture_recorded_and_the_truth(proxy: Proxy, 
             pose = capture.wait("alpha")
             assert math.dist(pose.position_m, (0.6, 0.0, 1.0)) < 0.3
             wait_until(lambda: capture.wait("alpha").velocity_m_s is not None, "two poses in a row tell its velocity")
-            with pytest.raises(UsageError, match="alpha flies"):
+            with pytest.raises(UsageError, match="alpha is flying"):
                 capture.calibrate(drone)
             drone.land()
     told = files.decoded(path, "/alpha/mocap")
@@ -52,7 +52,7 @@ def test_a_path_is_flown_by_motion_capture_recorded_and_the_truth(proxy: Proxy, 
     assert capture.state("alpha") is TrackState.ENDED
 
 
-def test_poses_are_told_with_the_drone_at_most_so_often(proxy: Proxy) -> None:
+def test_poses_are_logged_on_the_drone_at_a_limited_rate(proxy: Proxy) -> None:
     proxy(TRUE)
     entries: list[LogEntry] = []
     poses: list[BodyPose] = []
@@ -78,14 +78,14 @@ def test_poses_are_told_with_the_drone_at_most_so_often(proxy: Proxy) -> None:
                 capture.link(drone, max_hz=wrong)
 
 
-def test_a_proxy_that_ends_is_lost_tracking(proxy: Proxy) -> None:
+def test_the_end_of_a_proxy_is_a_loss_of_tracking(proxy: Proxy) -> None:
     process = proxy(TRUE)
     with skyloop.mocap("sim://", {"alpha": "alpha"}) as capture:
         capture.wait("alpha")
         told: list[str] = []
         with capture.on_event(lambda event: told.append(event.text)):
             process.end()
-            wait_until(lambda: "alpha is not tracked any more" in told, "it was told")
+            wait_until(lambda: "alpha is no longer tracked" in told, "it was told")
         assert capture.pose("alpha") is None
 
 
@@ -103,7 +103,7 @@ def test_bodies_must_be_names(bodies: dict[str, str]) -> None:
         skyloop.mocap("sim://", bodies)
 
 
-def test_a_listener_must_be_a_function_and_one_that_fails_costs_only_itself(
+def test_a_callback_must_be_a_function_and_a_failing_one_affects_no_other(
     proxy: Proxy, caplog: pytest.LogCaptureFixture
 ) -> None:
     proxy(TRUE)

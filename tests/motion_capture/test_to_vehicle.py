@@ -1,4 +1,4 @@
-"""Poses of motion capture told to the vehicle: an emulated PX4 without GPS flies by them, and no other way."""
+"""Motion capture poses sent to the vehicle: an emulated PX4 without GPS flies by them, and only then."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.process
 
 
 class Nothing:
-    """A source whose frames come from the test."""
+    """A source whose frames the test provides."""
 
     def start(self, timeout_s: float) -> None: ...
     def close(self) -> None: ...
@@ -29,7 +29,7 @@ class Nothing:
 
 @contextmanager
 def seeing(name: str) -> Iterator[MotionCapture]:
-    """A body that stands at the origin, trembling by micrometres, seen fifty times a second."""
+    """A body at the origin that trembles by micrometres, seen fifty times a second."""
     capture = MotionCapture(parse_system("vicon://nowhere"), {name: "body"}, lambda *_: Nothing())
     ended = threading.Event()
 
@@ -62,7 +62,7 @@ def test_an_autopilot_without_gps_flies_by_them() -> None:
     ):
         with capture.link(drone):
             wait_until(lambda: capture.pose(drone.name), "it is seen")
-            assert it.autopilot.poses == 0, "told with the drone, and not to the vehicle"
+            assert it.autopilot.poses == 0, "logged on the drone, not sent to the vehicle"
         with capture.link(drone, to_vehicle=True):
             wait_until(lambda: it.autopilot.poses > 20, "the autopilot heard them")
             drone.takeoff()
@@ -70,7 +70,7 @@ def test_an_autopilot_without_gps_flies_by_them() -> None:
             drone.land()
 
 
-def test_who_may_tell_and_what() -> None:
+def test_who_may_send_poses_and_which() -> None:
     with skyloop.connect("sim://?cameras=none") as drone:
         with pytest.raises(UsageError, match=r"position must have 3 finite numbers \(x, y, z\), got \(0"):
             drone.send_external_pose((0.0, 0.0, float("nan")), (0.0, 0.0, 0.0, 1.0))

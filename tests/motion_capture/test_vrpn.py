@@ -1,4 +1,4 @@
-"""VRPN by our own client: trackers and their sensors, servers that fall silent, end, come back, or are none."""
+"""VRPN through our own client: trackers and their sensors; servers that fall silent, end, return, or are not VRPN."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def report(tracker: str, sensor: int, x: float = 0.0) -> TrackerPose:
     return TrackerPose(tracker, sensor, (x, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0))
 
 
-# Which sensor is whose ------------------------------------------------------------------------------------------
+# Assignment of sensors ------------------------------------------------------------------------------------------
 
 
-def test_sensor_0_of_a_tracker_that_has_no_other_is_the_body_once_others_had_time_to_report() -> None:
+def test_sensor_0_is_the_body_once_others_had_time_to_report() -> None:
     selection = SensorSelection(["Rig"])
     assert selection.select([report("Rig", 0)], 1) == {}
     assert not selection.settled(1)
@@ -46,16 +46,16 @@ def test_sensor_0_of_a_tracker_that_has_no_other_is_the_body_once_others_had_tim
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_several_sensors_none_is_taken_unless_it_is_named(order: tuple[int, ...]) -> None:
+def test_with_several_sensors_none_is_used_unless_named(order: tuple[int, ...]) -> None:
     selection = SensorSelection(["Rig"])
     selection.select([report("Rig", sensor) for sensor in order], 1)
     assert set(selection.select([report("Rig", 0)], SECOND)) == set()
-    assert set(selection.select([report("Rig", 0), report("Rig", 1)], 2 * SECOND)) == {"Rig:1"}, "to be shown only"
+    assert set(selection.select([report("Rig", 0), report("Rig", 1)], 2 * SECOND)) == {"Rig:1"}, "only for display"
     assert "reports sensors 0, 1" in selection.refused["Rig"]
     assert "'Rig:0'" in selection.refused["Rig"]
 
 
-def test_a_single_sensor_that_is_not_0_is_not_taken_for_it() -> None:
+def test_a_single_sensor_other_than_0_is_not_taken_for_it() -> None:
     selection = SensorSelection(["Rig"])
     selection.select([report("Rig", 3)], 1)
     assert "Rig" not in selection.select([report("Rig", 3)], SECOND)
@@ -63,12 +63,12 @@ def test_a_single_sensor_that_is_not_0_is_not_taken_for_it() -> None:
     assert "?sensor=3" in selection.refused["Rig"]
 
 
-def test_a_sensor_that_turns_up_later_ends_the_guess() -> None:
+def test_a_sensor_that_appears_later_ends_the_guess() -> None:
     selection = SensorSelection(["Rig"])
     selection.select([report("Rig", 0)], 1)
     assert "Rig" in selection.select([report("Rig", 0)], SECOND)
     assert "Rig" not in selection.select([report("Rig", 0), report("Rig", 1)], SECOND + 1), "in the same piece"
-    assert "Rig" not in selection.select([report("Rig", 0)], 9 * SECOND), "even when it is not seen any more"
+    assert "Rig" not in selection.select([report("Rig", 0)], 9 * SECOND), "even when it is no longer seen"
 
 
 def test_each_body_has_its_own_sensor_and_the_newest_pose() -> None:
@@ -145,7 +145,7 @@ def test_a_server_that_invents_sensors_costs_no_memory() -> None:
 @pytest.mark.parametrize(
     ("address", "said"),
     [
-        ("vrpn://h/Rig", r"named in bodies, as \{'alpha': 'Rig'\}"),
+        ("vrpn://h/Rig", r"name the tracker in bodies, as \{'alpha': 'Rig'\}"),
         ("vrpn://h?sensor=-1", "sensor is '-1' and must be a whole number from 0"),
         ("vrpn://h?sensor=", "sensor is ''"),
         ("vicon://h?sensor=1", "sensor is for vrpn:// only"),
@@ -166,7 +166,7 @@ def test_an_address_says_the_sensor() -> None:
 
 @contextmanager
 def listening(answer: Callable[[socket.socket], None]) -> Iterator[str]:
-    """A server that answers each connection so, one after the other; its address."""
+    """Run a server that answers each connection in turn; yield its address."""
 
     def serve() -> None:
         while True:
@@ -202,7 +202,7 @@ def test_several_sensors_of_a_tracker_are_refused_with_what_to_do() -> None:
 @pytest.mark.parametrize(
     ("option", "body", "sensor"), [("", f"{TRACKER}:1", 1), ("?sensor=1", TRACKER, 1), ("?sensor=1", f"{TRACKER}:0", 0)]
 )
-def test_a_sensor_that_is_named_is_the_body_and_no_other(option: str, body: str, sensor: int) -> None:
+def test_only_the_named_sensor_is_the_body(option: str, body: str, sensor: int) -> None:
     seen: list[BodyPose] = []
     with listening(streaming(0, 1)) as address, mocap(address + option, {"alpha": body}) as capture:
         with capture.on_pose(seen.append, inline=True):
@@ -219,7 +219,7 @@ def test_two_drones_fly_by_two_sensors_of_one_tracker() -> None:
     assert apart == pytest.approx(server.APART_M)
 
 
-def test_a_sensor_that_turns_up_in_flight_loses_the_body_and_says_why() -> None:
+def test_a_sensor_that_appears_in_flight_loses_the_body_with_the_reason() -> None:
     both = threading.Event()
     events: list[TrackEvent] = []
 
@@ -241,7 +241,7 @@ def test_a_sensor_that_turns_up_in_flight_loses_the_body_and_says_why() -> None:
     assert len([event for event in events if "reports sensors 0, 1" in event.text]) == 1
 
 
-def test_a_server_that_is_restarted_is_found_again() -> None:
+def test_a_restarted_server_is_found_again() -> None:
     events: list[TrackEvent] = []
     with ExitStack() as stack:
         first = stack.enter_context(running("0"))
@@ -268,7 +268,7 @@ def running(*arguments: str) -> Iterator[Process]:
         process.end()
 
 
-def test_a_connection_that_falls_silent_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_connection_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "SILENT_S", 0.3)
     events: list[TrackEvent] = []
     connections = []
@@ -301,12 +301,12 @@ def test_a_connection_that_falls_silent_is_replaced(monkeypatch: pytest.MonkeyPa
         (COOKIE[:10], "the server ended the connection"),
     ],
 )
-def test_what_is_no_vrpn_server_is_a_link_error_with_the_reason(sent: bytes, said: str) -> None:
+def test_other_servers_are_a_link_error_with_the_reason(sent: bytes, said: str) -> None:
     with listening(lambda connection: connection.sendall(sent)) as address, pytest.raises(LinkError, match=said):
         mocap(address, {"alpha": "x"}, timeout_s=0.5)
 
 
-def test_a_server_that_says_nothing_and_a_host_that_can_be_none_are_link_errors() -> None:
+def test_silent_servers_and_impossible_hosts_are_link_errors() -> None:
     with listening(lambda connection: time.sleep(0.5)) as address:
         begin = time.monotonic()
         with pytest.raises(LinkError, match=r"sent no frame within 0\.2 s"):
@@ -316,7 +316,7 @@ def test_a_server_that_says_nothing_and_a_host_that_can_be_none_are_link_errors(
         mocap(f"vrpn://{'a' * 70}.invalid", {"alpha": "x"}, timeout_s=0.5)
 
 
-def test_what_has_piled_up_is_one_frame_with_the_newest_pose() -> None:
+def test_a_backlog_is_one_frame_with_the_newest_pose() -> None:
     taken: list[RawFrame] = []
     sent = threading.Event()
 
@@ -335,7 +335,7 @@ def test_what_has_piled_up_is_one_frame_with_the_newest_pose() -> None:
 
 
 def test_the_reference_client_reads_what_our_codec_writes() -> None:
-    """The client that the package carries is compiled from the reference implementation."""
+    """The package's client is compiled from the reference implementation."""
     pytest.importorskip("motioncapture", reason="needs the motioncapture package: skyloop install mocap")
     try:
         socket.getprotobyname("tcp")

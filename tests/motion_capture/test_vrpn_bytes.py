@@ -1,4 +1,4 @@
-"""VRPN's bytes, by its public description; and what only resembles them."""
+"""VRPN's bytes, from its public description; and bytes that only resemble them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from skyloop.motion_capture.vrpn import (
     encode_pose,
 )
 
-#: Put together by hand from Format_Of_Protocol.txt.
+#: Written by hand from Format_Of_Protocol.txt.
 GOLDEN_COOKIE: Final = bytes.fromhex("7672706e3a207665722e2030372e333820203000 00000000")
 GOLDEN_SENDER: Final = bytes.fromhex(
     "00000024 00000000 00000000 00000001 ffffffff 00000000"  # 24 + 12 bytes, sender 1, description of a sender
@@ -40,7 +40,7 @@ GOLDEN_TYPE: Final = bytes.fromhex(
 )
 GOLDEN_POSE: Final = bytes.fromhex(
     "00000058 65a0bc00 0007a120 00000001 00000005 00000000"  # 24 + 64 bytes, 1705032704.5 s, sender 1, type 5
-    "00000002 00000002"  # sensor 2, and again where the padding is
+    "00000002 00000002"  # sensor 2, and again as padding
     "3ff8000000000000 bfd0000000000000 4000000000000000"  # 1.5, -0.25, 2
     "0000000000000000 0000000000000000 3fe3333333333333 3fe999999999999a"  # 0, 0, 0.6, 0.8
 )
@@ -61,7 +61,7 @@ def encoded(pose: TrackerPose) -> bytes:
     return encode_pose(1, 5, pose.sensor, pose.position, pose.quaternion)
 
 
-def test_golden_bytes_are_what_is_encoded() -> None:
+def test_encoding_gives_the_golden_bytes() -> None:
     assert COOKIE == GOLDEN_COOKIE
     assert encode_description(SENDER_DESCRIPTION, 1, "Tracker") == GOLDEN_SENDER
     assert encode_description(TYPE_DESCRIPTION, 5, POS_QUAT) == GOLDEN_TYPE
@@ -74,7 +74,7 @@ def test_golden_bytes_decode_to_the_pose_with_its_sensor() -> None:
 
 
 @given(st.lists(poses, max_size=5), st.lists(st.integers(0, 700), max_size=12))
-def test_poses_come_back_however_the_stream_is_cut(sent: list[TrackerPose], cuts: list[int]) -> None:
+def test_poses_decode_however_the_stream_is_cut(sent: list[TrackerPose], cuts: list[int]) -> None:
     stream = GREETING + b"".join(map(encoded, sent))
     decoder, got, at = Decoder(), [], 0
     for cut in [*sorted(cuts), len(stream)]:
@@ -108,16 +108,16 @@ def test_a_stream_cut_short_is_no_pose(size: int) -> None:
     assert Decoder().feed((GREETING + GOLDEN_POSE)[:size]) == []
 
 
-def test_what_is_not_described_is_skipped() -> None:
+def test_undescribed_messages_are_skipped() -> None:
     decoder = Decoder()
-    assert decoder.feed(COOKIE + GOLDEN_POSE) == [], "neither the sender nor the type is known"
+    assert decoder.feed(COOKIE + GOLDEN_POSE) == [], "sender and type are unknown"
     assert decoder.feed(GOLDEN_SENDER + GOLDEN_POSE) == []
     assert decoder.feed(encode_message(1, 4, b"text") + encode_message(9, -3, b"10.0.0.1\0")) == []
     assert decoder.feed(GOLDEN_TYPE + encode_message(1, 5, GOLDEN_POSE[24:])) == [POSE]
     assert decoder.feed(encode_pose(2, 5, 0, POSE.position, POSE.quaternion)) == [], "another sender"
 
 
-def test_a_number_that_is_described_anew_has_the_new_name() -> None:
+def test_a_number_described_again_has_the_new_name() -> None:
     decoder = Decoder()
     assert decoder.feed(GREETING + encode_description(SENDER_DESCRIPTION, 1, "Wand") + GOLDEN_POSE) == [
         TrackerPose("Wand", POSE.sensor, POSE.position, POSE.quaternion)
@@ -143,12 +143,12 @@ def test_a_number_that_is_described_anew_has_the_new_name() -> None:
         (GREETING + encode_message(1, 5, bytes(72)), "got 72"),
     ],
 )
-def test_what_is_not_vrpn_says_why(data: bytes, said: str) -> None:
+def test_other_bytes_are_refused_with_the_reason(data: bytes, said: str) -> None:
     with pytest.raises(DecodeError, match=said):
         Decoder().feed(data)
 
 
-def test_a_server_that_describes_without_end_is_given_up() -> None:
+def test_a_server_with_endless_descriptions_is_dropped() -> None:
     decoder = Decoder()
     decoder.feed(COOKIE)
     for number in range(MAX_NAMES):
@@ -166,10 +166,10 @@ def test_a_name_in_no_encoding_and_one_with_control_characters_can_be_printed() 
         assert pose.tracker == shown
 
 
-def test_numbers_that_are_none_are_left_to_who_judges_poses() -> None:
+def test_nan_is_left_to_the_check_of_poses() -> None:
     (pose,) = Decoder().feed(GREETING + encode_pose(1, 5, 0, (math.nan, math.inf, 0.0), POSE.quaternion))
     assert math.isnan(pose.position[0])
 
 
-def test_the_cookie_has_the_size_that_is_read() -> None:
+def test_the_cookie_has_the_expected_size() -> None:
     assert len(COOKIE) == COOKIE_SIZE == 24

@@ -1,4 +1,4 @@
-"""The process that listens to a system, and what replaces it when it dies, without a system."""
+"""The process that listens to a system, and its replacement when it dies, without a system."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Body:
 
 
 def package(frames: int, error: Exception) -> types.ModuleType:
-    """Stands for the ``motioncapture`` package: gives so many frames, and then fails."""
+    """Stand in for the ``motioncapture`` package: yield ``frames`` frames, then fail."""
 
     class System:
         def __init__(self) -> None:
@@ -105,7 +105,7 @@ def test_a_missing_package_names_what_to_install() -> None:
         source("raise SystemExit(3)", [], []).start(20.0)
 
 
-def test_what_a_child_complains_of_is_told() -> None:
+def test_a_childs_complaint_is_reported() -> None:
     told: list[str] = []
     failing = source("import sys; sys.exit('no such host')", [], told)
     with pytest.raises(LinkError, match="no frame within"):
@@ -121,7 +121,7 @@ def test_the_child_itself_says_why_it_ends_and_nothing_else() -> None:
     assert not any("Warning" in text for text in told)
 
 
-def test_the_same_trouble_is_told_once() -> None:
+def test_the_same_problem_is_reported_once() -> None:
     told: list[str] = []
     makers: list[tuple[Callable[[RawFrame], None], Callable[[str], None]]] = []
 
@@ -140,7 +140,7 @@ def test_the_same_trouble_is_told_once() -> None:
 
 
 def opened(address: str) -> tuple[MotionCapture, Callable[[RawFrame], None]]:
-    """A capture whose system is the test."""
+    """Open a capture whose system is the test."""
     sources: list[Callable[[RawFrame], None]] = []
 
     def make(_system: Any, _names: Any, take: Any, _trouble: Any) -> Any:
@@ -150,8 +150,8 @@ def opened(address: str) -> tuple[MotionCapture, Callable[[RawFrame], None]]:
     return MotionCapture(parse_system(address), {"alpha": "body"}, make)._open(), sources[0]
 
 
-def test_poses_that_are_late_by_more_than_a_body_may_be_silent_are_taken() -> None:
-    """With latency=0.3 each pose was lost as it came."""
+def test_poses_later_than_the_loss_timeout_are_accepted() -> None:
+    """With latency=0.3 each pose was lost on arrival."""
     capture, take = opened("vicon://nowhere?latency=0.3")
     with capture:
         take(RawFrame(monotonic_ns(), {"body": ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))}))
@@ -161,12 +161,12 @@ def test_poses_that_are_late_by_more_than_a_body_may_be_silent_are_taken() -> No
         wait_until(lambda: capture.pose("alpha") is None, "it is lost once none comes any more")
 
 
-def test_it_may_be_closed_by_its_own_callback() -> None:
+def test_its_own_callback_can_close_it() -> None:
     capture, take = opened("vicon://nowhere")
     closed = threading.Event()
 
     def on_event(event: TrackEvent) -> None:
-        if event.state is TrackState.LOST:  # on the thread that watches
+        if event.state is TrackState.LOST:  # on the watching thread
             capture.close()
             closed.set()
 
@@ -191,8 +191,8 @@ def test_a_child_that_sends_nonsense_is_replaced() -> None:
 
 
 def test_a_refused_recalibration_keeps_the_calibration_in_force() -> None:
-    """Somebody touched the drone meanwhile: its attitude must not be wrong by 90 degrees from then on."""
-    turned = (0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  # the body's axes, for those of the drone
+    """The drone was touched meanwhile: its attitude must not stay wrong by 90 degrees."""
+    turned = (0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  # the body's axes, relative to the drone's
     sources: list[Callable[[RawFrame], None]] = []
 
     class Source:
@@ -227,7 +227,7 @@ def test_a_refused_recalibration_keeps_the_calibration_in_force() -> None:
 
     with capture:
         calibrate(0.0)
-        with pytest.raises(UsageError, match="let it stand still"):
+        with pytest.raises(UsageError, match="keep the drone still"):
             calibrate(0.1)
         sources[0](RawFrame(monotonic_ns(), {"body": ((0.5, 0.0, 0.0), turned)}))
         pose = capture.pose("alpha")

@@ -1,10 +1,9 @@
 """A small Vicon server: ``python -m tests.motion_capture.vicon PORT``.
 
 Written from the public source of Vicon's own client (DataStream SDK, MIT licence, in the headers of
-https://github.com/whoenig/vicon-datastream-sdk): over TCP, little endian, packets and in them objects, each a type, the
-length of what follows, and that. The server first tells which objects it has; the client answers with those that it
-wants, and asks for frames. A vector, a set and a text begin with their length. Places are in millimetres, rotations
-matrices by rows.
+https://github.com/whoenig/vicon-datastream-sdk): over TCP, little endian, packets of objects, each with type, length
+and content. The server first lists its objects; the client answers with those that it wants, and requests frames. A
+vector, a set and a text start with their length. Places are in millimetres, rotations matrices by rows.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ OBJECTS, REQUEST_FRAME, CONTENTS = 100001, 100002, 100004
 STREAM_INFO, SUBJECT_INFO, FRAME_INFO, LOCAL_SEGMENTS, GLOBAL_SEGMENTS = 1, 2, 5, 8, 9
 SUPPORTED: Final = (STREAM_INFO, SUBJECT_INFO, FRAME_INFO, LOCAL_SEGMENTS, GLOBAL_SEGMENTS, CONTENTS, REQUEST_FRAME)
 HEADER: Final = struct.Struct("<II")
-_FREQUENCY: Final = 27_000_000  # ticks of the frames' clock a second
+_FREQUENCY: Final = 27_000_000  # ticks per second of the frames' clock
 
 Matrix = tuple[float, ...]
 
@@ -54,7 +53,7 @@ def text(words: str) -> bytes:
 
 
 def subject(number: int, name: str) -> bytes:
-    """A body of one segment of the same name, as Tracker makes them, without markers."""
+    """Encode a body of one segment with the same name, like Tracker's, without markers."""
     segment = struct.pack("<II6f", number, number, *[0.0] * 6) + text(name)
     return item(SUBJECT_INFO, struct.pack("<I", number) + text(name) + struct.pack("<I", 1) + segment + bytes(8))
 
@@ -64,7 +63,7 @@ def segment(kind: int, number: int, place_mm: Sequence[float], matrix: Matrix) -
 
 
 def frame(number: int, wanted: set[int]) -> bytes:
-    """Of the objects that the client wants. The second body is hidden: its segment is not sent."""
+    """Encode the objects that the client wants. The second body is hidden: its segment is not sent."""
     place, yaw = pose(number)
     place_mm = [1000.0 * value for value in place]
     items = [(STREAM_INFO, item(STREAM_INFO, struct.pack("<q", int(PERIOD_S * _FREQUENCY))))]
@@ -75,7 +74,7 @@ def frame(number: int, wanted: set[int]) -> bytes:
 
 
 def packets(client: socket.socket) -> Iterator[list[tuple[int, bytes]]]:
-    """What a client sends, as objects."""
+    """Yield a client's packets as objects."""
     with client.makefile("rb") as stream:
         while len(head := stream.read(HEADER.size)) == HEADER.size:
             kind, size = HEADER.unpack(head)
@@ -89,7 +88,7 @@ def packets(client: socket.socket) -> Iterator[list[tuple[int, bytes]]]:
 
 
 class Wishes:
-    """What a client has asked for so far; read on a thread of its own."""
+    """A client's requests so far, read on a separate thread."""
 
     def __init__(self, client: socket.socket) -> None:
         self.objects: set[int] = set()
@@ -107,7 +106,7 @@ class Wishes:
 
 
 def serve(port: int) -> None:
-    """One client, until it goes."""
+    """Serve one client until it leaves."""
     with socket.create_server(("127.0.0.1", port)) as server:
         print(f"ready {server.getsockname()[1]}", flush=True)
         client, _ = server.accept()

@@ -1,9 +1,9 @@
 """A small VRPN server: ``python -m tests.motion_capture.vrpn PORT [SENSOR...]``.
 
 Written from the protocol's public description (``Format_Of_Protocol.txt`` and ``vrpn_Connection.C`` of
-https://github.com/vrpn/vrpn, Boost licence): a client connects by TCP, or tells by UDP where it listens and the server
-connects there; both say who they are, and the server names its senders and types and sends poses. All big endian,
-padded to eight bytes.
+https://github.com/vrpn/vrpn, Boost licence): a client connects by TCP, or announces by UDP where it listens and the
+server connects there; both identify themselves, and the server names its senders and types and sends poses. All big
+endian, padded to eight bytes.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from tests.motion_capture.moving import BODIES, PERIOD_S, pose
 
 SENDERS: Final = ("VRPN Control", *BODIES)
 TYPES: Final = ("vrpn_Base ping_message", "vrpn_Base pong_message", POS_QUAT)
-APART_M: Final = 10.0  #: how far along x each sensor is from the one before
+APART_M: Final = 10.0  #: distance along x from one sensor to the next
 
 
 def frame(number: int, sensor: int = 0) -> bytes:
-    """The pose of a sensor of the first body; nothing is sent of the body that is hidden."""
+    """Encode the pose of a sensor of the first body; nothing is sent for the hidden body."""
     (x, y, z), yaw = pose(number)
     turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
     seconds, fraction = divmod(time.time(), 1.0)
@@ -49,7 +49,7 @@ def frame(number: int, sensor: int = 0) -> bytes:
 
 
 def descriptions() -> bytes:
-    """What the senders and types are called."""
+    """Encode the names of the senders and types."""
     return b"".join(
         encode_description(kind, number, name)
         for kind, names in ((SENDER_DESCRIPTION, SENDERS), (TYPE_DESCRIPTION, TYPES))
@@ -58,7 +58,7 @@ def descriptions() -> bytes:
 
 
 def stream(client: socket.socket, sensors: list[int], ended: threading.Event) -> None:
-    """Greet a client, and send it poses for as long as it takes them."""
+    """Greet a client and send it poses as long as it reads them."""
     with contextlib.suppress(OSError), client:
         client.sendall(COOKIE)
         if client.recv(len(COOKIE), socket.MSG_WAITALL)[:11] != COOKIE[:11]:
@@ -71,7 +71,7 @@ def stream(client: socket.socket, sensors: list[int], ended: threading.Event) ->
 
 
 def serve(port: int, sensors: list[int]) -> None:
-    """Serve whoever connects, until it is killed. One that calls by UDP again has given up the last try."""
+    """Serve any client until killed. A client that calls by UDP again has abandoned its last try."""
     with socket.create_server(("127.0.0.1", port)) as server, socket.socket(type=socket.SOCK_DGRAM) as knock:
         knock.bind(server.getsockname())
         threading.Thread(target=accept, args=(server, sensors), daemon=True).start()

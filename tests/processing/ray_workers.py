@@ -14,7 +14,7 @@ import skyloop.ray
 
 
 def seen(drone: skyloop.Drone, seconds: float) -> list[int]:
-    """Workers whose results came within this time."""
+    """Return the workers whose results arrived within this time."""
     workers = set()
     end = time.monotonic() + seconds
     for result in drone.results("marks", timeout_s=20.0):

@@ -1,4 +1,4 @@
-"""``examples/detector_on_another_host.py``: its detector as a process of its own, its controller in this one."""
+"""``examples/detector_on_another_host.py``: its detector in a separate process, its controller in this one."""
 
 from __future__ import annotations
 

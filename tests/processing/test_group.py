@@ -17,7 +17,7 @@ from skyloop.transport.testing import wait_until
 pytestmark = pytest.mark.process
 
 LINE = msgspec.json.encode(Status(processor="d", camera="front", parts=2, results=3)).decode()
-#: Tells once how it does, prints something of its own, and ends with its standard input.
+#: Reports its status once, prints other text, and ends with its standard input.
 WORKS = f"import sys\nprint('hello', flush=True)\nprint({LINE!r}, flush=True)\nsys.stdin.read()\n"
 
 
@@ -34,19 +34,19 @@ def gone(pid: int) -> bool:
     return not Path(f"/proc/{pid}").exists()
 
 
-def test_children_are_summed_started_anew_and_ended() -> None:
+def test_children_are_summed_restarted_and_ended() -> None:
     told: list[str] = []
     with Group(command(WORKS), 2, told.append, pause_s=0.01) as group:
         wait_until(lambda: total(group) == 6, "both have told how they do")
         before = group.pids
         os.kill(before[0], signal.SIGKILL)
         wait_until(lambda: total(group) == 6 and group.pids[0] != before[0], "another one took its place")
-        assert told == ["worker 1 was killed by signal 9: the others have its share until it is restarted"]
+        assert told == ["worker 1 was killed by signal 9: the others process its share until it restarts"]
         pids = group.pids
     assert all(gone(pid) for pid in pids)
 
 
-def test_an_exit_code_is_told() -> None:
+def test_an_exit_code_is_reported() -> None:
     told: list[str] = []
     with Group(command("raise SystemExit(3)"), 1, told.append, pause_s=0.01) as group:
         wait_until(lambda: group.code is None and len(told) >= 2, "it failed again and again")
@@ -54,7 +54,7 @@ def test_an_exit_code_is_told() -> None:
 
 
 @pytest.mark.parametrize(("codes", "end"), [((0, 0), 0), ((0, USAGE_ERROR), USAGE_ERROR)])
-def test_it_is_over_when_all_are_or_one_can_never_work(tmp_path: Path, codes: tuple[int, int], end: int) -> None:
+def test_it_ends_when_all_have_ended_or_one_can_never_work(tmp_path: Path, codes: tuple[int, int], end: int) -> None:
     for number, code in enumerate(codes):
         (tmp_path / f"{number}-{code}").touch()
     takes_one = (

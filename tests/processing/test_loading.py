@@ -1,4 +1,4 @@
-"""The user's class from a module or a file, and what is said when that does not work."""
+"""The user's class from a module or a file, and the errors if that fails."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_other_code_has_another_mark(folder: Path) -> None:
     assert load_processor("a.py").mark != load_processor("b.py").mark
 
 
-def test_a_class_without_a_file_has_a_mark_by_what_it_does() -> None:
+def test_a_class_without_a_file_has_a_mark_from_its_code() -> None:
     def made(text: str) -> Code:
         names: dict[str, type] = {"__name__": "nowhere"}  # type: ignore[dict-item]
         exec(text, names)
@@ -70,16 +70,16 @@ def test_one_of_several_is_named(folder: Path) -> None:
         ("class A(\n", "bad.py: line 1"),
     ],
 )
-def test_a_bad_file_is_told(folder: Path, text: str, words: str) -> None:
+def test_a_bad_file_is_reported(folder: Path, text: str, words: str) -> None:
     (folder / "bad.py").write_text(text)
     with pytest.raises(UsageError) as raised:
         load_processor("bad.py")
     assert words in str(raised.value)
 
 
-def test_a_class_that_is_no_processor(folder: Path) -> None:
+def test_a_class_that_is_not_a_processor(folder: Path) -> None:
     (folder / "bad.py").write_text("class A: ...\n")
-    with pytest.raises(UsageError, match="A is no processor: it has no method process"):
+    with pytest.raises(UsageError, match="A is not a processor: it has no method process"):
         load_processor("bad.py:A")
 
 
@@ -91,14 +91,14 @@ def test_a_class_that_is_no_processor(folder: Path) -> None:
             UsageError,
             "there is no file nowhere.py: give a Python file with a class with a method process",
         ),
-        ("detector", UsageError, "'detector' names no processor: give module:Class, file.py:Class or file.py"),
-        (":Detector", UsageError, "names no processor"),
-        ("no_such_module:Detector", UsageError, "there is no module no_such_module here or where Python looks"),
+        ("detector", UsageError, "'detector' is not a processor: give module:Class, file.py:Class or file.py"),
+        (":Detector", UsageError, "is not a processor"),
+        ("no_such_module:Detector", UsageError, "there is no module no_such_module here or on Python's path"),
         ("broken_module:Detector", FileFormatError, "module broken_module: ZeroDivisionError"),
         ("lacking_module:Detector", FileFormatError, "module lacking_module: No module named 'not_there_at_all'"),
     ],
 )
-def test_targets_that_lead_nowhere(folder: Path, target: str, error: type[Exception], words: str) -> None:
+def test_targets_that_do_not_exist(folder: Path, target: str, error: type[Exception], words: str) -> None:
     (folder / "broken_module.py").write_text("1 / 0\n")
     (folder / "lacking_module.py").write_text("import not_there_at_all\n")
     with pytest.raises(error) as raised:

@@ -1,4 +1,4 @@
-"""Workers over the network transport: only the frames of its part travel to each."""
+"""Workers over the network transport: each receives only the frames of its part."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def working(node: Node) -> Iterator[tuple[Drone, Worker]]:
 
 
 def asked_for(drone: Drone) -> list[tuple[int, int] | None]:
-    """The parts of the frames that are subscribed to."""
+    """Return the subscribed parts of the frames."""
     return [channel.request.part for channel in drone._state.video.variants.values() if channel.subscribed]
 
 

@@ -1,4 +1,4 @@
-"""Processors on a Ray cluster: for real where Ray is, and what is said and asked of Ray where it is not."""
+"""Processors on a Ray cluster: for real where Ray is installed, and otherwise against a fake Ray."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skyloop.processing import Settings, Status
 from tests.support.processes import Process
 
 ROOT = Path(__file__).parents[2]
-OWN = ROOT / ".third-party" / "ray" / "bin" / "python"  #: Ray in an environment of its own, as it is large
+OWN = ROOT / ".third-party" / "ray" / "bin" / "python"  #: Ray in its own environment, because it is large
 TARGET = f"{ROOT / 'tests' / 'integration' / 'processes' / 'processor.py'}:Marks"
 
 
@@ -36,7 +36,7 @@ def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def with_ray() -> str:
-    """A Python that has it."""
+    """The path of a Python with Ray."""
     if importlib.util.find_spec("ray") is not None:
         return sys.executable
     if not OWN.exists():
@@ -45,7 +45,7 @@ def with_ray() -> str:
 
 
 @pytest.mark.process
-def test_actors_share_the_frames_and_a_dead_one_is_started_anew(sockets: Path) -> None:
+def test_actors_share_the_frames_and_a_dead_one_is_restarted(sockets: Path) -> None:
     python = with_ray()
     proxy = Process("-m", "skyloop", "proxy", "sim://?world=empty&cameras=front&fps=20", "--name", "alpha")
     try:
@@ -67,7 +67,7 @@ def test_actors_share_the_frames_and_a_dead_one_is_started_anew(sockets: Path) -
     print(found)
     assert len(found["before"]) == 2
     assert found["parts"] == [2, 2]
-    assert len(set(found["before"]) & set(found["after"])) == 1  # the other one went on
+    assert len(set(found["before"]) & set(found["after"])) == 1  # the other one continued
     assert "runs other code under the name marks" in found["other"]
 
 
@@ -83,7 +83,7 @@ class Actor:
 
 
 class FakeRay(ModuleType):
-    """As much of Ray as is asked for, with actors in this process; ``lost`` of them do not answer."""
+    """The used part of Ray, with actors in this process; ``lost`` of them do not answer."""
 
     def __init__(self) -> None:
         super().__init__("ray")
@@ -121,7 +121,7 @@ class FakeRay(ModuleType):
 
 
 class FakeWorker:
-    """A worker that does nothing but tell how it does."""
+    """A worker that only reports its status."""
 
     def __init__(self, drone: Any, processor: Any, settings: Settings, tell: Any) -> None:
         self.status = Status(processor=settings.name, camera="front")
@@ -144,7 +144,7 @@ def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) ->
         skyloop.ray.process(TARGET, drone="alpha")
 
 
-def test_what_is_asked_of_ray(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_to_ray(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/run/somewhere")
     with skyloop.ray.process(TARGET, drone="alpha", workers=2, name="mine", num_gpus=0.5) as workers:
         assert [status.processor for status in workers.statuses() if status is not None] == ["mine", "mine"]
@@ -159,7 +159,7 @@ def test_what_is_asked_of_ray(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> 
     assert len(ray.killed) == 2
 
 
-def test_a_class_may_be_given_itself(ray: FakeRay) -> None:
+def test_a_class_can_be_given_directly(ray: FakeRay) -> None:
     class Here:
         def process(self, frame: Any) -> int:
             return 1
@@ -170,7 +170,7 @@ def test_a_class_may_be_given_itself(ray: FakeRay) -> None:
         assert status.processor == "here"
 
 
-def test_an_actor_that_cannot_begin_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_actor_that_cannot_start_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     def nowhere(*_: Any, **__: Any) -> None:
         raise UnknownNameError("proxy", "alpha", [])
 
@@ -189,7 +189,7 @@ def test_an_actor_that_cannot_begin_is_told(ray: FakeRay, monkeypatch: pytest.Mo
         skyloop.ray.process(Broken, drone="alpha")
 
 
-def test_a_worker_that_is_refused_later_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_worker_refused_later_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     workers = skyloop.ray.process(TARGET, drone="alpha")
     actor = workers.actors[0].actor
     monkeypatch.setattr(actor._worker, "run", lambda seconds: (_ for _ in ()).throw(LinkError("somebody else")))
@@ -208,12 +208,12 @@ def test_no_room_for_the_actors(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("workers", [0, 1.5])
-def test_a_number_of_workers_that_cannot_be(ray: FakeRay, workers: Any) -> None:
+def test_invalid_numbers_of_workers(ray: FakeRay, workers: Any) -> None:
     with pytest.raises(UsageError, match="must be at least 1"):
         skyloop.ray.process(TARGET, drone="alpha", workers=workers)
 
 
-def test_a_worker_whose_thread_raises_anything_else_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_other_error_of_a_workers_thread_is_reported(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     workers = skyloop.ray.process(TARGET, drone="alpha")
     actor = workers.actors[0].actor
     for error in (RuntimeError("no memory"), SystemExit(3)):
@@ -239,6 +239,6 @@ def test_a_users_environment_is_kept_beside_ours(ray: FakeRay, monkeypatch: pyte
 
 
 @pytest.mark.parametrize("wrong", ["torch", {"env_vars": ["MODEL"]}])
-def test_an_environment_that_is_none_is_refused(ray: FakeRay, wrong: Any) -> None:
+def test_an_invalid_environment_is_refused(ray: FakeRay, wrong: Any) -> None:
     with pytest.raises(UsageError, match=r"runtime_env is .* must be a dict"):
         skyloop.ray.process(TARGET, drone="alpha", runtime_env=wrong)

@@ -1,4 +1,4 @@
-"""How workers do, in figures and words."""
+"""Workers' statistics, in figures and words."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def test_several_together() -> None:
     both = together([one, two])
     assert both is not None
     assert (both.processes, both.parts, both.results, both.results_hz, both.age_s) == (2, 2, 7, 3.0, 0.1)
-    assert "2 of 2 processes at work" in str(both)
-    assert str(both).endswith("errors 0  not sendable 1  not sent 2")
+    assert "2 of 2 processes working" in str(both)
+    assert str(both).endswith("errors 0  unsendable 1  unsent 2")
     assert together([one]) is one
     assert together([]) is None
 
 
 @pytest.mark.parametrize("parts", [0, 2])
-def test_a_worker_without_a_part_is_not_at_work(parts: int) -> None:
+def test_a_worker_without_a_part_is_not_working(parts: int) -> None:
     one = Status(processor="d", camera="front", parts=parts, workers=2)
     both = together([one, Status(processor="d", camera="front", parts=2, workers=2)])
     assert both is not None

@@ -1,4 +1,4 @@
-"""Workers in this process: which frames they take, what they publish, and what goes wrong in the user's class."""
+"""Workers in this process: the frames that they take, their results, and errors of the user's class."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def working(
     tell: Callable[[str], None] = print,
     **fields: Any,
 ) -> Iterator[Worker]:
-    """A worker with a connection and a thread of its own."""
+    """Run a worker with its own connection and thread."""
     with observer(node, app) as drone:
         worker = Worker(drone, Does(function), Settings(**{"name": "detector", "code": "Does 1", **fields}), tell)
         thread = threading.Thread(target=worker.run)
@@ -63,7 +63,7 @@ def working(
 
 @contextmanager
 def collected(node: Node, eye: Drone) -> Iterator[list[Result]]:
-    """All results, as they come."""
+    """Collect all results as they arrive."""
     got: list[Result] = []
     with eye.on_result(got.append, inline=True):
         eye.wait(lambda _: node.server.subscribers("results") == 1, WAIT_S)
@@ -104,7 +104,7 @@ def test_workers_share_the_frames(node: Node, eye: Drone) -> None:
     }
 
 
-def test_all_get_all_where_that_is_chosen(node: Node, eye: Drone) -> None:
+def test_all_workers_get_all_frames_if_not_shared(node: Node, eye: Drone) -> None:
     def process(frame: Frame) -> int:
         return frame.seq
 
@@ -118,7 +118,7 @@ def test_all_get_all_where_that_is_chosen(node: Node, eye: Drone) -> None:
     assert len(seqs[0] & seqs[1]) >= 10
 
 
-def test_a_worker_that_hangs_gives_its_share_to_the_others_until_it_is_back(node: Node, eye: Drone) -> None:
+def test_a_hanging_worker_gives_its_share_to_the_others_until_it_is_back(node: Node, eye: Drone) -> None:
     hang, go_on = threading.Event(), threading.Event()
 
     def sometimes(frame: Frame) -> int:
@@ -145,7 +145,7 @@ def test_a_worker_that_hangs_gives_its_share_to_the_others_until_it_is_back(node
         assert states == ["joined", "joined", "busy", "back"]
 
 
-def test_what_process_raises_is_told_and_work_goes_on(node: Node, eye: Drone) -> None:
+def test_exceptions_of_process_are_reported_and_work_continues(node: Node, eye: Drone) -> None:
     told: list[str] = []
     logged: list[LogEntry] = []
 
@@ -162,7 +162,7 @@ def test_what_process_raises_is_told_and_work_goes_on(node: Node, eye: Drone) ->
     assert "detector failed (1 times so far):\nTraceback" in told[0]
     assert "ValueError: no good" in told[0]
     assert "in process\n    raise ValueError" in told[0]
-    assert "worker.py" not in told[0].replace("test_worker.py", "")  # no line of ours
+    assert "worker.py" not in told[0].replace("test_worker.py", "")  # none of our own lines
     assert (logged[0].name, logged[0].severity) == ("detector", Severity.ERROR)
     assert logged[0].text is not None
     assert "ValueError: no good" in logged[0].text
@@ -176,7 +176,7 @@ def test_what_process_raises_is_told_and_work_goes_on(node: Node, eye: Drone) ->
         (Output(1, ["circle"]), "this can't be drawn on a frame"),  # type: ignore[list-item]
     ],
 )
-def test_results_that_cannot_be_sent_are_told_once_and_counted(node: Node, eye: Drone, value: Any, words: str) -> None:
+def test_unsendable_results_are_reported_once_and_counted(node: Node, eye: Drone, value: Any, words: str) -> None:
     told: list[str] = []
     with working(node, lambda frame: value, tell=told.append) as worker:
         eye.wait(lambda _: worker.status.refused >= 4, WAIT_S)
@@ -186,7 +186,7 @@ def test_results_that_cannot_be_sent_are_told_once_and_counted(node: Node, eye: 
     assert "Further ones are counted" in text
 
 
-def test_shapes_are_drawn_and_none_is_no_result(node: Node, eye: Drone) -> None:
+def test_shapes_are_drawn_and_none_publishes_no_result(node: Node, eye: Drone) -> None:
     drawn: list[Annotation] = []
     box = Polyline(((1.0, 1.0), (2.0, 2.0)))
     with collected(node, eye) as got, eye.on_annotation(drawn.append):
@@ -198,7 +198,7 @@ def test_shapes_are_drawn_and_none_is_no_result(node: Node, eye: Drone) -> None:
     assert drawn[0].shapes == (box,)
 
 
-def test_old_frames_are_left_out_and_counted(node: Node, eye: Drone) -> None:
+def test_old_frames_are_skipped_and_counted(node: Node, eye: Drone) -> None:
     with working(node, lambda frame: frame.seq, max_age_s=0.0) as worker:
         eye.wait(lambda _: worker.status.stale >= 5, WAIT_S)
         assert worker.status.results == 0
@@ -222,7 +222,7 @@ def test_a_slow_worker_drops_frames_and_a_paced_one_too(node: Node, eye: Drone) 
     assert got[-1].seq - got[0].seq > 6
 
 
-def test_it_ends_after_its_time_with_its_drone_and_when_its_name_was_taken(node: Node) -> None:
+def test_it_ends_after_its_time_with_its_drone_and_when_its_name_is_taken(node: Node) -> None:
     with observer(node, "one") as drone:
         settings = Settings("detector", "Does 1")
         Worker(drone, Does(lambda frame: 0), settings).run(seconds=0.05)
@@ -247,6 +247,6 @@ def test_it_ends_after_its_time_with_its_drone_and_when_its_name_was_taken(node:
         ({"stuck_s": float("inf")}, "stuck_s is inf"),
     ],
 )
-def test_settings_that_make_no_sense(fields: dict[str, Any], words: str) -> None:
+def test_invalid_settings(fields: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         Settings(**{"name": "detector", "code": "", **fields})

@@ -1,4 +1,4 @@
-"""Recordings that the tests share."""
+"""Recordings shared by the tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.recorded_flights import Plan, write_flight
 
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two seconds of a drone with a camera, everything in it; not to be changed."""
+    """Two seconds of a drone with a camera, on all channels; do not modify."""
     return write_flight(tmp_path_factory.mktemp("flights") / "flight.mcap")
 
 
@@ -26,7 +26,7 @@ def other_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def log(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ended]:
-    """Runs ``skyloop log ARGUMENTS`` in this process, in a terminal that is wide enough."""
+    """Runs ``skyloop log ARGUMENTS`` in this process, in a wide terminal."""
     monkeypatch.setenv("COLUMNS", "200")
 
     def run(*arguments: str | Path) -> Ended:

@@ -1,4 +1,4 @@
-"""Disks that fill up, stand still or vanish, when a test wants it."""
+"""Disks that fill up, hang or vanish on a test's command."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from skyloop.recording.output import Target
 
 
 class Disk:
-    """Makes files that share its room. Use :meth:`open` for an opener, and :meth:`free` for what is left."""
+    """Creates files that share its room: :meth:`open` is the opener, :meth:`free` the room left."""
 
     def __init__(self, room: int = 10**9) -> None:
-        self.room = room  #: bytes that are left
-        self.moving = threading.Event()  #: writing waits until it is set
+        self.room = room  #: bytes left
+        self.moving = threading.Event()  #: writing waits until set
         self.moving.set()
-        self.writing = threading.Event()  #: somebody has begun to write
+        self.writing = threading.Event()  #: a write has begun
 
     def open(self, path: Path, overwrite: bool) -> Target:
         return cast(Target, _File(self, path.open("wb" if overwrite else "xb", buffering=0)))
@@ -29,7 +29,7 @@ class Disk:
 
 
 class _File:
-    """Writes as much as there is room for, like a real disk, and then says that it is full."""
+    """Writes as much as there is room for, like a real disk, then raises "disk full"."""
 
     def __init__(self, disk: Disk, file: Any) -> None:
         self._disk = disk

@@ -1,4 +1,4 @@
-"""Recordings of H.264, written as the recorder writes them: by its own translation, into its own file."""
+"""Recordings of H.264, written like the recorder's: with its translation, into its file."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from skyloop.vehicles.emulation.video import Encoder, Format
 
 MS = 1_000_000
 BEGIN_NS = 5_000_000_000
-STEP_NS = 40 * MS  #: from one picture to the next
-GROUP = 5  #: pictures from one key to the next
+STEP_NS = 40 * MS  #: from one image to the next
+GROUP = 5  #: images from one key frame to the next
 CAPABILITIES = Capabilities("sim", frozenset(), (CameraInfo("front", 64, 48, 25.0, stream=H264),))
 
 
 @dataclass(frozen=True)
 class Unit:
-    """One picture of the stream."""
+    """One image of the stream."""
 
     number: int
     data: bytes
@@ -44,7 +44,7 @@ class Unit:
 
 @cache
 def film(count: int = 20, width: int = 64, height: int = 48, first: int = 1, seed: int = 1) -> tuple[Unit, ...]:
-    """A moving bar over noise; a key every five pictures."""
+    """Encode a moving bar over noise, with a key frame every five images."""
     encoder = Encoder(Format("h264", width, height, 0), 25.0, 500, group=GROUP)
     picture = np.random.default_rng(seed).integers(0, 255, (height, width, 3), np.uint8)
     units = []
@@ -59,7 +59,7 @@ def film(count: int = 20, width: int = 64, height: int = 48, first: int = 1, see
 
 
 def write_film(path: Path, units: Iterable[Unit], *, closed: bool = True) -> Path:
-    """Write a recording of drone ``alpha`` with camera ``front`` and nothing else; a chunk every five pictures."""
+    """Write a recording of only drone ``alpha`` with camera ``front``; a chunk every five images."""
     clock = ClockPair(BEGIN_NS, 1_760_000_000 * NS_PER_S, 1)
     translator = Translator("alpha", CAPABILITIES, clock)
     start = Start(VERSION, "test", (DroneRecord("alpha", "sim://", to_plain(CAPABILITIES)),), clock.unix_ns)

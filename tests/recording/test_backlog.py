@@ -1,4 +1,4 @@
-"""What waits to be written: order, bounds, and what is dropped first."""
+"""The backlog: order, bounds, and drops."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def numbers(taken: list[Item]) -> list[int]:
     return [one.received_ns for one in taken]
 
 
-def test_order_of_arrival_whatever_the_rank() -> None:
+def test_order_of_arrival_regardless_of_rank() -> None:
     backlog = Backlog(LIMIT, RESERVE)
     for number, rank in enumerate((Rank.FRAME, Rank.KEPT, Rank.STATE, Rank.KEPT, Rank.FRAME)):
         backlog.put(item(rank, number))
@@ -52,7 +52,7 @@ def test_the_oldest_frame_makes_room_for_the_newest() -> None:
     assert numbers(backlog.take(10_000)) == list(range(4, 14))
 
 
-def test_even_what_must_be_kept_is_bounded() -> None:
+def test_even_essential_items_are_bounded() -> None:
     backlog = Backlog(LIMIT, RESERVE)
     for number in range(20):
         backlog.put(item(Rank.KEPT, number))
@@ -60,7 +60,7 @@ def test_even_what_must_be_kept_is_bounded() -> None:
     assert backlog.dropped == {(0, "commands"): 5}
 
 
-def test_what_could_not_be_written_comes_first_again() -> None:
+def test_unwritten_items_come_first_again() -> None:
     backlog = Backlog(LIMIT, RESERVE)
     for number in range(4):
         backlog.put(item(Rank(number % 3), number))
@@ -101,7 +101,7 @@ def test_nothing_is_lost_uncounted_reordered_or_beyond_the_bound(steps: list[tup
 
 
 @pytest.mark.parametrize("rank", list(Rank))
-def test_one_that_is_larger_than_everything(rank: Rank) -> None:
+def test_an_item_larger_than_everything(rank: Rank) -> None:
     backlog = Backlog(LIMIT, RESERVE)
     backlog.put(item(rank, size=LIMIT + RESERVE + 1))
     assert backlog.take(1) == []

@@ -38,26 +38,26 @@ def test_a_timid_controller(flight: Path, other_flight: Path) -> None:
     assert fields["forward"].seconds == pytest.approx(1.1, abs=0.06)
     assert found.same_action == 1.0
     assert found.part_at_s == pytest.approx(0.51, abs=0.02)  # with the first velocity
-    assert found.aligned == "by their clock, which is the same"
+    assert found.aligned == "by their common clock"
     assert compare(Recording.open(flight), Recording.open(other_flight), part=0.3).part_at_s is None
 
 
-def test_flights_to_a_place(tmp_path: Path) -> None:
+def test_flights_to_a_position(tmp_path: Path) -> None:
     paths = [write_flight(tmp_path / f"{gain}.mcap", Plan(places=True, gain=gain)) for gain in (1.0, 2.0)]
     low, high = map(Recording.open, paths)
     fields = {field.name: field for field in compare(low, high, what="asked").fields}
     assert fields["z"].unit == "m"
     assert fields["z"].rms == pytest.approx(1.2)
     assert fields["x"].rms == 0.0
-    assert "yaw" not in fields, "none was asked for"
+    assert "yaw" not in fields, "none was requested"
     commands = tables(low, "alpha")["commands"]
     flying = commands["asked"] == "position"
     assert commands["applied_y"][flying] == pytest.approx(2.0)
     assert not commands.known("applied_yaw")
 
 
-def test_a_replay_knows_where_it_is(tmp_path: Path, flight: Path) -> None:
-    """On another clock, 100 s later, and begun 0.4 s into the recording."""
+def test_a_replay_knows_its_position(tmp_path: Path, flight: Path) -> None:
+    """On another clock, 100 s later, started 0.4 s into the recording."""
     later = 100_000 * MS
 
     def replayed(at_ms: int) -> Feedback:
@@ -75,10 +75,10 @@ def test_a_replay_knows_where_it_is(tmp_path: Path, flight: Path) -> None:
     assert found.new.times_s[0] - found.old.times_s[0] == pytest.approx(0.4, abs=0.001)
 
 
-def test_flights_that_have_nothing_in_common_begin_with_their_first_command(tmp_path: Path, flight: Path) -> None:
+def test_unrelated_flights_start_at_their_first_command(tmp_path: Path, flight: Path) -> None:
     path = write_flight(tmp_path / "other.mcap", Plan(shift_ns=50_000 * MS, gain=0.5))
     found = compare(Recording.open(flight), Recording.open(path))
-    assert found.aligned == "both begin with their first command"
+    assert found.aligned == "both start at their first command"
     assert found.new.times_s[0] == pytest.approx(found.old.times_s[0])
     assert found.same_action == 1.0
 

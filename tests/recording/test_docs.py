@@ -1,4 +1,4 @@
-"""``docs/recording.md`` is true of the code."""
+"""``docs/recording.md`` matches the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""H.264 kept as it came: what is in the file is what was sent, and shows what the decoder shows."""
+"""H.264 kept unchanged: the file holds the sent stream and shows the decoder's images."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ def sent() -> tuple[PaveFrame, ...]:
 
 @functools.cache
 def shown() -> tuple[NDArray[np.uint8], ...]:
-    """What the driver's own decoder makes of it."""
+    """The images of the driver's own decoder."""
     decoder = PaveDecoder()
     images = [decoder.decode(frame) for frame in sent()]
     return tuple(np.asarray(image.to_ndarray(format="bgr24"), np.uint8) for image in images if image is not None)
 
 
 def record_stream(path: Path, **options: Any) -> skyloop.recording.Recorder:
-    """Plays the drone's eight seconds, twenty times as fast, to a recorder and to nobody else."""
+    """Play the drone's eight seconds at twenty times the speed to a recorder only."""
     server = MemoryServer("alpha")
     with Proxy(make_driver(f"video://{stream()}?speed=20"), server, name="alpha"):
         drone = open_drone(server.dial, app="me", timeout_s=WAIT_S)
@@ -75,7 +75,7 @@ def record_stream(path: Path, **options: Any) -> skyloop.recording.Recorder:
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Not to be changed."""
+    """A recording of the stream; do not modify."""
     path = tmp_path_factory.mktemp("encoded") / "flight.mcap"
     recorder = record_stream(path)
     assert (recorder.dropped, recorder.missed) == ({}, {})
@@ -85,7 +85,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # Into the file -------------------------------------------------------------------------------------------------------
 
 
-def test_each_picture_is_in_the_file_as_it_was_sent(kept: Path) -> None:
+def test_each_image_is_in_the_file_as_sent(kept: Path) -> None:
     videos = files.decoded(kept, VIDEO)
     assert [video.data for video in videos] == [frame.payload for frame in sent()]
     assert {(video.format, video.frame_id) for video in videos} == {("h264", "alpha/front")}
@@ -99,14 +99,14 @@ def test_each_picture_is_in_the_file_as_it_was_sent(kept: Path) -> None:
     assert files.is_complete(kept)
 
 
-def test_key_pictures_carry_their_parameters_as_viewers_want_it(kept: Path) -> None:
+def test_key_frames_carry_their_parameters_as_viewers_require(kept: Path) -> None:
     for video, frame in zip(files.decoded(kept, VIDEO), sent(), strict=True):
         units = [unit[0] & 31 for unit in re.split(rb"\x00{2,3}\x01", video.data) if unit]
         assert units == ([7, 8, 5] if frame.is_key else [1])
 
 
 @pytest.mark.parametrize(("encoding", "format_"), [("jpeg", "jpeg"), ("png", "png")])
-def test_frames_are_encoded_anew_where_that_is_asked_for(tmp_path: Path, encoding: str, format_: str) -> None:
+def test_frames_are_re_encoded_on_request(tmp_path: Path, encoding: str, format_: str) -> None:
     record_stream(tmp_path / "flight.mcap", encoding=encoding)
     topics = {one.topic for one in files.read(tmp_path / "flight.mcap")}
     assert IMAGE in topics
@@ -115,12 +115,12 @@ def test_frames_are_encoded_anew_where_that_is_asked_for(tmp_path: Path, encodin
 
 
 def test_an_unknown_encoding_is_refused() -> None:
-    with pytest.raises(UsageError, match='"auto", "jpeg" or, without any loss, "png"'):
+    with pytest.raises(UsageError, match='"auto", "jpeg" or, lossless, "png"'):
         Options(encoding="h264")  # type: ignore[arg-type]
 
 
 class Announcing(FakeVehicle):
-    """Announces H.264 and gives frames, and for as long as ``encoded`` is set also pictures that pass for H.264."""
+    """Announces H.264 and sends frames, and while ``encoded`` is set also images that pass for H.264."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ class Announcing(FakeVehicle):
                 sink.frame("front", pixels, now_ns, width=32, height=24)
 
 
-def test_frames_are_recorded_while_the_stream_that_was_announced_does_not_come(
+def test_frames_are_recorded_while_the_announced_stream_does_not_arrive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(taps, "_STREAM_GONE_NS", 200_000_000)
@@ -167,12 +167,12 @@ def test_frames_are_recorded_while_the_stream_that_was_announced_does_not_come(
 # Out of the file -----------------------------------------------------------------------------------------------------
 
 
-def test_pictures_are_those_of_the_decoder(kept: Path) -> None:
+def test_images_match_the_decoders(kept: Path) -> None:
     pictures = list(Recording.open(kept).pictures("alpha", "front"))
     assert len(pictures) == len(shown()) == 240
     for picture, expected in zip(pictures, shown(), strict=True):
         assert np.array_equal(picture.pixels(), expected)
-    # In any order, as thumbnails or a person ask for them; each is decoded from its key picture on.
+    # In any order, as for thumbnails; each is decoded starting from its key frame.
     for index in (100, 99, 100, 7, 239, 120):
         assert np.array_equal(pictures[index].pixels(), shown()[index])
         image, encoding = pictures[index].as_recorded()
@@ -187,7 +187,7 @@ def replayed(path: Path, query: str) -> list[tuple[int, NDArray[np.uint8]]]:
     return seen
 
 
-def test_a_replay_in_step_shows_every_picture(kept: Path) -> None:
+def test_a_replay_in_step_shows_every_image(kept: Path) -> None:
     seen = replayed(kept, "")
     assert len(seen) == len(shown())
     assert all(np.array_equal(frame, expected) for (_, frame), expected in zip(seen, shown(), strict=True))
@@ -195,7 +195,7 @@ def test_a_replay_in_step_shows_every_picture(kept: Path) -> None:
     assert [captured_ns for captured_ns, _ in seen] == [record.header.captured_ns for record in records]
 
 
-def test_a_replay_that_begins_between_two_keys_shows_whole_pictures_at_once(kept: Path) -> None:
+def test_a_replay_from_between_two_key_frames_shows_whole_images_at_once(kept: Path) -> None:
     seen = replayed(kept, "&start=0.2")  # of 0.4 s in all
     records = [layout.decode(one.data, FrameRecord) for one in files.of(kept, FRAMES)]
     first = next(n for n, record in enumerate(records) if record.header.captured_ns == seen[0][0])
@@ -206,7 +206,7 @@ def test_a_replay_that_begins_between_two_keys_shows_whole_pictures_at_once(kept
     assert all(np.array_equal(frame, expected) for (_, frame), expected in zip(seen, shown()[first:], strict=True))
 
 
-def test_a_file_that_was_cut_off_shows_what_is_there_and_can_be_mended(kept: Path, tmp_path: Path, log: Log) -> None:
+def test_a_truncated_file_shows_its_content_and_can_be_recovered(kept: Path, tmp_path: Path, log: Log) -> None:
     cut = tmp_path / "cut.mcap"
     data = kept.read_bytes()
     cut.write_bytes(data[: len(data) * 2 // 3])
@@ -217,7 +217,7 @@ def test_a_file_that_was_cut_off_shows_what_is_there_and_can_be_mended(kept: Pat
         assert np.array_equal(pictures[-1].pixels(), shown()[len(pictures) - 1])
 
 
-def test_looking_at_it(kept: Path, tmp_path: Path, log: Log) -> None:
+def test_commands_on_the_recording(kept: Path, tmp_path: Path, log: Log) -> None:
     rows = {row.topic: row for row in summarise(Recording.open(kept)).rows}
     assert (rows[FRAMES].count, rows[VIDEO].count, rows[FRAMES].missing) == (240, 240, 0)
     assert rows[VIDEO].schema == "foxglove.CompressedVideo"
@@ -245,7 +245,7 @@ def test_without_pyav_the_rest_of_a_recording_can_be_read(
     assert "data:image" not in (tmp_path / "report.html").read_text()
 
 
-def test_what_builds_on_a_missing_or_damaged_picture_is_not_shown() -> None:
+def test_images_that_depend_on_missing_or_damaged_ones_are_not_shown() -> None:
     groups = Groups()
     found = [groups.add(n, frame.payload, key=frame.is_key) for n, frame in enumerate(sent()[:40]) if n not in (0, 18)]
     whole = [n for n in range(1, 40) if n != 18]
@@ -261,11 +261,11 @@ def test_what_builds_on_a_missing_or_damaged_picture_is_not_shown() -> None:
     assert np.array_equal(group.pixels(0, "it"), shown()[0])
 
 
-def test_a_recording_whose_key_picture_is_gone_says_so(kept: Path, tmp_path: Path) -> None:
+def test_a_missing_key_frame_is_reported(kept: Path, tmp_path: Path) -> None:
     recording = Recording.open(kept)
     pictures = list(recording.pictures("alpha", "front"))
     broken = type(pictures[1])(**{f: getattr(pictures[1], f) for f in pictures[1].__slots__} | {"group": None})
-    with pytest.raises(FileFormatError, match="frame 2 of front can't be decoded: frames that it builds on"):
+    with pytest.raises(FileFormatError, match="frame 2 of front can't be decoded: frames that it depends on"):
         broken.pixels()
     with pytest.raises(UnknownNameError):
         recording.pictures("alpha", "bottom")
@@ -285,7 +285,7 @@ def emulated() -> Iterator[Driver]:
         )
 
 
-def test_an_emulated_drone_is_recorded_as_it_sends_and_as_its_frames_show(emulated: Driver, tmp_path: Path) -> None:
+def test_an_emulated_drone_is_recorded_as_sent_and_as_shown(emulated: Driver, tmp_path: Path) -> None:
     server, path = MemoryServer("alpha"), tmp_path / "flight.mcap"
     live: dict[int, NDArray[np.uint8]] = {}
     with Proxy(emulated, server, name="alpha"), open_drone(server.dial, app="me", timeout_s=WAIT_S) as drone:

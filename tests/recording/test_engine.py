@@ -52,7 +52,7 @@ Fly = Callable[..., Drone]
 
 @pytest.fixture
 def fly() -> Iterator[Fly]:
-    """Makes proxies in this process, with a pilot each."""
+    """Creates proxies in this process, with a pilot each."""
     with ExitStack() as stack:
 
         def one(name: str = "alpha", encoding: Encoding = Encoding.BGR8) -> Drone:
@@ -68,12 +68,12 @@ def fly() -> Iterator[Fly]:
 def test_a_recorder_that_fails_to_start_leaves_no_open_file(
     fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The second drone's connection was gone: the file stayed open, and the writing thread with it."""
+    """The second drone's connection was gone: file and writing thread stayed open."""
     drones, path = [fly("one"), fly("two")], tmp_path / "flight.mcap"
     monkeypatch.setattr(drones[1], "on_command", Mock(side_effect=LinkError("it is gone")))
     with pytest.raises(LinkError, match="it is gone"):
         skyloop.record(drones, path, min_free_mb=0)
-    assert files.is_complete(path), "it was closed, and can be read"
+    assert files.is_complete(path), "it is closed and readable"
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith("skyloop-record")]
 
 
@@ -81,7 +81,7 @@ def until_has(path: Path, topic: str, count: int = 1) -> None:
     files.until(lambda: len(files.of(path, topic)) >= count, f"{count} of {topic}")
 
 
-def test_everything_is_in_the_file(fly: Fly, tmp_path: Path) -> None:
+def test_all_channels_are_in_the_file(fly: Fly, tmp_path: Path) -> None:
     drone, path = fly(), tmp_path / "flight.mcap"
     with skyloop.record(drone, path, min_free_mb=0) as recorder:
         assert recorder.state.value == "recording"
@@ -166,7 +166,7 @@ def check_for_viewers(path: Path) -> None:
     assert files.decoded(path, "/alpha/camera/front/annotations")[0].points
 
 
-def test_jpeg_is_kept_as_it_came(fly: Fly, tmp_path: Path) -> None:
+def test_jpeg_is_kept_unchanged(fly: Fly, tmp_path: Path) -> None:
     drone, path = fly(encoding=Encoding.JPEG), tmp_path / "flight.mcap"
     with skyloop.record(drone, path, channels=["video.front"], min_free_mb=0):
         until_has(path, "/alpha/frames/front", 3)
@@ -220,7 +220,7 @@ def test_several_drones_in_one_file(fly: Fly, tmp_path: Path) -> None:
         skyloop.record([alpha, alpha], tmp_path / "twice.mcap", min_free_mb=0)
 
 
-def test_a_full_disk_is_told_and_the_flight_goes_on(fly: Fly, tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_the_flight_continues(fly: Fly, tmp_path: Path) -> None:
     disk = Disk()
     drone, path = fly(), tmp_path / "flight.mcap"
     events: list[Event] = []
@@ -233,7 +233,7 @@ def test_a_full_disk_is_told_and_the_flight_goes_on(fly: Fly, tmp_path: Path) ->
         files.until(lambda: engine.status.state is RecorderState.PAUSED, "the pause")
         drone.takeoff()
         assert drone.feedback(max_age_s=1.0).state.airborne
-        files.until(lambda: any("stands still" in (entry.text or "") for entry in logs), "the log entry")
+        files.until(lambda: any("recording paused" in (entry.text or "") for entry in logs), "the log entry")
         disk.room = 10**9
         files.until(lambda: engine.status.state is RecorderState.RECORDING, "the next file")
         engine.stop()
@@ -245,7 +245,7 @@ def test_a_full_disk_is_told_and_the_flight_goes_on(fly: Fly, tmp_path: Path) ->
     assert "takeoff" in [applied.asked.name for applied in taken], "kept while the disk was full"
 
 
-def test_a_slow_encoder_costs_frames_which_are_counted_and_told(
+def test_a_slow_encoder_costs_frames_which_are_counted_and_reported(
     fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate = threading.Event()
@@ -272,9 +272,7 @@ def test_a_slow_encoder_costs_frames_which_are_counted_and_told(
     assert [event for event in events if event.kind is EventKind.RECORDING][-1].app == "me"
 
 
-def test_pictures_that_can_not_be_encoded_are_counted(
-    fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_can_not_be_encoded_are_counted(fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(self: Video, *_: object) -> None:
         raise SkyloopError("no")
 
@@ -284,7 +282,7 @@ def test_pictures_that_can_not_be_encoded_are_counted(
         files.until(lambda: recorder.dropped.get("alpha", {}).get("video.front", 0) > 0, "counted")
 
 
-def test_an_encoder_says_what_it_can_not_do() -> None:
+def test_an_encoder_reports_impossible_images() -> None:
     header = FrameHeader("front", 1, 1, 1, 4, 3, Encoding.BGR8, 36)
     with pytest.raises(SkyloopError, match="frame 1 of front can't be encoded"):
         encoder(Options())(header, np.zeros((0, 0, 3), np.uint8))
@@ -299,7 +297,7 @@ def test_a_drone_that_is_closed_first(fly: Fly, tmp_path: Path) -> None:
     assert files.is_complete(path)
 
 
-def test_in_a_fork_a_recording_is_left_to_the_parent(fly: Fly, tmp_path: Path) -> None:
+def test_a_fork_leaves_a_recording_to_the_parent(fly: Fly, tmp_path: Path) -> None:
     drone, path = fly(), tmp_path / "flight.mcap"
     with skyloop.record(drone, path, min_free_mb=0) as recorder:
         until_has(path, "/alpha/feedback")
@@ -307,7 +305,7 @@ def test_in_a_fork_a_recording_is_left_to_the_parent(fly: Fly, tmp_path: Path) -
         assert isinstance(engine, Engine)
         engine.forked()
         recorder.close()
-        assert recorder.state.value == "recording", "its file was not closed"
+        assert recorder.state.value == "recording", "its file is still open"
         engine._ended_ns = None  # the parent's
     assert files.is_complete(path)
 
@@ -319,7 +317,7 @@ def test_gaps_in_numbers() -> None:
     assert gaps.missed == 3
 
 
-# What is asked for ---------------------------------------------------------------------------------------------
+# Options --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -347,10 +345,10 @@ def test_wrong_options(fly: Fly, tmp_path: Path, options: dict[str, Any], match:
 
 def test_wrong_paths_and_drones(fly: Fly, tmp_path: Path) -> None:
     drone = fly()
-    with pytest.raises(UsageError, match="is no folder"):
+    with pytest.raises(UsageError, match="is not a folder"):
         skyloop.record(drone, tmp_path / "nowhere" / "f.mcap")
     (tmp_path / "f.mcap").write_text("precious")
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         skyloop.record(drone, tmp_path / "f")
     for wrong in (7, [], [None]):
         with pytest.raises(UsageError, match="must be a drone"):

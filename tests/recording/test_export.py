@@ -1,4 +1,4 @@
-"""``skyloop log export``: CSV, Parquet, NumPy and MP4 hold what was recorded."""
+"""``skyloop log export``: CSV, Parquet, NumPy and MP4 hold the recorded data."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_mp4_keeps_each_frames_time(log: Log, flight: Path, tmp_path: Path, burn
     image = pictures[5].to_ndarray(format="bgr24")
     assert image.shape == (48, 64, 3)
     corner = image[34:, 24:40].max()
-    assert corner > 200 if burn else corner < 160  # white figures on a dark ramp, away from the bright column
+    assert corner > 200 if burn else corner < 160  # white digits on a dark ramp, away from the bright column
 
 
 def jpeg(width: int, height: int) -> bytes:
@@ -123,8 +123,8 @@ def videos(path: Path, target: Path) -> tuple[int, int]:
     return found.frames, found.left_out
 
 
-def test_pictures_that_are_damaged_or_of_another_size_are_left_out(tmp_path: Path) -> None:
-    """A video has one size, that of its first picture, made even; the others keep their times."""
+def test_damaged_images_and_images_of_another_size_are_left_out(tmp_path: Path) -> None:
+    """A video has one size, that of its first image, made even; the others keep their times."""
     odd = {number: jpeg(65, 49) for number in range(1, 21)} | {3: b"no picture", 4: b"\xff\xd8\xff", 6: jpeg(32, 24)}
     path = write_flight(tmp_path / "flight.mcap", Plan(packed=odd.get))
     assert videos(path, tmp_path / "x.mp4") == (17, 3)
@@ -135,14 +135,14 @@ def test_pictures_that_are_damaged_or_of_another_size_are_left_out(tmp_path: Pat
     assert tenths == [0, 1, 4, *range(6, 20)]
 
 
-def test_a_camera_of_which_nothing_can_be_decoded(tmp_path: Path) -> None:
+def test_a_camera_without_decodable_frames(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(packed=lambda number: b"no picture"))
     with pytest.raises(FileFormatError, match="no frame of front can be decoded"):
         export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4")
     assert not (tmp_path / "x.mp4").exists()
 
 
-def test_without_h264_mpeg4_is_taken(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_h264_mpeg4_is_used(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not every build of FFmpeg has x264."""
     monkeypatch.setattr(video, "_CODECS", ("no codec of that name", "mpeg4"))
     assert export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "x.mp4", burn_time=True).frames == 20
@@ -154,7 +154,7 @@ def test_without_h264_mpeg4_is_taken(flight: Path, tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(("missing", "to", "extra"), [("pyarrow", "parquet", "parquet"), ("av", "mp4", "video")])
-def test_what_is_not_installed_is_named(
+def test_missing_packages_are_named(
     log: Log, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str, to: str, extra: str
 ) -> None:
     monkeypatch.setitem(sys.modules, missing, None)
@@ -170,7 +170,7 @@ def test_burning_times_needs_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
         video._burn(image, 1.0)
 
 
-def test_frames_that_are_not_there(tmp_path: Path) -> None:
+def test_missing_frames(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(frame_ms=0))
     with pytest.raises(UnknownNameError, match="camera of alpha"):
         export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4")
@@ -184,7 +184,7 @@ def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:
         (["--to", "mp4", "--channel", "feedback"], "--channel has no effect on mp4"),
         (["--burn-time"], "--burn-time has no effect on csv"),
         (["--channel", "annotations"], "holds none of these channels"),
-        (["-o", "/proc/nothing/here"], "can't be made"),
+        (["-o", "/proc/nothing/here"], "can't be created"),
         (["--to", "xlsx"], "--to"),
     ):
         ended = log("export", flight, *arguments)
@@ -192,7 +192,7 @@ def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:
         assert words in ended.err, ended.err
 
 
-def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
+def test_unwritable_paths_are_refused(flight: Path, tmp_path: Path) -> None:
     (tmp_path / "feedback.csv").mkdir()
     found = read(Recording.open(flight), "alpha", (Channel.FEEDBACK,))
     with pytest.raises(Exception, match="can't be written: Is a directory"):
@@ -209,7 +209,7 @@ def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
         read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))
 
 
-def test_what_fails_leaves_an_existing_file_alone(tmp_path: Path, flight: Path, log: Log) -> None:
+def test_a_failed_export_leaves_an_existing_file_alone(tmp_path: Path, flight: Path, log: Log) -> None:
     target = tmp_path / "film.mp4"
     target.write_bytes(b"an earlier export")
     ended = log("export", flight, "--to", "mp4", "--camera", "wrong", "-o", target)

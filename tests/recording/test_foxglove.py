@@ -1,4 +1,4 @@
-"""Messages for viewers, decoded with the public classes."""
+"""Messages for viewers, decoded by the public classes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ angles = st.floats(-math.pi, math.pi)
 
 
 def matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """Rotation matrix of a quaternion, shape (3, 3)."""
+    """Return the rotation matrix of a quaternion, shape (3, 3)."""
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -40,7 +40,7 @@ def matrix(x: float, y: float, z: float, w: float) -> np.ndarray:
 
 
 @given(angles, angles, angles)
-def test_quaternions_are_the_rotations_of_the_attitude(roll: float, pitch: float, yaw: float) -> None:
+def test_quaternions_match_the_attitude(roll: float, pitch: float, yaw: float) -> None:
     q = foxglove.quaternion(roll, pitch, yaw)
     assert matrix(q.x, q.y, q.z, q.w) == pytest.approx(rotation_from_euler(roll, pitch, yaw), abs=1e-9)
 
@@ -80,7 +80,7 @@ def test_a_camera_is_mounted_where_the_vehicle_says() -> None:
     assert foxglove.drone_to_camera("alpha", CameraInfo("front", 4, 3, 30.0), AT_NS) is None
 
 
-def test_a_picture_there_and_back() -> None:
+def test_an_image_round_trips() -> None:
     data = foxglove.image("alpha", "front", AT_NS, b"\xff\xd8picture", "jpeg")
     message = CompressedImage.FromString(data)
     assert (message.frame_id, message.format) == ("alpha/front", "jpeg")
@@ -127,9 +127,9 @@ def test_log_lines() -> None:
     )
 
 
-def test_a_schema_has_all_that_it_needs() -> None:
+def test_a_schema_has_all_its_dependencies() -> None:
     found = FileDescriptorSet.FromString(foxglove.schema(foxglove.ImageAnnotations))
     names = [file.name for file in found.file]
     assert len(names) == len(set(names))
     for place, file in enumerate(found.file):
-        assert set(file.dependency) <= set(names[:place]), "a file comes after what it imports"
+        assert set(file.dependency) <= set(names[:place]), "a file follows its imports"

@@ -1,4 +1,4 @@
-"""A recording's index says what a scan of the whole file says, or is not believed."""
+"""A recording's index agrees with a scan of the whole file, or is not trusted."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def kept(folder: Path) -> Path:
-    """Not to be changed."""
+    """A recording with an index; do not modify."""
     return write_film(folder / "kept.mcap", film())
 
 
 def known(found: Scan | None) -> dict[str, object]:
     assert found is not None
     names = ("size", "schemas", "channels", "metadata", "attachments", "cut", "damaged", "head")
-    pieces = [replace(piece, crc=None) for piece in found.pieces]  # of the index's, checksums are read later
+    pieces = [replace(piece, crc=None) for piece in found.pieces]  # checksums from the index are read later
     return {"pieces": pieces, **{name: getattr(found, name) for name in names}}
 
 
@@ -39,7 +39,7 @@ def read(path: Path) -> list[Entry]:
     return list(Recording.open(path).entries())
 
 
-def test_it_says_what_a_scan_says(kept: Path, flight: Path) -> None:
+def test_it_agrees_with_a_scan(kept: Path, flight: Path) -> None:
     for path in (kept, flight):
         assert known(indexed(path)) | {"head": 0} == known(scan(path)) | {"head": 0}
     assert len(read(kept)) == 40
@@ -57,13 +57,13 @@ def test_attachments_and_messages_between_chunks(folder: Path) -> None:
             writer.add_message(channel, 2, b"{}", 2)
             writer.finish()  # type: ignore[no-untyped-call]
         found = indexed(path)
-        assert (found is not None) == chunked  # messages outside of chunks are in no index
+        assert (found is not None) == chunked  # messages outside chunks are in no index
         if found is not None:
             assert known(found) | {"head": 0} == known(scan(path)) | {"head": 0}
             assert len(found.attachments) == 1
 
 
-def test_opening_looks_at_no_chunk(kept: Path, folder: Path) -> None:
+def test_opening_reads_no_chunk(kept: Path, folder: Path) -> None:
     data = bytearray(kept.read_bytes())
     pieces = Recording.open(kept).found.pieces
     begin, end = pieces[1].offset - 52, pieces[1].offset + pieces[1].size
@@ -73,10 +73,10 @@ def test_opening_looks_at_no_chunk(kept: Path, folder: Path) -> None:
     recording = Recording.open(path)
     assert recording.found.pieces == pieces
     assert len(list(recording.entries())) == 30
-    assert recording.damaged == [f"at byte {pieces[1].offset}: there is no chunk where the file's index says so"]
+    assert recording.damaged == [f"at byte {pieces[1].offset}: the file's index points to a chunk that is not there"]
 
 
-def test_a_chunk_of_another_size_than_the_index_says(kept: Path, folder: Path) -> None:
+def test_a_chunk_whose_size_differs_from_the_index(kept: Path, folder: Path) -> None:
     data = bytearray(kept.read_bytes())
     piece = Recording.open(kept).found.pieces[1]
     data[piece.offset - 43 + 16 : piece.offset - 43 + 24] = struct.pack("<Q", piece.unpacked + 1)
@@ -84,11 +84,11 @@ def test_a_chunk_of_another_size_than_the_index_says(kept: Path, folder: Path) -
     path.write_bytes(data)
     recording = Recording.open(path)
     assert len(list(recording.entries())) == 30
-    assert "a chunk's size is another than in the file's index" in recording.damaged[0]
+    assert "a chunk's size differs from the file's index" in recording.damaged[0]
 
 
 @given(st.data())
-def test_an_index_with_a_wrong_byte_is_not_believed(kept: Path, folder: Path, data: st.DataObject) -> None:
+def test_an_index_with_a_wrong_byte_is_not_trusted(kept: Path, folder: Path, data: st.DataObject) -> None:
     whole = kept.read_bytes()
     (summary,) = struct.unpack_from("<Q", whole, len(whole) - 8 - 20)
     at = data.draw(st.integers(summary, len(whole) - 1))
@@ -100,7 +100,7 @@ def test_an_index_with_a_wrong_byte_is_not_believed(kept: Path, folder: Path, da
 
 
 @given(st.data())
-def test_nor_is_one_of_a_file_that_something_was_cut_out_of(kept: Path, folder: Path, data: st.DataObject) -> None:
+def test_the_index_of_a_file_with_a_part_cut_out_is_not_trusted(kept: Path, folder: Path, data: st.DataObject) -> None:
     whole = kept.read_bytes()
     begin = data.draw(st.integers(0, len(whole) - 1))
     end = data.draw(st.integers(begin + 1, len(whole)))
@@ -110,12 +110,12 @@ def test_nor_is_one_of_a_file_that_something_was_cut_out_of(kept: Path, folder: 
 
 
 @given(st.binary(max_size=200))
-def test_anything_else_has_none(folder: Path, data: bytes) -> None:
+def test_other_data_has_no_index(folder: Path, data: bytes) -> None:
     path = folder / "any.mcap"
     path.write_bytes(data)
     assert indexed(path) is None
 
 
-def test_a_file_that_is_not_there(folder: Path) -> None:
+def test_a_missing_file(folder: Path) -> None:
     with pytest.raises(UsageError, match="No such file"):
         indexed(folder / "nothing.mcap")

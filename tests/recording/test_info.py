@@ -1,4 +1,4 @@
-"""``skyloop log info``: what is in a recording."""
+"""``skyloop log info``: the content of a recording."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_counts_rates_gaps_and_delays(flight: Path) -> None:
     feedback = rows["/alpha/feedback"]
     assert feedback.count == 96
     assert feedback.rate_hz == pytest.approx(95 / 1.98, rel=0.01)
-    assert feedback.missing == 4  # by their numbers
+    assert feedback.missing == 4  # by sequence numbers
     assert feedback.gaps == 1
     assert feedback.longest_s == pytest.approx(0.1)
     delays = {delay.what: delay for delay in feedback.delays}
@@ -46,16 +46,16 @@ def test_counts_rates_gaps_and_delays(flight: Path) -> None:
     assert summary.notes == ()
 
 
-def test_drops_are_those_told_last(tmp_path: Path, flight: Path) -> None:
+def test_the_last_reported_drops_count(tmp_path: Path, flight: Path) -> None:
     told = summarise(Recording.open(write_flight(tmp_path / "open.mcap", Plan(closed=False))))
     assert told.dropped == {"alpha": {"video.front": 2}}
     assert told.missed == {"alpha": {"feedback": 4}}
     assert any("never closed" in note for note in told.notes)
-    assert summarise(Recording.open(flight)).dropped == {}  # the recorder's last word
+    assert summarise(Recording.open(flight)).dropped == {}  # the recorder's final report
 
 
 @pytest.mark.process
-def test_in_a_pipe_nothing_is_cut(tmp_path: Path) -> None:
+def test_nothing_is_cut_in_a_pipe(tmp_path: Path) -> None:
     name = "alpha-of-the-long-name-" * 3
     flight = write_flight(tmp_path / "flight.mcap", Plan(drone=name))
     command = [sys.executable, "-m", "skyloop", "log", "info", str(flight)]
@@ -67,7 +67,7 @@ def test_in_a_pipe_nothing_is_cut(tmp_path: Path) -> None:
         )
 
 
-def test_a_narrow_terminal_folds_what_tells_rows_apart(flight: Path) -> None:
+def test_a_narrow_terminal_folds_the_distinguishing_columns(flight: Path) -> None:
     recording = Recording.open(flight)
     screen = Console(width=60, file=io.StringIO())
     for part in log_tables.info(recording, summarise(recording)):
@@ -88,7 +88,7 @@ def test_the_table(log: Log, flight: Path) -> None:
     assert "5 info, 2 warning" in ended.out
 
 
-def test_what_was_lost_and_what_is_wrong_is_said(log: Log, tmp_path: Path) -> None:
+def test_losses_and_problems_are_reported(log: Log, tmp_path: Path) -> None:
     path = write_flight(tmp_path / "open.mcap", Plan(closed=False))
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 3 // 4])
@@ -107,7 +107,7 @@ def test_for_programs(log: Log, flight: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["info", "report", "export", "recover"])
-def test_a_file_that_is_none_is_one_clear_line(log: Log, tmp_path: Path, command: str) -> None:
+def test_an_invalid_file_gives_one_clear_line(log: Log, tmp_path: Path, command: str) -> None:
     assert log(command, tmp_path / "none.mcap") == (
         2,
         "",
@@ -117,7 +117,7 @@ def test_a_file_that_is_none_is_one_clear_line(log: Log, tmp_path: Path, command
     path.write_bytes(b"RIFF....AVI ")
     ended = log(command, path)
     assert (ended.code, ended.out) == (2, "")
-    assert "is no MCAP file: it begins with b'RIFF....'" in ended.err
+    assert "is not an MCAP file: it begins with b'RIFF....'" in ended.err
 
 
 @pytest.mark.parametrize("command", ["info", "report", "export", "compare", "recover"])
@@ -127,7 +127,7 @@ def test_every_command_has_an_example(log: Log, command: str) -> None:
     assert f"Example: skyloop log {command} " in ended.out
 
 
-def test_without_the_extra_it_is_named(flight: Path) -> None:
+def test_a_missing_extra_is_named(flight: Path) -> None:
     code = "import sys; sys.modules['mcap'] = None; from skyloop.cli import main; main(sys.argv[1:])"
     for words in (["log", "info", str(flight)], ["proxy", f"replay://{flight}"]):
         done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=30)

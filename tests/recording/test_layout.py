@@ -1,4 +1,4 @@
-"""What is in a file, and the way back: times, topics, metadata, samples, schemas."""
+"""The content of a file, encoded and decoded: times, topics, metadata, samples, schemas."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ ALL: dict[str, msgspec.Struct] = {
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_samples_there_and_back(name: str) -> None:
+def test_samples_round_trip(name: str) -> None:
     data = encode(ALL[name])
     assert decode(data, type(ALL[name])) == ALL[name]
     assert isinstance(json.loads(data), dict)
@@ -70,7 +70,7 @@ def test_every_channel_has_a_sample_here() -> None:
     assert {type(sample) for sample in ALL.values()} == set(TYPES.values())
 
 
-def test_keys_are_fields_and_what_is_not_known_is_absent() -> None:
+def test_keys_are_fields_and_unknown_values_are_absent() -> None:
     plain = json.loads(encode(Feedback(captured_ns=1, altitude_m=2.0)))
     assert plain["altitude_m"] == 2.0
     assert plain["failsafe"] == "none"
@@ -89,7 +89,7 @@ def test_numbers_that_are_not_finite_come_back_as_nan(numbers: list[float], nati
     for before, after in zip(numbers, msgspec.structs.astuple(back), strict=True):
         assert after == before if math.isfinite(before) else math.isnan(after)
     feedback = decode(encode(Feedback(captured_ns=1, velocity_m_s=(1.0, math.inf, 0.0), native=dict(native))), Feedback)
-    assert feedback.velocity_m_s is None, "a vector that is not known in one part is not known"
+    assert feedback.velocity_m_s is None, "a vector with an unknown part is unknown"
     assert feedback.native is not None
     assert all(math.isnan(feedback.native[k]) or feedback.native[k] == v for k, v in native.items())  # type: ignore[arg-type]
 
@@ -109,18 +109,18 @@ def test_numbers_that_are_not_finite_come_back_as_nan(numbers: list[float], nati
         (b"7", FrameRecord),
     ],
 )
-def test_what_is_no_sample_is_refused(data: bytes, kind: type[msgspec.Struct]) -> None:
+def test_invalid_samples_are_refused(data: bytes, kind: type[msgspec.Struct]) -> None:
     with pytest.raises(FileFormatError):
         decode(data, kind)
 
 
-def test_fields_of_a_later_version_are_passed_over() -> None:
+def test_fields_of_a_later_version_are_ignored() -> None:
     assert decode(b'{"captured_ns": 3, "colour": "red"}', Feedback) == Feedback(captured_ns=3)
 
 
 # Schemas -------------------------------------------------------------------------------------------------------
 
-#: The only words that the JSON readers of Foxglove and Lichtblick know.
+#: The only keywords known to the JSON readers of Foxglove and Lichtblick.
 SIMPLE = {"boolean", "string", "number", "integer"}
 
 
@@ -138,7 +138,7 @@ def check_viewers_schema(described: dict[str, Any]) -> None:
 
 
 def check_value(value: Any, described: dict[str, Any]) -> None:
-    """Whether a JSON value is as described; null stands for a number."""
+    """Check a JSON value against its schema; null stands for a number."""
     kinds: dict[str, Any] = {
         "boolean": bool,
         "string": str,
@@ -160,14 +160,14 @@ def check_value(value: Any, described: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_samples_are_as_their_schema_says_and_viewers_understand_it(name: str) -> None:
+def test_samples_match_their_schema_and_viewers_understand_it(name: str) -> None:
     described = json.loads(schema(type(ALL[name])))
     check_viewers_schema(described)
     check_value(json.loads(encode(ALL[name])), described)
     assert described["title"] == schema_name(type(ALL[name]))
 
 
-def test_what_is_plotted_is_in_the_schemas() -> None:
+def test_plotted_fields_are_in_the_schemas() -> None:
     def properties(kind: type[msgspec.Struct]) -> dict[str, Any]:
         found: dict[str, Any] = json.loads(schema(kind))["properties"]
         return found
@@ -191,7 +191,7 @@ def test_times_are_mapped_by_one_pair() -> None:
 
 
 @given(st.text(min_size=1, max_size=20), st.text(min_size=1, max_size=20))
-def test_topics_there_and_back(drone: str, camera: str) -> None:
+def test_topics_round_trip(drone: str, camera: str) -> None:
     for channel in Channel:
         topic = Topic(drone, channel, camera if channel is Channel.FRAMES else "")
         assert parse_topic(str(topic)) == topic
@@ -206,7 +206,7 @@ def test_other_topics_are_not_ours(other: str) -> None:
     assert parse_topic(other) is None
 
 
-def test_metadata_there_and_back() -> None:
+def test_metadata_round_trips() -> None:
     able = Capabilities("sim", frozenset({"land", "takeoff"}), (CAMERA,), "a drone")
     start = Start(1, "0.2", (DroneRecord("alpha", "sim://", to_plain(able), -5),), 10, 2, {"quality": 90})
     texts = to_metadata(start)

@@ -1,4 +1,4 @@
-"""Recordings of layout 1, made when feedback's numbers had no units in their names: they open, replay and export."""
+"""Recordings of layout 1, from before feedback's fields had units in their names: they open, replay and export."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def expected(at_ms: int) -> Feedback:
     return Feedback(**fields | {"angular_velocity_rad_s": (0.01, 0.02, 0.03), "acceleration_m_s2": (0.1, 0.2, 9.8)})
 
 
-def test_it_is_of_the_layout_before() -> None:
+def test_it_has_the_previous_layout() -> None:
     start = Recording.open(OLD).start
     assert start.layout == 1 < VERSION
     assert "position" in start.drones[0].capabilities["cameras"][0]
@@ -52,12 +52,12 @@ def test_every_number_of_feedback_is_read() -> None:
     assert recording.damaged == []
 
 
-def test_the_cameras_place_is_read() -> None:
+def test_the_cameras_position_is_read() -> None:
     (camera,) = Recording.open(OLD).drone().described.cameras
     assert camera.position_m == (0.1, 0.02, 0.03)
 
 
-def test_names_of_today_go_before_those_of_layout_1() -> None:
+def test_current_names_take_precedence_over_those_of_layout_1() -> None:
     assert decode(b'{"captured_ns": 1, "yaw": 0.5, "yaw_rad": 0.25}', Feedback).yaw_rad == 0.25
     assert decode(b'{"captured_ns": 1, "yaw": 0.5}', Feedback).yaw_rad == 0.5
     assert decode(encode(expected(500)), Feedback) == expected(500)
@@ -100,5 +100,5 @@ def test_another_layout_is_refused_with_both_numbers(tmp_path: Path, layout: int
         writer.add_metadata(META_CLOCK, to_metadata(ClockPair(1, 2, 3)))
         writer.add_metadata(META_RECORDING, to_metadata(Start(layout, "9.9", (), 2)))
         writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(FileFormatError, match=f"has layout {layout}, and .* reads layouts 1 to {VERSION}"):
+    with pytest.raises(FileFormatError, match=f"has layout {layout}, but .* reads layouts 1 to {VERSION}"):
         Recording.open(path)

@@ -57,7 +57,7 @@ def test_an_episode_lasts_while_the_drone_follows_set_points(recording: Path) ->
     assert episode.action.shape == (len(episode), 4)
 
 
-def test_the_state_is_that_at_the_capture_of_the_picture(recording: Path) -> None:
+def test_the_state_is_taken_at_the_capture_of_the_image(recording: Path) -> None:
     form, (episode,) = cut(recording, fps=7.0)
     for row, captured_ns in enumerate(episode.frames_ns["front"]):
         at_ms = (int(captured_ns) - BEGIN_NS) / MS + 4  # feedback is captured 4 ms before its millisecond
@@ -68,10 +68,10 @@ def test_the_state_is_that_at_the_capture_of_the_picture(recording: Path) -> Non
         least, most = sorted((before.roll_rad, after.roll_rad))
         assert least - 1e-9 <= episode.state[row, form.state.index("roll_rad")] <= most + 1e-9
     yaw = episode.state[:, form.state.index("yaw_rad")]
-    assert np.abs(yaw).max() <= np.pi, "the short way round, also where it wraps"
+    assert np.abs(yaw).max() <= np.pi, "the shorter way, even across the wrap"
 
 
-def test_the_action_is_the_set_point_that_followed_the_picture(recording: Path) -> None:
+def test_the_action_is_the_set_point_that_followed_the_image(recording: Path) -> None:
     _, (episode,) = cut(recording)
     commands = read(recording)["commands"]
     steps = np.arange(len(episode)) * (NS_PER_S // 10)
@@ -82,8 +82,8 @@ def test_the_action_is_the_set_point_that_followed_the_picture(recording: Path) 
         assert episode.action[row, 1] == pytest.approx(commands["asked_left"][newest])
 
 
-def test_a_gap_in_the_pictures_ends_an_episode_and_short_ones_are_left_out(tmp_path: Path) -> None:
-    def hidden(at_ms: int) -> Feedback | None:  # a second in which nothing is known of the drone
+def test_a_gap_in_the_images_ends_an_episode_and_short_ones_are_left_out(tmp_path: Path) -> None:
+    def hidden(at_ms: int) -> Feedback | None:  # a second without feedback
         return feedback_at(PLAN, 4000, 1) if 4000 <= at_ms < 5000 else None
 
     path = write_flight(tmp_path / "gap.mcap", replace(PLAN, extra=hidden))
@@ -94,7 +94,7 @@ def test_a_gap_in_the_pictures_ends_an_episode_and_short_ones_are_left_out(tmp_p
     assert cut(short)[1] == []
 
 
-def test_a_mark_begins_another_episode_whose_task_it_is(recording: Path) -> None:
+def test_a_mark_starts_another_episode_and_names_its_task(recording: Path) -> None:
     found = read(recording)
     form = form_of(found, ["front"], 10.0)
     logs = found["logs"]
@@ -104,7 +104,7 @@ def test_a_mark_begins_another_episode_whose_task_it_is(recording: Path) -> None
     assert first.frames_ns["front"][-1] <= second.frames_ns["front"][0]
 
 
-def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_are_none(recording: Path) -> None:
+def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_do_not_count(recording: Path) -> None:
     found = read(recording)
     form = form_of(found, ["front"], 10.0)
     commands = found["commands"]
@@ -120,7 +120,7 @@ def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_are_none(r
 
 
 def taught(found: dict[str, Table], at_ns: Sequence[int], values: Sequence[str]) -> dict[str, Table]:
-    """Logs of a teacher's answers, and of another array."""
+    """Add logs of a teacher's answers, and of another array."""
     columns = {
         "t_s": np.zeros(len(at_ns) + 1),
         "name": np.array(["other", *["action"] * len(at_ns)]),
@@ -131,7 +131,7 @@ def taught(found: dict[str, Table], at_ns: Sequence[int], values: Sequence[str])
     return {**found, "logs": Table("logs", columns)}
 
 
-def test_actions_that_are_logged_stand_for_what_was_flown(recording: Path) -> None:
+def test_logged_actions_replace_the_flown_ones(recording: Path) -> None:
     found = read(recording)
     form, (flown,) = cut(recording)
     pictures = flown.frames_ns["front"]
@@ -139,7 +139,7 @@ def test_actions_that_are_logged_stand_for_what_was_flown(recording: Path) -> No
     answers = [f"{row} 0.25 -0.5 1" for row in range(len(pictures))]
     (episode,) = episodes(taught(found, pictures[::-1].tolist(), answers[::-1]), form, "")
     assert episode.action.tolist() == [[row, 0.25, -0.5, 1] for row in range(len(pictures))]
-    late = (pictures[:half] + 40 * MS).tolist()  # with the time at which they were computed
+    late = (pictures[:half] + 40 * MS).tolist()  # with their computation time
     (episode,) = episodes(taught(found, late, answers[:half]), form, "")
     assert episode.action[:, 0].tolist() == list(range(half)), "no row without an answer"
     assert (episode.state == flown.state[:half]).all()
@@ -153,7 +153,7 @@ def test_logged_arrays_are_read_with_their_own_time(recording: Path) -> None:
     assert abs(int(logs["at_ns"][0]) - BEGIN_NS - PLAN.seconds / 2 * NS_PER_S) < NS_PER_S
 
 
-def test_what_can_not_be_learnt_from_is_told(tmp_path: Path, recording: Path) -> None:
+def test_unusable_recordings_are_refused(tmp_path: Path, recording: Path) -> None:
     found = read(recording)
     with pytest.raises(FileFormatError, match="no frames of back"):
         form_of(found, ["back"], 10.0)
@@ -162,11 +162,11 @@ def test_what_can_not_be_learnt_from_is_told(tmp_path: Path, recording: Path) ->
     placed = write_flight(tmp_path / "placed.mcap", replace(PLAN, places=True))
     with pytest.raises(UsageError, match="by position set-points"):
         form_of(read(placed), [], 10.0)
-    with pytest.raises(UsageError, match=r"from 0\.5 to 120, not 0"):
+    with pytest.raises(UsageError, match=r"fps is 0 and must be from 0\.5 to 120"):
         export_lerobot([Recording.open(recording)], tmp_path / "a", fps=0)
     with pytest.raises(UnknownNameError, match="beta"):
         export_lerobot([Recording.open(recording)], tmp_path / "a", drone="beta")
-    with pytest.raises(FileFormatError, match="follows set-points for a second"):
+    with pytest.raises(FileFormatError, match="follows set-points for at least a second"):
         export_lerobot([Recording.open(write_flight(tmp_path / "short.mcap", Plan(seconds=1.5)))], tmp_path / "a")
     with pytest.raises(UsageError, match="no recording was given"):
         export_lerobot([], tmp_path / "a")
@@ -179,7 +179,7 @@ def test_what_can_not_be_learnt_from_is_told(tmp_path: Path, recording: Path) ->
         export_lerobot([Recording.open(recording)], tmp_path / "full")
 
 
-def test_recordings_that_do_not_go_together_are_refused(
+def test_recordings_that_do_not_match_are_refused(
     tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tests.support.recorded_flights.action_at", lambda plan, at_ms: Attitude(roll=0.1))
@@ -219,7 +219,7 @@ def test_a_dataset_has_the_files_that_lerobot_reads(tmp_path: Path, recording: P
     assert np.abs(pictures[3][1].astype(int) - picture_at(number)).mean() < 6
 
 
-def test_a_damaged_picture_is_told_and_the_one_before_stands_there(tmp_path: Path) -> None:
+def test_a_damaged_image_is_reported_and_replaced_by_the_one_before(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "bad.mcap", replace(PLAN, packed=lambda n: b"no picture" if n in (30, 31) else None))
     found = export_lerobot([Recording.open(path)], tmp_path / "set")
     assert found.repeated == 2
@@ -237,7 +237,7 @@ def test_without_cameras_there_are_no_videos(tmp_path: Path) -> None:
     assert not (tmp_path / "set" / "videos").exists()
 
 
-def test_options_of_other_forms_are_refused(recording: Path, log: Log) -> None:
+def test_options_of_other_formats_are_refused(recording: Path, log: Log) -> None:
     assert "--fps has no effect on csv" in log("export", str(recording), "--fps", "5").err
     assert (
         "--channel has no effect on lerobot" in log("export", str(recording), "--to", "lerobot", "--channel", "x").err
@@ -247,7 +247,7 @@ def test_options_of_other_forms_are_refused(recording: Path, log: Log) -> None:
     assert "2 cameras were given" in ended.err
 
 
-def test_pyarrow_is_named_where_it_is_missing(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_pyarrow_is_named(tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match="skyloop install parquet"):
         export_lerobot([Recording.open(recording)], tmp_path / "set")

@@ -1,7 +1,7 @@
-"""Every field that a message may leave out is left out once, by introspection, and goes through all that reads it.
+"""Each optional field of every message is left out once, by introspection, and the message passes all its readers.
 
 A field with a default is optional: an older program does not send it, and a vehicle that does not know it leaves it
-out. A new one is tested here without another line.
+out. New fields are tested here without another line.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ CLOCK = ClockPair(BEGIN_NS, UNIX_NS, 1)
 
 
 def variants(full: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """A message as it is, with each of its optional fields absent, and with all of them absent; its parts likewise."""
+    """Yield a message unchanged, without each optional field, and without all of them; its parts likewise."""
     optional = {}
     for field in msgspec.structs.fields(full):
         value = getattr(full, field.name)
@@ -62,7 +62,7 @@ def variants(full: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             optional[field.name] = field.default_factory()
     absent = {name: {name: default} for name, default in optional.items()} | {"all": optional}
     for name, fields in absent.items():
-        with suppress(ValueError):  # a log entry has to have one of its values
+        with suppress(ValueError):  # a log entry needs one of its values
             yield path + name, msgspec.structs.replace(full, **fields)
 
 
@@ -75,7 +75,7 @@ def cases(samples: dict[str, Any]) -> dict[str, Any]:
 
 
 def actions() -> dict[str, AnyAction]:
-    """The fullest sample of each action."""
+    """Return the fullest sample of each action."""
     commands = [one for name, one in SAMPLES.items() if isinstance(one, Command) and "minimal" not in name]
     found = {command.action.name: command.action for command in commands}
     assert {type(action) for action in found.values()} == set(get_args(AnyAction))
@@ -83,7 +83,7 @@ def actions() -> dict[str, AnyAction]:
 
 
 def recorded() -> dict[str, Any]:
-    """A full sample of everything that is recorded."""
+    """Return a full sample of everything recorded."""
     full: dict[str, Any] = {
         name: one for name, one in SAMPLES.items() if type(one) in TYPES.values() and "minimal" not in name
     }
@@ -107,14 +107,14 @@ FILE = cases(recorded())
 
 
 @pytest.mark.parametrize("name", WIRE)
-def test_a_field_that_is_absent_passes_the_wire(name: str) -> None:
+def test_an_absent_field_passes_the_wire(name: str) -> None:
     sample: Sample = WIRE[name]
     again = decode(encode(sample))
     assert encode(again) == encode(sample)
 
 
 def shifted(sample: Any) -> Any:
-    """The sample with its own times within the recording."""
+    """Return the sample with times within the recording."""
     names = ("captured_ns", "published_ns", "at_ns", "applied_ns", "sent_ns", "made_ns")
     times = {name: BEGIN_NS + 1 for name in names if getattr(sample, name, None)}
     if isinstance(sample, FrameRecord):
@@ -123,7 +123,7 @@ def shifted(sample: Any) -> Any:
 
 
 def write(path: Path, sample: Any) -> Recording:
-    """A recording of a state, the sample, and two more states."""
+    """Write a recording of a state, the sample, and two more states."""
     clock_ns = BEGIN_NS
     translator = Translator("alpha", CAPABILITIES, CLOCK)
     file = RecordingFile(path, Start(layout.VERSION, "0.1", (record(),), UNIX_NS), CLOCK)
@@ -154,14 +154,14 @@ def jpeg() -> bytes:
 
 
 @pytest.mark.parametrize("name", FILE)
-def test_a_field_that_is_absent_is_recorded_replayed_and_exported(name: str, tmp_path: Path) -> None:
-    """Issue 28, C1: the replay of a flight with "Fly there" ended in a TypeError about a yaw of None."""
+def test_an_absent_field_is_recorded_replayed_and_exported(name: str, tmp_path: Path) -> None:
+    """The replay of a flight with "Fly there" ended in a TypeError about a yaw of None."""
     sample = FILE[name]
     recording = write(tmp_path / "flight.mcap", sample)
     assert not recording.cut
     for item in recording.items("alpha"):
         if type(item.value) is type(sample) and not isinstance(sample, Feedback):
-            assert layout.encode(item.value) == layout.encode(shifted(sample)), "what is read is what was written"
+            assert layout.encode(item.value) == layout.encode(shifted(sample)), "the sample reads back unchanged"
     sink = RecordingSink()
     clock = ManualClock(BEGIN_NS)
     player = StepPlayer(ReplaySource(recording, recording.drone("alpha")), sink, clock, Playback(1.0, in_step=True))
@@ -171,7 +171,7 @@ def test_a_field_that_is_absent_is_recorded_replayed_and_exported(name: str, tmp
         player.step()
     assert sink.link_state is LinkState.CLOSED
     assert not sink.problems
-    for feedback in sink.feedbacks:  # as the replay's own recording and the page have it
+    for feedback in sink.feedbacks:  # as for the replay's own recording and the page
         assert layout.decode(layout.encode(feedback), Feedback).captured_ns == feedback.captured_ns
         json.dumps([feedback_values(feedback, clock()), flat_values(feedback, {}, None)], allow_nan=False)
     if isinstance(sample, Applied):

@@ -1,4 +1,4 @@
-"""One file: what was committed stays readable."""
+"""One file: committed data stays readable."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_file_has_its_metadata_schemas_times_and_summary(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("room", [0, 1, 900, 5000])
-def test_a_full_disk_leaves_what_was_committed(tmp_path: Path, room: int) -> None:
+def test_a_full_disk_leaves_the_committed_data(tmp_path: Path, room: int) -> None:
     disk = Disk()
     file = opened(tmp_path, disk)
     for number in range(3):
@@ -74,7 +74,7 @@ def test_a_disk_that_is_full_at_once_leaves_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_overwritten_unless_it_may_be(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_without_permission(tmp_path: Path) -> None:
     (tmp_path / "f.mcap").write_text("precious")
     with pytest.raises(FileExistsError):
         opened(tmp_path, Disk())

@@ -1,4 +1,4 @@
-"""The recorder as a process of its own, beside real proxies."""
+"""The recorder in its own process, beside real proxies."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Proxy = Callable[..., Process]
 
 @pytest.fixture(autouse=True)
 def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A directory of sockets for this test alone; with a short path, as those of sockets must be."""
+    """A socket directory for this test alone, with a short path, as sockets require."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
         yield
@@ -102,7 +102,7 @@ def test_a_flight_is_recorded_and_the_file_is_complete(tmp_path: Path) -> None:
     assert all(0 < frame.received_ns - frame.header.captured_ns < 2e9 for frame in frames)
 
 
-def test_a_recorder_that_is_killed_is_told_and_the_flight_goes_on(tmp_path: Path) -> None:
+def test_a_killed_recorder_is_reported_and_the_flight_continues(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     events: list[Event] = []
     with skyloop.connect(SIM, on_exit="hover") as drone, drone.on_event(events.append):
@@ -145,7 +145,7 @@ def test_when_the_application_is_killed_the_file_is_closed(
     files.until(lambda: files.is_complete(path), "the file is complete")
 
 
-def test_what_the_child_can_not_do_is_raised_here(proxy: Proxy, tmp_path: Path) -> None:
+def test_errors_of_the_child_are_raised_here(proxy: Proxy, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no proxy named 'nobody'"):
         skyloop.record("nobody", tmp_path / "f.mcap")
     proxy()
@@ -155,13 +155,13 @@ def test_what_the_child_can_not_do_is_raised_here(proxy: Proxy, tmp_path: Path) 
         skyloop.record("alpha", tmp_path / "f.mcap", min_free_mb=1e9)
 
 
-def test_a_child_that_ends_at_once_is_told(proxy: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_child_that_ends_at_once_is_reported(proxy: Proxy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/bin/false")
     with pytest.raises(LinkError, match="ended with exit code 1"):
         skyloop.record("alpha", tmp_path / "f.mcap")
 
 
-def test_a_recorder_that_is_told_to_end_closes_its_file(proxy: Proxy, tmp_path: Path) -> None:
+def test_a_terminated_recorder_closes_its_file(proxy: Proxy, tmp_path: Path) -> None:
     proxy()
     with skyloop.record("alpha", tmp_path / "f.mcap", min_free_mb=0) as recorder:
         os.kill(pid(recorder), signal.SIGTERM)
@@ -170,7 +170,7 @@ def test_a_recorder_that_is_told_to_end_closes_its_file(proxy: Proxy, tmp_path: 
     assert recorder.path == tmp_path / "f.mcap"
 
 
-def test_two_drones_and_a_proxy_that_comes_back(proxy: Proxy, tmp_path: Path) -> None:
+def test_two_drones_and_a_returning_proxy(proxy: Proxy, tmp_path: Path) -> None:
     path = tmp_path / "both.mcap"
     proxy("beta")
     first = proxy("alpha")
@@ -230,6 +230,6 @@ def test_a_disk_that_is_really_full(small_disk: Path) -> None:
     commands = [
         one.sequence for one in (*files.of(first, topic[:-8] + "commands"), *files.of(second, topic[:-8] + "commands"))
     ]
-    assert sorted(set(commands)) == commands, "none is there twice"
+    assert sorted(set(commands)) == commands, "none appears twice"
     missing = commands[-1] - commands[0] + 1 - len(commands)
-    assert missing <= superseded, "none is missing but what was never applied: a newer one took its place"
+    assert missing <= superseded, "only commands never applied are missing: newer ones replaced them"

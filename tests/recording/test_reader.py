@@ -1,4 +1,4 @@
-"""Recordings are read whole, cut off and damaged; what is none is refused with words."""
+"""Recordings are read whole, truncated and damaged; other files are refused with a reason."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def counts(path: Path) -> Counter[str]:
     return Counter(item.channel.value for item in recording.items(recording.drones[0].name))
 
 
-def test_what_it_is(flight: Path) -> None:
+def test_properties(flight: Path) -> None:
     recording = Recording.open(flight)
     assert [drone.name for drone in recording.drones] == ["alpha"]
     assert recording.drone().described.vehicle == "sim"
@@ -54,7 +54,7 @@ def test_what_it_is(flight: Path) -> None:
     assert {series.schema for series in recording.series if series.own is None} == {"foxglove.CompressedImage"}
 
 
-def test_samples_come_in_order_and_typed(flight: Path) -> None:
+def test_samples_are_in_order_and_typed(flight: Path) -> None:
     recording = Recording.open(flight)
     items = list(recording.items("alpha"))
     times = [item.entry.log_ns for item in items]
@@ -68,7 +68,7 @@ def test_samples_come_in_order_and_typed(flight: Path) -> None:
     assert list(recording.items("beta")) == []
 
 
-def test_progress_is_told(flight: Path) -> None:
+def test_progress_is_reported(flight: Path) -> None:
     told: list[float] = []
     for _ in Recording.open(flight).entries(progress=told.append):
         pass
@@ -77,7 +77,7 @@ def test_progress_is_told(flight: Path) -> None:
 
 
 @pytest.mark.parametrize("png", [True, False])
-def test_pictures_are_decoded(tmp_path: Path, png: bool) -> None:
+def test_images_are_decoded(tmp_path: Path, png: bool) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(png=png, seconds=0.5))
     pictures = list(Recording.open(path).pictures("alpha", "front"))
     assert [picture.header.seq for picture in pictures] == [1, 2, 3, 4, 5]
@@ -90,13 +90,13 @@ def test_pictures_are_decoded(tmp_path: Path, png: bool) -> None:
         assert np.array_equal(picture.pixels(), pixels)
 
 
-def test_pictures_and_samples_together(flight: Path) -> None:
+def test_images_and_samples_together(flight: Path) -> None:
     found = list(Recording.open(flight).items_and_pictures("alpha", (Channel.FRAMES, Channel.EVENTS)))
     assert sum(isinstance(one, Picture) for one in found) == 20
     assert {one.channel for one in found if isinstance(one, Item)} == {Channel.EVENTS}
 
 
-def test_unknown_names_are_told(flight: Path) -> None:
+def test_unknown_names_are_reported(flight: Path) -> None:
     recording = Recording.open(flight)
     with pytest.raises(UnknownNameError, match="did you mean 'alpha'"):
         recording.drone("alfa")
@@ -104,11 +104,11 @@ def test_unknown_names_are_told(flight: Path) -> None:
         next(recording.pictures("alpha", "sideways"))
 
 
-# What is no whole recording ----------------------------------------------------------------------------------------
+# Incomplete and damaged files --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_a_file_that_was_cut_is_read_as_far_as_it_goes(tmp_path: Path, compression: CompressionType) -> None:
+def test_a_truncated_file_is_read_to_its_end(tmp_path: Path, compression: CompressionType) -> None:
     whole = write_flight(tmp_path / "whole.mcap", Plan(compression=compression, chunk_size=4096))
     last = Recording.open(whole).found.pieces[-1]
     data = whole.read_bytes()[: last.offset + last.size]
@@ -125,7 +125,7 @@ def test_a_file_that_was_cut_is_read_as_far_as_it_goes(tmp_path: Path, compressi
         before = seen
 
 
-def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+def test_a_damaged_chunk_is_skipped(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
     whole = sum(counts(path).values())
     piece = Recording.open(path).found.pieces[2]
@@ -140,7 +140,7 @@ def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_no_damage_does_more_than_leave_something_out(
+def test_damage_only_removes_samples(
     tmp_path_factory: pytest.TempPathFactory, flight: Path, data: st.DataObject
 ) -> None:
     content = bytearray(flight.read_bytes())
@@ -155,7 +155,7 @@ def test_no_damage_does_more_than_leave_something_out(
                 one.pixels()
 
 
-def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path) -> None:
+def test_other_files_are_refused_with_a_reason(tmp_path: Path, flight: Path) -> None:
     path = tmp_path / "x.mcap"
     with pytest.raises(UsageError, match="No such file"):
         Recording.open(path)
@@ -163,7 +163,7 @@ def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path
     with pytest.raises(FileFormatError, match="is empty"):
         Recording.open(path)
     path.write_bytes(b"\x00\x00\x00\x18ftypmp42")
-    with pytest.raises(FileFormatError, match="is no MCAP file: it begins with"):
+    with pytest.raises(FileFormatError, match="is not an MCAP file: it begins with"):
         Recording.open(path)
     path.write_bytes(flight.read_bytes()[:20])
     with pytest.raises(FileFormatError, match="ends before its first sample"):
@@ -173,13 +173,13 @@ def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path
         writer.start()
         writer.register_channel("/camera", "json", writer.register_schema("x", "jsonschema", b"{}"))
         writer.finish()  # type: ignore[no-untyped-call]
-    with pytest.raises(FileFormatError, match=r"no recording of Skyloop's \(its topics: /camera\)"):
+    with pytest.raises(FileFormatError, match=r"not a Skyloop recording \(its topics: /camera\)"):
         Recording.open(path)
     with pytest.raises(UsageError, match="Is a directory"):
         Recording.open(tmp_path)
 
 
-def test_messages_outside_of_chunks_are_read(tmp_path: Path, flight: Path) -> None:
+def test_messages_outside_chunks_are_read(tmp_path: Path, flight: Path) -> None:
     source = Recording.open(flight)
     path = tmp_path / "flat.mcap"
     with path.open("wb") as file:
@@ -195,7 +195,7 @@ def test_messages_outside_of_chunks_are_read(tmp_path: Path, flight: Path) -> No
     assert counts(path) == {"feedback": counts(flight)["feedback"]}
 
 
-def test_a_message_that_is_not_what_it_should_be_is_counted(tmp_path: Path, flight: Path) -> None:
+def test_a_malformed_message_is_counted(tmp_path: Path, flight: Path) -> None:
     path = tmp_path / "flat.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
@@ -212,7 +212,7 @@ def test_a_message_that_is_not_what_it_should_be_is_counted(tmp_path: Path, flig
     assert len(recording.damaged) == 2
 
 
-def test_pictures_that_are_none() -> None:
+def test_invalid_images() -> None:
     with pytest.raises(FileFormatError, match="frame 3 can't be decoded"):
         decode_image(b"\xff\xd8nonsense", "frame 3", grey=False)
     with pytest.raises(FileFormatError, match="can't be decoded"):
@@ -226,7 +226,7 @@ def feedback(ms: int) -> Feedback:
     return Feedback(captured_ns=ms * 1_000_000 - 5, published_ns=ms * 1_000_000)
 
 
-def test_a_course_never_goes_back_and_is_not_led_astray() -> None:
+def test_a_course_never_runs_backwards_and_ignores_wrong_times() -> None:
     course = Course()
     parameter = Parameter("a", ParameterType.FLOAT, 1.0)
     assert reported_ns(parameter) is None
@@ -237,8 +237,8 @@ def test_a_course_never_goes_back_and_is_not_led_astray() -> None:
     assert course.first_ns == 1_000_000_000
 
 
-def test_a_course_goes_on_when_the_proxys_computer_starts_again() -> None:
-    """Its clock begins anew: the rest of the flight had no time, and 60 s were a point."""
+def test_a_course_continues_when_the_proxys_computer_reboots() -> None:
+    """Its clock restarts: the rest of the flight had no time, and 60 s became a point."""
     course = Course()
     flight = [(10**8 + 20 * step, 20 * step) for step in range(100)]
     flight += [(30_000 + 20 * step, 62_000 + 20 * step) for step in range(100)]  # 60 s later by the recorder's clock
@@ -251,10 +251,10 @@ def test_a_course_goes_on_when_the_proxys_computer_starts_again() -> None:
     assert late.captured_ns == late.published_ns - 5
 
 
-def test_a_flight_whose_proxy_started_again_is_replayed_and_exported_whole(
+def test_a_flight_whose_proxy_rebooted_is_replayed_and_exported_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.support.recorded_flights._events", lambda *_: iter(()))  # whose clock is the first one
+    monkeypatch.setattr("tests.support.recorded_flights._events", lambda *_: iter(()))  # their clock is the first one
 
     def after(at_ms: int) -> Feedback | None:
         if at_ms < 1000:
@@ -276,10 +276,10 @@ def test_a_flight_whose_proxy_started_again_is_replayed_and_exported_whole(
     assert moment.state.published_ns == pytest.approx(source.first_ns + 1500 * MS, abs=25 * MS)
     played = [one.value.published_ns for one in source.samples() if isinstance(one.value, Feedback)]
     steps = [(after - before) / MS for before, after in pairwise(played)]
-    assert sum(abs(step - 20) > 1 for step in steps) <= 2, "but for the one sample at the change"
+    assert sum(abs(step - 20) > 1 for step in steps) <= 2, "except for the one sample at the change"
 
 
-def test_times_of_applications_do_not_set_the_clock_anew() -> None:
+def test_times_of_applications_do_not_restart_the_clock() -> None:
     course = Course()
     assert course.follow(feedback(10**6)) == 10**12
     for _ in range(5):
@@ -288,13 +288,13 @@ def test_times_of_applications_do_not_set_the_clock_anew() -> None:
         assert course.follow(feedback(10**6)) == 10**12
 
 
-def test_a_course_goes_on_after_a_long_pause() -> None:
+def test_a_course_continues_after_a_long_pause() -> None:
     course = Course()
     hours = 5 * 3600 * 1000
     steps = [feedback(1000), feedback(hours), feedback(hours + 20), feedback(hours + 40)]
     assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1000, hours + 20, hours + 40]
 
 
-def test_image_topics_are_those_of_the_layout(flight: Path) -> None:
+def test_image_topics_match_the_layout(flight: Path) -> None:
     entries = list(Recording.open(flight).entries({image_topic("alpha", "front")}))
     assert [entry.sequence for entry in entries] == list(range(1, 21))

@@ -1,4 +1,4 @@
-"""``skyloop log recover``: what can be read is saved, with an index; the damaged file is left alone."""
+"""``skyloop log recover``: readable data is saved with an index; the damaged file stays unchanged."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def samples(path: Path) -> list[tuple[str, int, bytes]]:
     return [(entry.topic, entry.log_ns, entry.data) for entry in Recording.open(path).entries()]
 
 
-def test_everything_that_can_be_read_is_saved(log: Log, cut: Path) -> None:
+def test_everything_readable_is_saved(log: Log, cut: Path) -> None:
     before = cut.read_bytes()
     readable = samples(cut)
     ended = log("recover", cut)
@@ -47,7 +47,7 @@ def test_everything_that_can_be_read_is_saved(log: Log, cut: Path) -> None:
     assert recording.cut == ""
     assert sorted(samples(mended)) == sorted(readable)
     assert len(list(recording.pictures("alpha", "front"))) >= 10
-    with mended.open("rb") as file:  # others find their way in it by its index
+    with mended.open("rb") as file:  # other programs navigate by its index
         summary = make_reader(file).get_summary()
     assert summary is not None
     assert summary.statistics is not None
@@ -55,7 +55,7 @@ def test_everything_that_can_be_read_is_saved(log: Log, cut: Path) -> None:
     assert summary.chunk_indexes
 
 
-def test_what_is_damaged_in_the_middle_is_left_out(tmp_path: Path) -> None:
+def test_damage_in_the_middle_is_left_out(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
     whole = len(samples(path))
     piece = Recording.open(path).found.pieces[1]
@@ -95,11 +95,11 @@ def test_nothing_is_overwritten(log: Log, cut: Path, tmp_path: Path) -> None:
     target.write_text("mine")
     ended = log("recover", cut, "-o", target)
     assert ended.code == 2
-    assert "exists already: choose another name" in ended.err
+    assert "already exists: choose another name" in ended.err
     assert target.read_text() == "mine"
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_where_it_can_not_be_written_it_says_so(cut: Path, tmp_path: Path) -> None:
+def test_an_unwritable_target_is_reported(cut: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="No such file or directory"):
         recover(Recording.open(cut), tmp_path / "nowhere" / "x.mcap")

@@ -1,4 +1,4 @@
-"""Replays through proxy and client: in step with one application, and served like any other vehicle."""
+"""Replays through proxy and client: in step with one application, and served like any vehicle."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WAIT_S = 10.0
 
 
 class Steering(skyloop.Controller):
-    """Flies by what it sees; notes what it is called with and what is made of its commands."""
+    """Flies by the frames; records its calls and the fate of its commands."""
 
     gain = 1.0
 
@@ -87,7 +87,7 @@ def test_every_frame_is_delivered_and_two_runs_give_the_same_commands(flight: Pa
     assert flown(flight, Bolder).applied != runs[0].applied
 
 
-def test_the_time_is_that_of_the_recording(flight: Path) -> None:
+def test_the_time_is_the_recordings(flight: Path) -> None:
     controller = flown(flight)
     assert controller.ages_ms == pytest.approx([30.0] * 20, abs=0.1)
     assert controller.feedback[0] <= BEGIN_NS
@@ -95,11 +95,11 @@ def test_the_time_is_that_of_the_recording(flight: Path) -> None:
     times = [one.applied_ns for one in controller.applied]
     assert times == sorted(times)
     assert BEGIN_NS <= times[0] < times[-1] <= BEGIN_NS + 2000 * MS
-    # A set-point is repeated at 32 Hz between the frames that change it, and no command is delayed by anything.
+    # A set-point repeats at 32 Hz between the frames that change it, and nothing delays a command.
     assert all(one.applied_ns == one.sent_ns for one in controller.applied)
 
 
-def test_waiting_makes_the_time_go_on(flight: Path) -> None:
+def test_waiting_advances_the_time(flight: Path) -> None:
     with skyloop.connect(f"replay://{flight}?speed=max", on_exit="hover") as drone:
         assert drone.feedback().state == "landed"
         assert drone.wait("flying", timeout_s=5.0).captured_ns == BEGIN_NS + 496 * MS
@@ -110,7 +110,7 @@ def test_waiting_makes_the_time_go_on(flight: Path) -> None:
         assert [next(frames).seq - first.seq for _ in range(3)] == [1, 2, 3]
         assert drone.next_feedback().captured_ns > before
         time.sleep(0.05)  # no time passes meanwhile
-        assert drone.next_frame().seq == first.seq + 3  # the newest, and not read by this before
+        assert drone.next_frame().seq == first.seq + 3  # the newest one not read yet
         assert drone.next_frame().seq == first.seq + 4
         with pytest.raises(NoAnswerError, match=r"not emergency within 0\.2 s"):
             drone.wait("emergency", timeout_s=0.2)
@@ -121,12 +121,12 @@ def test_waiting_makes_the_time_go_on(flight: Path) -> None:
         drone.frame()
         drone.next_frame()  # the last one
         with pytest.raises(NoAnswerError):
-            drone.next_frame(timeout_s=30.0)  # none comes after the end, and nobody waits for 30 s to learn it
+            drone.next_frame(timeout_s=30.0)  # none arrives after the end, and the call does not wait 30 s to find out
         assert drone.link.vehicle == "closed"
         assert "end of the recording" in drone.link.reason
 
 
-def test_takeoff_is_when_it_took_off(flight: Path) -> None:
+def test_takeoff_returns_at_the_recorded_take_off(flight: Path) -> None:
     with skyloop.connect(f"replay://{flight}?speed=max", on_exit="hover") as drone:
         drone.takeoff()
         assert drone.feedback().state == "flying"
@@ -157,7 +157,7 @@ def test_listeners_and_processors_are_in_step_too(flight: Path) -> None:
     assert any(event.text.startswith("recorded: ") for event in events)
 
 
-def test_parameters_are_asked_for_as_ever(flight: Path) -> None:
+def test_parameters_can_be_requested_as_usual(flight: Path) -> None:
     with skyloop.connect(f"replay://{flight}?speed=max", on_exit="hover") as drone:
         drone.config["limits.speed"] = 0.1
         drone.wait("flying", timeout_s=5.0)
@@ -183,14 +183,14 @@ def test_a_set_point_decays_in_the_recordings_time(flight: Path) -> None:
     assert 0.3 <= (hover_ns - begun_ns) / 1e9 < 0.36
 
 
-def test_it_is_of_one_application_alone(flight: Path) -> None:
+def test_it_belongs_to_one_application(flight: Path) -> None:
     way = connector(f"replay://{flight}?speed=max")
     assert isinstance(way, SteppedReplay)
     dial = way.dialer(0.0)
     try:
         with (
             open_drone(dial, app="first", scheduler=way.scheduler, on_exit="hover"),
-            pytest.raises(LinkError, match="in step with one application, and that one is connected"),
+            pytest.raises(LinkError, match="in step with one application, which is already connected"),
         ):
             open_drone(dial, app="second", timeout_s=0.5)
     finally:
@@ -200,11 +200,11 @@ def test_it_is_of_one_application_alone(flight: Path) -> None:
         open_drone(dial, app="late", timeout_s=0.5)
 
 
-def test_other_speeds_take_the_ordinary_way(flight: Path) -> None:
+def test_other_speeds_use_an_ordinary_proxy(flight: Path) -> None:
     assert connector(f"replay://{flight}?speed=3") is None
 
 
-def test_what_is_wrong_is_told_when_connecting(tmp_path: Path, flight: Path) -> None:
+def test_errors_are_reported_when_connecting(tmp_path: Path, flight: Path) -> None:
     before = threading.active_count()
     with pytest.raises(UsageError, match="No such file"):
         skyloop.connect(f"replay://{tmp_path}/none.mcap?speed=max")
@@ -213,7 +213,7 @@ def test_what_is_wrong_is_told_when_connecting(tmp_path: Path, flight: Path) -> 
     assert threading.active_count() == before
 
 
-def test_an_exception_in_a_controller_comes_out(flight: Path) -> None:
+def test_an_exception_in_a_controller_propagates(flight: Path) -> None:
     class Wrong(skyloop.Controller):
         def on_frame(self, frame: skyloop.Frame) -> None:
             raise ZeroDivisionError("a mistake")
@@ -227,7 +227,7 @@ def test_an_exception_in_a_controller_comes_out(flight: Path) -> None:
     assert threading.active_count() == before
 
 
-def test_what_a_predicate_raises_comes_out(flight: Path) -> None:
+def test_an_exception_in_a_predicate_propagates(flight: Path) -> None:
     def wrong(feedback: Feedback) -> bool:
         if feedback.state == "flying":
             raise ZeroDivisionError("a mistake")
@@ -240,7 +240,7 @@ def test_what_a_predicate_raises_comes_out(flight: Path) -> None:
         drone.wait(wrong, timeout_s=5.0)
 
 
-def test_another_thread_may_wait_as_well(flight: Path) -> None:
+def test_another_thread_can_wait_too(flight: Path) -> None:
     with skyloop.connect(f"replay://{flight}?speed=max", on_exit="hover") as drone:
         states: list[str] = []
         waiting = threading.Event()
@@ -279,7 +279,7 @@ def test_ctrl_c_ends_the_waiting(flight: Path) -> None:
         sent: list[Feedback] = []
         with pytest.raises(KeyboardInterrupt):
             drone.wait(interrupt, timeout_s=1e6)
-        assert drone.next_feedback()  # and it goes on
+        assert drone.next_feedback()  # it continues
 
 
 # Recording a replay ------------------------------------------------------------------------------------------------
@@ -298,25 +298,25 @@ def test_a_replay_is_recorded_beside_the_old_commands_and_compared(tmp_path: Pat
     first, second, bolder = recorded
     events = [item.value for item in first.items("flight", (Channel.EVENTS,))]
     assert EventKind.RECORDING in {event.kind for event in events}
-    assert all(abs(event.at_ns - BEGIN_NS) < 60 * NS_PER_S for event in events)  # the flight's time, the recorder's too
+    assert all(abs(event.at_ns - BEGIN_NS) < 60 * NS_PER_S for event in events)  # the flight's time
     commands = [item.value for item in first.items("flight", (Channel.COMMANDS,))]
     assert any(isinstance(one.asked, Velocity) for one in commands)
     old = {item.value.native.get("replay.asked") for item in first.items("flight", (Channel.FEEDBACK,))}
     assert {"takeoff", "velocity", "land"} <= old
     same = compare(first, second)
-    assert same.aligned.startswith("by their clock")
+    assert same.aligned.startswith("by their common clock")
     assert same.part_at_s is None
     assert same.same_action == 1.0
     assert all(field.rms == 0.0 for field in same.fields)
     other = compare(first, bolder)
     assert other.part_at_s == pytest.approx(0.5, abs=0.15)
     assert max(field.rms for field in other.fields) > 0.1
-    assert compare(Recording.open(flight), first).aligned.startswith("by their clock")
+    assert compare(Recording.open(flight), first).aligned.startswith("by their common clock")
     # And a recording of a replay is a recording: it can be replayed itself.
     assert len(flown(tmp_path / "0.mcap").frames) >= 15
 
 
-# Served to everybody -----------------------------------------------------------------------------------------------
+# Served to all applications ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -347,13 +347,13 @@ def test_a_replay_is_a_vehicle_like_any_other(served: MemoryServer) -> None:
         assert drone.link.application != "lost"
 
 
-def test_max_is_not_for_everybody(flight: Path) -> None:
+def test_max_speed_is_only_for_one_application(flight: Path) -> None:
     driver = ReplayDriver(parse_uri(f"replay://{flight}?speed=max"))
     with pytest.raises(UsageError, match="in step with one application"):
         Proxy(driver, MemoryServer("alpha"), name="alpha").start()
 
 
-def test_a_replay_of_what_can_not_fly(tmp_path: Path) -> None:
+def test_a_replay_of_a_vehicle_that_can_not_fly(tmp_path: Path) -> None:
     plain = msgspec.structs.replace(CAPABILITIES, actions=frozenset(), why_not="it is a picture only")
     path = write_flight(tmp_path / "plain.mcap", Plan(seconds=0.5, capabilities=plain))
     with skyloop.connect(f"replay://{path}?speed=max") as drone, pytest.raises(UnsupportedError, match="picture only"):

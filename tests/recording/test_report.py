@@ -1,4 +1,4 @@
-"""``skyloop log report``: one page that shows the flight and needs nothing else."""
+"""``skyloop log report``: one self-contained page that shows the flight."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Log = Callable[..., Ended]
 
 
 class Checker(HTMLParser):
-    """Notes tags, and complains of what is not closed in order."""
+    """Records tags, and reports those not closed in order."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ def page(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     return path.read_text()
 
 
-def test_it_is_one_whole_page(page: str) -> None:
+def test_it_is_one_complete_page(page: str) -> None:
     tags = checked(page).tags
     assert not re.search(r"(?:src|href)=\"(?!data:)", page)
     assert "@import" not in page
@@ -133,7 +133,7 @@ def test_the_command(log: Log, flight: Path, tmp_path: Path) -> None:
     assert "did you mean 'alpha'" in log("report", flight, "--drone", "alhpa").err
 
 
-def test_a_recording_of_pictures_alone_and_one_of_nothing_known(tmp_path: Path) -> None:
+def test_a_recording_of_only_images_and_one_without_known_values(tmp_path: Path) -> None:
     def blind(at_ms: int) -> Feedback:
         return Feedback(captured_ns=feedback_at(Plan(), at_ms, 1).captured_ns, published_ns=0)
 
@@ -162,7 +162,7 @@ def test_names_do_no_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node to check the page's script")
-def test_the_script_is_one(tmp_path: Path) -> None:
+def test_the_script_is_valid(tmp_path: Path) -> None:
     script = Path(charts.__file__).parent / "static" / "page.js"
     node = shutil.which("node")
     assert node is not None
@@ -194,7 +194,7 @@ def test_thinning_keeps_the_extremes(values: list[float], buckets: int) -> None:
         assert np.nanmin(thin) == np.nanmin(numbers)
 
 
-def test_lines_have_gaps_where_nothing_is_known() -> None:
+def test_lines_have_gaps_at_unknown_values() -> None:
     t_s = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 5.0, 5.1])
     values = np.array([1.0, 2.0, math.nan, 3.0, 4.0, 5.0, 6.0])
     assert [part[1].tolist() for part in charts.pieces(t_s, values)] == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
@@ -209,7 +209,7 @@ def test_limits() -> None:
     assert charts.limits([], least_span=1.0) == (0.0, 1.0)
 
 
-def test_key_frames_are_at_events_and_in_between() -> None:
+def test_key_frames_are_at_events_and_between_them() -> None:
     events = Table(
         "events",
         {
@@ -232,7 +232,7 @@ def test_key_frames_are_at_events_and_in_between() -> None:
     assert facts.moments(0.0, 10.0, events, 0) == []
 
 
-def test_the_way_without_a_position() -> None:
+def test_the_path_without_a_position() -> None:
     t_s = np.arange(0.0, 2.0, 0.1)
     columns = {"t_s": t_s, "velocity_forward_m_s": np.full(20, 0.5), "velocity_left_m_s": np.zeros(20)}
     columns["yaw_rad"] = np.full(20, math.pi / 2)
@@ -256,7 +256,7 @@ def test_stretches_of_one_name() -> None:
     assert spans(np.zeros(0), np.array([], dtype=np.str_), {}, 1.0) == []
 
 
-def test_without_a_picture_decoder_thumbnails_are_as_recorded(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_image_decoder_thumbnails_are_as_recorded(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     picture = next(Recording.open(flight).pictures("alpha", "front"))
     monkeypatch.setitem(sys.modules, "cv2", None)

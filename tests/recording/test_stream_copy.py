@@ -1,4 +1,4 @@
-"""MP4 by copying: what is shown is what was recorded, bit by bit, and nothing that can't be shown is copied."""
+"""MP4 by copying: the video shows the recorded images bit by bit, and nothing undecodable is copied."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def exported(folder: Path, stream: Sequence[Unit], **options: Any) -> Videos:
 
 
 def shown(path: Path) -> dict[int, Image]:
-    """The images of a video, by how many of the recording's steps after the first they are shown."""
+    """Return a video's images by number of recording steps after the first."""
     with av.open(str(path)) as container:
         frames = list(container.decode(video=0))
         times = [float(frame.pts * frame.time_base) / STEP_S for frame in frames]  # type: ignore[operator]
@@ -43,22 +43,22 @@ def shown(path: Path) -> dict[int, Image]:
 
 
 def recorded(folder: Path) -> dict[int, Image]:
-    """The images of the recording, by their number; those that can't be decoded are left out."""
+    """Return the recording's decodable images by number."""
     pictures = Recording.open(folder / "flight.mcap").pictures("alpha", "front")
     return {picture.header.seq: picture.pixels() for picture in pictures if picture.can_be_decoded}
 
 
 def assert_shows(path: Path, expected: dict[int, Image]) -> None:
-    """The video shows these images, counted from the first one's number on."""
+    """Assert that the video shows these images, counted from the first one's number."""
     found, first = shown(path), min(expected)
     assert {first + number for number in found} == set(expected)
     assert all(np.array_equal(image, expected[first + number]) for number, image in found.items())
 
 
-# What is copied ------------------------------------------------------------------------------------------------------
+# Copying -------------------------------------------------------------------------------------------------------------
 
 
-def test_every_picture_is_shown_as_it_was_recorded_at_its_time(tmp_path: Path) -> None:
+def test_every_image_is_shown_as_recorded_at_its_time(tmp_path: Path) -> None:
     found = exported(tmp_path, film())
     assert (found.frames, found.left_out) == (20, 0)
     (video,) = found.videos
@@ -77,7 +77,7 @@ def test_every_picture_is_shown_as_it_was_recorded_at_its_time(tmp_path: Path) -
     assert packets[-1].duration == pytest.approx(1 / 30 / float(packets[-1].time_base), rel=0.01)
 
 
-def test_a_gap_leaves_the_last_picture_standing_up_to_the_next_key(tmp_path: Path) -> None:
+def test_a_gap_shows_the_last_image_up_to_the_next_key_frame(tmp_path: Path) -> None:
     stream = [unit for unit in film() if unit.number not in (8, 9)]  # of the group 6 to 10
     found = exported(tmp_path, stream)
     assert (found.frames, found.left_out) == (17, 1)
@@ -85,41 +85,41 @@ def test_a_gap_leaves_the_last_picture_standing_up_to_the_next_key(tmp_path: Pat
     assert set(shown(tmp_path / "front.mp4")) == {n - 1 for n in range(1, 21) if n not in (8, 9, 10)}
 
 
-def test_a_recording_that_begins_between_two_keys_begins_with_the_next(tmp_path: Path) -> None:
+def test_a_recording_from_between_two_key_frames_starts_with_the_next(tmp_path: Path) -> None:
     found = exported(tmp_path, film()[2:])
     assert (found.frames, found.left_out) == (15, 3)
     assert_shows(tmp_path / "front.mp4", recorded(tmp_path))
 
 
 @pytest.mark.parametrize("spoilt", [b"", b"\0\0\0\1", b"\0\0\1\x67\x42", b"no H.264 at all", b"\0\0\1\x09\x10"])
-def test_a_key_without_parameters_or_picture_is_left_out_with_what_builds_on_it(tmp_path: Path, spoilt: bytes) -> None:
+def test_a_key_frame_without_parameters_or_image_is_left_out_with_its_dependents(tmp_path: Path, spoilt: bytes) -> None:
     stream = [unit.with_data(spoilt) if unit.number == 6 else unit for unit in film()]
     found = exported(tmp_path, stream)
     assert (found.frames, found.left_out) == (15, 5)
     assert set(shown(tmp_path / "front.mp4")) == {0, 1, 2, 3, 4, *range(10, 20)}
 
 
-def test_a_key_that_lost_its_parameters_is_left_out_with_what_builds_on_it(tmp_path: Path) -> None:
+def test_a_key_frame_that_lost_its_parameters_is_left_out_with_its_dependents(tmp_path: Path) -> None:
     bare = b"".join(START + unit for unit in units(film()[5].data) if unit_type(unit) == 5)
     assert bare
     found = exported(tmp_path, [unit.with_data(bare) if unit.number == 6 else unit for unit in film()])
     assert (found.frames, found.left_out) == (15, 5)
 
 
-def test_a_picture_without_any_slice_ends_its_group(tmp_path: Path) -> None:
+def test_an_image_without_any_slice_ends_its_group(tmp_path: Path) -> None:
     stream = [unit.with_data(b"\0\0\1\x06\x05") if unit.number == 8 else unit for unit in film()]
     found = exported(tmp_path, stream)
     assert (found.frames, found.left_out) == (17, 3)
 
 
-def test_a_parameter_set_that_can_not_be_understood_is_left_out(tmp_path: Path) -> None:
+def test_an_unreadable_parameter_set_is_left_out(tmp_path: Path) -> None:
     broken = b"\0\0\1\x67\xff\xff\xff\0\0\1\x68\xff\0\0\1\x65\x88\x80"
     stream = [unit.with_data(broken) if unit.number == 1 else unit for unit in film()]
     found = exported(tmp_path, stream)
     assert (found.frames, found.left_out) == (15, 5)
 
 
-def test_times_that_do_not_grow_are_moved_to_the_next_possible(tmp_path: Path) -> None:
+def test_times_that_do_not_increase_move_to_the_next_possible(tmp_path: Path) -> None:
     stream = [replace(unit, captured_ns=film()[0].captured_ns) for unit in film()]
     assert exported(tmp_path, stream).frames == 20
     with av.open(str(tmp_path / "front.mp4")) as container:
@@ -145,7 +145,7 @@ def changing() -> list[Unit]:
     return [*film(10), *film(10, 96, 64, 11), *film(5, first=21)]
 
 
-def test_another_size_begins_another_file(tmp_path: Path, log: Callable[..., Ended]) -> None:
+def test_another_size_starts_another_file(tmp_path: Path, log: Callable[..., Ended]) -> None:
     found = exported(tmp_path, changing())
     names = [(video.path.name, video.frames, video.width, video.height) for video in found.videos]
     assert names == [("front.mp4", 10, 64, 48), ("front-2.mp4", 10, 96, 64), ("front-3.mp4", 5, 64, 48)]
@@ -158,7 +158,7 @@ def test_another_size_begins_another_file(tmp_path: Path, log: Callable[..., End
     assert f"{tmp_path}/x-2.mp4: 10 frames of front, from 0.400 s on, 96×64, as it was recorded" in ended.err
 
 
-def test_parameters_that_come_back_the_same_begin_no_file(tmp_path: Path) -> None:
+def test_returning_to_the_same_parameters_starts_no_file(tmp_path: Path) -> None:
     assert len(exported(tmp_path, [*film(10), *film(10, first=11, seed=2)]).videos) == 1
 
 
@@ -182,17 +182,17 @@ def test_names(number: int) -> None:
     assert path.parent == Path("a")
 
 
-# What is encoded -----------------------------------------------------------------------------------------------------
+# Encoding ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("options", [{"burn_time": True}, {"encode": True}])
-def test_what_is_drawn_into_or_asked_to_be_is_encoded(tmp_path: Path, options: dict[str, bool]) -> None:
+def test_frames_drawn_into_or_encoded_on_request(tmp_path: Path, options: dict[str, bool]) -> None:
     found = exported(tmp_path, film(), **options)
     assert [(video.frames, video.copied) for video in found.videos] == [(20, False)]
     assert set(shown(tmp_path / "front.mp4")) == set(range(20))
 
 
-def test_a_camera_of_which_some_frames_are_jpeg_is_encoded(tmp_path: Path) -> None:
+def test_a_camera_with_some_jpeg_frames_is_encoded(tmp_path: Path) -> None:
     jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 90, np.uint8))[1].tobytes()
     stream = [replace(unit, data=jpeg, format="jpeg", key=True) if 6 <= unit.number <= 10 else unit for unit in film()]
     found = exported(tmp_path, stream)
@@ -203,7 +203,7 @@ def test_a_camera_of_which_some_frames_are_jpeg_is_encoded(tmp_path: Path) -> No
 # Damage --------------------------------------------------------------------------------------------------------------
 
 
-def test_of_a_recording_that_was_cut_off_what_is_there_is_exported(tmp_path: Path) -> None:
+def test_the_existing_part_of_a_truncated_recording_is_exported(tmp_path: Path) -> None:
     data = write_film(tmp_path / "whole.mcap", film(), closed=False).read_bytes()
     (tmp_path / "flight.mcap").write_bytes(data[: len(data) * 2 // 3])
     found = export_mp4(Recording.open(tmp_path / "flight.mcap"), "alpha", "front", tmp_path / "front.mp4")
@@ -211,7 +211,7 @@ def test_of_a_recording_that_was_cut_off_what_is_there_is_exported(tmp_path: Pat
     assert_shows(tmp_path / "front.mp4", recorded(tmp_path))
 
 
-def test_of_a_damaged_recording_what_is_whole_is_exported(tmp_path: Path) -> None:
+def test_the_intact_part_of_a_damaged_recording_is_exported(tmp_path: Path) -> None:
     path = write_film(tmp_path / "flight.mcap", film())
     data = bytearray(path.read_bytes())
     piece = Recording.open(path).found.pieces[1]
@@ -224,19 +224,19 @@ def test_of_a_damaged_recording_what_is_whole_is_exported(tmp_path: Path) -> Non
     assert_shows(tmp_path / "front.mp4", recorded(tmp_path))
 
 
-def test_a_camera_of_which_nothing_can_be_decoded(tmp_path: Path) -> None:
+def test_a_camera_without_decodable_frames(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="no frame of front can be decoded"):
         exported(tmp_path, film()[1:5])
     assert not (tmp_path / "front.mp4").exists()
 
 
-def test_where_it_can_not_be_written(tmp_path: Path) -> None:
+def test_unwritable_paths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "front.mp4").mkdir()
     with pytest.raises(UsageError, match=r"front\.mp4 can't be written: Is a directory"):
         exported(tmp_path, film())
 
 
-# What a unit holds ---------------------------------------------------------------------------------------------------
+# Contents of a unit --------------------------------------------------------------------------------------------------
 
 BODY = st.binary(min_size=1, max_size=20).map(lambda data: data.replace(b"\0", b"\1"))  # no start code in it
 NAL = st.tuples(st.integers(0, 31), BODY).map(lambda parts: bytes([0x60 | parts[0]]) + parts[1])

@@ -1,4 +1,4 @@
-"""H.264 from the subscription to the file: units of any size, gaps, other sizes, streams that stop and return."""
+"""H.264 from subscription to file: units of any size, gaps, new sizes, streams that stop and return."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Rig:
         return [item.sample.record.header.seq for item in self.items]
 
     def written(self, path: Path) -> list[Any]:
-        """Write what came, and read it again."""
+        """Write the received samples and read them again."""
         clock = ClockPair(0, 1_760_000_000_000_000_000, 1)
         backlog = Backlog(64 * MB)
         translators = [Translator("alpha", CAPABILITIES, clock)]
@@ -72,7 +72,7 @@ class Rig:
 
 
 def padded(unit: Unit, size: int) -> Unit:
-    """The same picture in a unit of this size, as encoders of a constant rate have it: with filler data."""
+    """Return the same image in a unit of this size, with filler data like constant-rate encoders."""
     return unit.with_data(unit.data + b"\0\0\1\x0c" + b"\xff" * (size - len(unit.data) - 5) + b"\x80")
 
 
@@ -82,7 +82,7 @@ def rig() -> Rig:
 
 
 @pytest.mark.parametrize("size", [70_000, 2_000_000])
-def test_units_of_any_size_are_kept_as_they_came(rig: Rig, tmp_path: Path, size: int) -> None:
+def test_units_of_any_size_are_kept_unchanged(rig: Rig, tmp_path: Path, size: int) -> None:
     sent = [padded(unit, size) if unit.key else unit for unit in film(10)]
     rig.send(*sent)
     found = rig.written(tmp_path / "flight.mcap")
@@ -101,30 +101,30 @@ def test_another_size_in_mid_stream_is_kept_and_shown(rig: Rig, tmp_path: Path) 
     assert (rig.stream.gaps.missed, rig.stream.dropped) == (0, 0)
 
 
-def test_after_a_gap_it_goes_on_with_the_next_key(rig: Rig, tmp_path: Path) -> None:
+def test_after_a_gap_it_continues_with_the_next_key_frame(rig: Rig, tmp_path: Path) -> None:
     rig.send(*(unit for unit in film() if unit.number not in (8, 9)))
     assert rig.numbers == [*range(1, 8), *range(11, 21)]
     assert (rig.stream.gaps.missed, rig.stream.dropped) == (2, 1)
     assert all(picture.can_be_decoded for picture in rig.written(tmp_path / "flight.mcap"))
 
 
-def test_what_comes_before_the_first_key_is_no_loss(rig: Rig) -> None:
+def test_frames_before_the_first_key_frame_do_not_count_as_lost(rig: Rig) -> None:
     rig.send(*film()[3:])
     assert rig.numbers == list(range(6, 21))
     assert (rig.stream.gaps.missed, rig.stream.dropped) == (0, 0)
 
 
 @pytest.mark.parametrize("first", [1, 9, 8, 500])
-def test_a_stream_that_stops_and_returns_begins_with_a_key(rig: Rig, tmp_path: Path, first: int) -> None:
-    """Whatever its numbers are then: a driver that found its vehicle again may count anew."""
+def test_a_returning_stream_starts_with_a_key_frame(rig: Rig, tmp_path: Path, first: int) -> None:
+    """Whatever its numbers: a driver that found its vehicle again may restart its count."""
     again = film(10, first=first)
-    rig.send(*film(8), *again[2:])  # the key and one more of it were not heard
+    rig.send(*film(8), *again[2:])  # its key frame and one more were not received
     if first + 2 == 9 + 2:
         assert rig.stream.gaps.missed == 2
     assert rig.numbers[:8] == list(range(1, 9))
     assert rig.numbers[8:] == [first + n for n in range(5, 10)]
     found = rig.written(tmp_path / "flight.mcap")
-    assert np.array_equal(found[8].pixels(), found[5].pixels())  # both are the sixth of the film
+    assert np.array_equal(found[8].pixels(), found[5].pixels())  # both are the sixth image of the film
 
 
 def test_another_codec_than_announced_is_not_kept(rig: Rig) -> None:
@@ -137,7 +137,7 @@ def test_another_codec_than_announced_is_not_kept(rig: Rig) -> None:
 
 
 @given(st.lists(st.integers(0, 19), max_size=40))
-def test_whatever_comes_what_is_kept_can_be_decoded(order: list[int]) -> None:
+def test_any_kept_frames_can_be_decoded(order: list[int]) -> None:
     rig = Rig()
     rig.send(*(film()[n] for n in order))
     last: int | None = None

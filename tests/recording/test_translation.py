@@ -1,4 +1,4 @@
-"""What arrives becomes messages: times on two clocks, calibration, paths, and what a new file begins with."""
+"""Samples become messages: times on two clocks, calibration, paths, and the start of a new file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.samples import CAMERA
 
 UNIX = 1_000_000_000_000_000_000
 CLOCK = ClockPair(0, UNIX, 1)
-AHEAD_NS = 5_000  #: the proxy's clock less the recorder's
+AHEAD_NS = 5_000  #: the proxy's clock minus the recorder's
 
 
 def translator(*cameras: CameraInfo) -> Translator:
@@ -55,7 +55,7 @@ def test_capture_is_on_the_proxys_clock_and_receiving_on_ours() -> None:
     assert layout.decode(message.data, Feedback).captured_ns == 7_000
 
 
-def test_logs_are_published_in_the_order_in_which_they_came_whatever_time_they_name() -> None:
+def test_logs_are_published_in_order_of_arrival_regardless_of_their_times() -> None:
     of = translator()
     later, sooner = LogEntry("me", "later", 9_000, text="a"), LogEntry("me", "sooner", 6_000, text="b")
     found = messages(of, later) + messages(of, sooner)
@@ -63,18 +63,18 @@ def test_logs_are_published_in_the_order_in_which_they_came_whatever_time_they_n
     assert [layout.decode(found[number].data, LogEntry).at_ns for number in (0, 2)] == [9_000, 6_000]
 
 
-def test_numbers_beyond_32_bits_begin_anew() -> None:
+def test_numbers_beyond_32_bits_restart() -> None:
     (message,) = messages(translator(), Feedback(captured_ns=1, seq=2**32 + 5))
     assert message.sequence == 5
 
 
-def test_a_frame_and_its_picture_belong_together() -> None:
+def test_a_frame_and_its_image_belong_together() -> None:
     record, image = messages(translator(), picture(2**32 + 1, None))
     assert (record.topic, image.topic) == ("/alpha/frames/front", "/alpha/camera/front/image")
     assert (record.log_ns, record.publish_ns, record.sequence) == (image.log_ns, image.publish_ns, 1)
 
 
-def test_calibration_comes_when_it_changes_and_in_each_file() -> None:
+def test_calibration_is_written_on_change_and_in_each_file() -> None:
     one, other = Intrinsics(1.0, 1.0, 2.0, 1.5), Intrinsics(2.0, 2.0, 2.0, 1.5)
     found = translator()
     calibration = "/alpha/camera/front/calibration"
@@ -86,7 +86,7 @@ def test_calibration_comes_when_it_changes_and_in_each_file() -> None:
     assert calibration in topics(messages(found, picture(9, other, width=8)))
 
 
-def test_a_file_begins_with_parameters_cameras_and_their_places() -> None:
+def test_a_file_starts_with_parameters_cameras_and_their_mountings() -> None:
     found = translator(CAMERA, CameraInfo("bottom", 4, 3, 30.0))
     messages(found, Parameter("tilt", Type.FLOAT, 0.1))
     messages(found, Parameter("tilt", Type.FLOAT, 0.2))
@@ -102,7 +102,7 @@ def test_logged_numbers_are_not_lines_for_people() -> None:
     assert topics(messages(translator(), text)) == ["/alpha/logs", layout.LOG]
 
 
-def test_results_are_json_whatever_is_in_them() -> None:
+def test_results_are_json_whatever_they_contain() -> None:
     value = {"boxes": np.array([[1.5, math.nan]]), 7: [b"x", None], "seen": True}
     sample = ProcessorResult("detector", "front", 12, 7_000, 8_000, 500, 4, pack(value), 3)
     (message,) = messages(translator(), sample)
@@ -118,7 +118,7 @@ def test_every_channel_of_our_own_can_be_translated() -> None:
     assert set(layout.TYPES) == set(Channel)
 
 
-def test_the_path_is_told_once_a_second_and_only_with_positions() -> None:
+def test_the_path_is_written_once_a_second_and_only_with_positions() -> None:
     found = translator()
     counts = 0
     for tenth in range(30):

@@ -1,4 +1,4 @@
-"""The writing thread's steps: rotation, disks that fill up, stand still or vanish, and what is told."""
+"""The writing thread's steps: rotation, disks that fill up, hang or vanish, and its reports."""
 
 from __future__ import annotations
 
@@ -70,14 +70,14 @@ class Bench:
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
 
     def pictures(self, *numbers: int, size: int = 1000, group: int = 10) -> None:
-        """Of H.264: each tenth is a key."""
+        """Put H.264 frames into the backlog; every tenth is a key frame."""
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
             record = FrameRecord(header, number, "h264", number % group == 0)
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, Picture(record, bytes(size)), size))
 
     def step(self, seconds: float = 1.0) -> None:
-        """A second later, when everything is due."""
+        """Advance by a second, after which everything is due."""
         self.now_ns += round(seconds * NS_PER_S)
         self.writer.step(self.now_ns)
 
@@ -90,7 +90,7 @@ Make = Callable[..., Bench]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Makes benches, and closes their files."""
+    """Creates benches and closes their files."""
     made: list[Bench] = []
 
     def one(folder: Path, disk: Disk, **options: Any) -> Bench:
@@ -121,7 +121,7 @@ def test_a_writer_with_its_thread(tmp_path: Path) -> None:
     assert writer.bytes == (tmp_path / "f.mcap").stat().st_size
 
 
-def test_what_is_written_can_be_read_before_the_file_is_closed(make: Make, tmp_path: Path) -> None:
+def test_written_data_can_be_read_before_the_file_is_closed(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk())
     bench.commands(1, 2)
     bench.step()
@@ -129,7 +129,7 @@ def test_what_is_written_can_be_read_before_the_file_is_closed(make: Make, tmp_p
     assert bench.writer.messages == 2
 
 
-def test_rotation_by_size_and_each_file_is_complete_in_itself(make: Make, tmp_path: Path) -> None:
+def test_rotation_by_size_with_self_contained_files(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_mb=1)
     tilt = Parameter("limits.tilt", ParameterType.FLOAT, 0.2)
     bench.backlog.put(Item(0, "parameters", Rank.KEPT, 1, tilt, 400))
@@ -163,7 +163,7 @@ def test_rotation_by_time(make: Make, tmp_path: Path) -> None:
     assert written(*bench.writer.files) == list(range(1, 26))
 
 
-def test_each_file_of_a_rotation_begins_with_a_key_picture(make: Make, tmp_path: Path) -> None:
+def test_each_file_of_a_rotation_starts_with_a_key_frame(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_s=2)
     for second in range(6):
         bench.pictures(*range(7 * second, 7 * second + 7))
@@ -177,9 +177,9 @@ def test_each_file_of_a_rotation_begins_with_a_key_picture(make: Make, tmp_path:
     assert bench.backlog.dropped == {}
 
 
-def test_a_rotation_waits_for_the_key_pictures_of_a_camera_that_sends_few(make: Make, tmp_path: Path) -> None:
+def test_a_rotation_waits_for_the_rare_key_frames_of_a_camera(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_s=2)
-    for second in range(22):  # a key each ten seconds
+    for second in range(22):  # a key frame every ten seconds
         bench.pictures(second)
         bench.step()
     bench.writer._end()
@@ -188,7 +188,7 @@ def test_a_rotation_waits_for_the_key_pictures_of_a_camera_that_sends_few(make: 
     assert bench.backlog.dropped == {}
 
 
-def test_a_rotation_does_not_wait_for_a_key_picture_that_never_comes(make: Make, tmp_path: Path) -> None:
+def test_a_rotation_does_not_wait_for_a_key_frame_without_a_stream(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_s=10)
     for second in range(26):
         bench.pictures(second, group=1000)
@@ -196,7 +196,7 @@ def test_a_rotation_does_not_wait_for_a_key_picture_that_never_comes(make: Make,
     assert len(bench.writer.files) == 2
 
 
-def test_a_rotation_does_not_wait_for_a_key_picture_for_ever(make: Make, tmp_path: Path) -> None:
+def test_a_rotation_does_not_wait_for_a_key_frame_forever(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_s=10)
     bench.pictures(0, 1)
     for _ in range(14):
@@ -209,18 +209,18 @@ def test_a_rotation_does_not_wait_for_a_key_picture_for_ever(make: Make, tmp_pat
     assert bench.backlog.dropped == {(0, "video.front"): 2}
 
 
-def test_after_pictures_that_were_dropped_the_next_key_is_waited_for(make: Make, tmp_path: Path) -> None:
+def test_after_dropped_frames_it_waits_for_the_next_key_frame(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), buffer=6500)
-    bench.pictures(*range(12), *range(20, 23))  # ten and five are too many: 0 to 8 go, and 9 builds on them
+    bench.pictures(*range(12), *range(20, 23))  # ten and five are too many: 0 to 8 are dropped, and 9 depends on them
     bench.step()
-    bench.pictures(23, 25, 26, 30)  # 24 never came
+    bench.pictures(23, 25, 26, 30)  # 24 never arrived
     bench.step()
     bench.writer._end()
     assert written(bench.path, topic="/alpha/frames/front") == [10, 11, 20, 21, 22, 23, 30]
     assert bench.backlog.dropped == {(0, "video.front"): 12}
 
 
-def test_a_disk_that_is_full_when_a_file_should_end_loses_no_picture(make: Make, tmp_path: Path) -> None:
+def test_a_disk_full_at_the_end_of_a_file_loses_no_frame(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk(), rotate_s=2)
     bench.pictures(0, 1)
     bench.step()
@@ -239,7 +239,7 @@ def test_a_disk_that_is_full_when_a_file_should_end_loses_no_picture(make: Make,
 
 
 @pytest.mark.parametrize("room", [0, 300, 2500])
-def test_a_full_disk_pauses_and_nothing_that_must_be_kept_is_lost(make: Make, tmp_path: Path, room: int) -> None:
+def test_a_full_disk_pauses_and_no_essential_sample_is_lost(make: Make, tmp_path: Path, room: int) -> None:
     bench = make(tmp_path, Disk())
     bench.commands(1, 2, 3)
     bench.step()
@@ -249,7 +249,7 @@ def test_a_full_disk_pauses_and_nothing_that_must_be_kept_is_lost(make: Make, tm
     assert bench.writer.state.value == "paused"
     assert "No space left" in bench.writer.reason
     assert written(bench.path) == [1, 2, 3]
-    bench.step()  # tried again in vain, and told once
+    bench.step()  # retried without success, and reported once
     bench.commands(60)
     bench.step()
     assert bench.texts().count("No space left") == 1
@@ -263,7 +263,7 @@ def test_a_full_disk_pauses_and_nothing_that_must_be_kept_is_lost(make: Make, tm
     assert bench.backlog.dropped == {}
 
 
-def test_what_follows_a_pause_overwrites_nothing(make: Make, tmp_path: Path) -> None:
+def test_a_file_after_a_pause_overwrites_nothing(make: Make, tmp_path: Path) -> None:
     (tmp_path / "flight-0002.mcap").write_text("precious")
     bench = make(tmp_path, Disk(), overwrite=True)
     bench.disk.room = 0
@@ -275,7 +275,7 @@ def test_what_follows_a_pause_overwrites_nothing(make: Make, tmp_path: Path) -> 
     assert (tmp_path / "flight-0002.mcap").read_text() == "precious"
 
 
-def test_a_disk_that_is_full_to_the_end(make: Make, tmp_path: Path) -> None:
+def test_a_disk_full_to_the_end(make: Make, tmp_path: Path) -> None:
     bench = make(tmp_path, Disk())
     bench.commands(1)
     bench.step()
@@ -313,7 +313,7 @@ def test_the_floor_stops_frames_first_then_all_until_there_is_room(make: Make, t
     bench.commands(3)
     bench.step()
     assert bench.writer.state.value == "paused"
-    assert files.is_complete(bench.path), "there was room to close it"
+    assert files.is_complete(bench.path), "there was room to close the file"
     bench.disk.room = 45 * MB  # above the floor, but not by the margin
     bench.step()
     assert bench.writer.room is Room.NO_FRAMES
@@ -352,7 +352,7 @@ def test_room_is_judged_with_a_margin(free: int, before: Room, after: Room) -> N
     assert judge_room(free, 100, before) is after
 
 
-def test_a_removed_folder_is_told_and_recording_goes_on_when_it_is_back(make: Make, tmp_path: Path) -> None:
+def test_a_removed_folder_is_reported_and_recording_continues_when_it_is_back(make: Make, tmp_path: Path) -> None:
     folder = tmp_path / "flights"
     folder.mkdir()
     bench = make(folder, Disk())
@@ -416,7 +416,7 @@ def test_a_disk_slower_than_the_data_costs_frames_and_no_command(make: Make, tmp
         (lambda path: path.parent.rmdir(), "No such file"),
     ],
 )
-def test_what_can_not_be_started(tmp_path: Path, prepare: Callable[[Path], object], match: str) -> None:
+def test_recordings_that_can_not_start(tmp_path: Path, prepare: Callable[[Path], object], match: str) -> None:
     path = tmp_path / "folder" / "f.mcap"
     path.parent.mkdir()
     prepare(path)
@@ -432,5 +432,5 @@ def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path) -> None:
     options = Options(min_free_mb=40)
     path = tmp_path / "f.mcap"
     writer = FileWriter(path, options, Backlog(MB), [], [], CLOCK, lambda *_: None, opener=disk.open, free=disk.free)
-    with pytest.raises(UsageError, match="has 9 MB left, and recording leaves 40 MB free"):
+    with pytest.raises(UsageError, match="has 9 MB left, but recording keeps 40 MB free"):
         writer.start()

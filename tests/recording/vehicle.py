@@ -1,4 +1,4 @@
-"""A vehicle that knows where it is and shows pictures."""
+"""A vehicle that knows its position and sends images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INTRINSICS = Intrinsics(30.0, 30.0, 16.0, 12.0)
 
 
 def picture(captured_ns: int) -> np.ndarray:
-    """What the vehicle's camera shows at a time, BGR, shape (24, 32, 3), uint8."""
+    """Return the camera's image at a time, BGR, shape (24, 32, 3), uint8."""
     number = captured_ns // 1_000_000
     image = np.full((24, 32, 3), (number % 256, 128, 255 - number % 256), np.uint8)
     image[: number % 24, : number % 32] = 0
@@ -23,7 +23,7 @@ def picture(captured_ns: int) -> np.ndarray:
 
 
 class Vehicle(FakeVehicle):
-    """Knows where it is, and shows pictures in the encoding wanted."""
+    """Knows its position, and sends images in the wanted encoding."""
 
     def __init__(self, encoding: Encoding = Encoding.BGR8) -> None:
         super().__init__()

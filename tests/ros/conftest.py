@@ -1,4 +1,4 @@
-"""An rclpy that keeps what is published."""
+"""An rclpy that stores published messages."""
 
 from tests.support.fake_rclpy import rclpy
 

@@ -1,4 +1,4 @@
-"""The bridge between a proxy in this process and an rclpy that keeps what is published (``fake_rclpy.py``)."""
+"""The bridge between a proxy in this process and an rclpy that stores published messages (``fake_rclpy.py``)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeVehicle]:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")  # nothing is written for this process
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")  # no profile is written for this process
     vehicle, server = FakeVehicle(), MemoryServer("alpha-1")
     proxy = Proxy(vehicle, server, name="alpha-1")
     proxy.start()
@@ -84,10 +84,10 @@ def goal(x: float, y: float, z: float, frame: str = "", yaw: float | None = None
     return Message(header=Message(frame_id=frame), pose=pose)
 
 
-# Out -----------------------------------------------------------------------------------------------------------------
+# From the drone ------------------------------------------------------------------------------------------------------
 
 
-def test_state_and_what_is_not_known(rig: Rig) -> None:
+def test_state_and_unknown_values(rig: Rig) -> None:
     assert rig.node.namespace == "alpha_1"
     assert rig.published("state").data == "landed"
     assert rig.node.publishers["imu/data"].published == []  # the vehicle reports yaw and altitude only
@@ -96,7 +96,7 @@ def test_state_and_what_is_not_known(rig: Rig) -> None:
     assert rig.node.publishers["fix"].published == []
 
 
-def test_a_vehicle_that_knows_its_place(rig: Rig) -> None:
+def test_a_vehicle_that_knows_its_position(rig: Rig) -> None:
     from skyloop.messages import Feedback, LinkState
     from skyloop.messages.feedback import EarthOrigin
     from skyloop.ros.names import RosTime
@@ -144,13 +144,13 @@ def test_a_vehicle_that_knows_its_place(rig: Rig) -> None:
     assert b"one/base_link\0" in node.publishers["/tf"].newest
     assert node.publishers["/tf_static"].published == []
     assert node.publishers["pilot"].newest.data == "me"
-    node.now_ns = 0  # a simulation's clock is not known yet
+    node.now_ns = 0  # a simulation's clock is unknown so far
     count = len(node.publishers["odom"].published)
     telemetry.publish(known)
     assert len(node.publishers["odom"].published) == count
 
 
-def test_frames_that_somebody_subscribes_to(rig: Rig) -> None:
+def test_frames_with_subscribers(rig: Rig) -> None:
     for topic in ("image_raw", "camera_info", "image_raw/compressed"):
         rig.node.publishers[f"front/{topic}"].subscribers = 0
     [camera] = rig.bridge._cameras
@@ -189,7 +189,7 @@ def test_without_opencv_there_are_no_compressed_images(
         assert any("skyloop install vision" in line for line in rclpy.nodes["skyloop"].logger.lines)
 
 
-# In ------------------------------------------------------------------------------------------------------------------
+# To the drone --------------------------------------------------------------------------------------------------------
 
 
 def test_nothing_is_flown_without_the_authority(rig: Rig) -> None:
@@ -212,13 +212,13 @@ def test_a_flight_and_the_dead_mans_hover(rig: Rig) -> None:
     until(lambda: rig.vehicle.state is FlightState.HOVERING, "hover after half a second of silence")
     assert rig.commands.call("hover").success
     assert rig.node.call("land").success
-    until(lambda: rig.published("state").data in ("landed", "landing"), "the topic tells of the landing")
+    until(lambda: rig.published("state").data in ("landed", "landing"), "the topic reports the landing")
     assert rig.node.call("authority/release").success
     until(lambda: rig.node.publishers["pilot"].newest.data == "", "nobody flies")
 
 
 def test_a_stop_does_not_wait_for_services_that_wait(rig: Rig) -> None:
-    """Four that waited for the drone held up the emergency stop."""
+    """Four services that waited for the drone once delayed the emergency stop."""
     assert {"hover", "emergency_stop"} <= rig.commands.services.keys()
     assert not {"hover", "emergency_stop"} & rig.node.services.keys()
     assert rig.commands.call("emergency_stop").success
@@ -259,7 +259,7 @@ def test_velocities_do_not_end_a_landing(rig: Rig) -> None:
 
 
 def test_a_velocity_that_was_checked_before_a_landing_is_sent_before_it(rig: Rig) -> None:
-    """The thread of the topic lost the processor between the check and the sending: the landing must wait for it."""
+    """The topic's thread lost the CPU between the check and the sending: the landing must wait for it."""
     from skyloop.ros.pilot import Pilot
 
     order: list[str] = []
@@ -289,7 +289,7 @@ def test_a_velocity_that_was_checked_before_a_landing_is_sent_before_it(rig: Rig
     assert order == ["velocity", "land"]
 
 
-def test_stamped_velocities_of_others_or_of_long_ago_are_ignored(rig: Rig) -> None:
+def test_stamped_velocities_for_others_or_from_long_ago_are_ignored(rig: Rig) -> None:
     assert rig.node.call("authority/request").success
     assert rig.node.call("takeoff").success
 
@@ -303,7 +303,7 @@ def test_stamped_velocities_of_others_or_of_long_ago_are_ignored(rig: Rig) -> No
     send("alpha_1/base_link", 2.0)
     assert not any(isinstance(each, Velocity) for each in rig.vehicle.applied)
     assert any("must be alpha_1/base_link" in line for line in rig.commands.logger.lines)
-    assert any("2 s old, 0.5 s are allowed" in line for line in rig.commands.logger.lines)
+    assert any("2 s old; the limit is 0.5 s" in line for line in rig.commands.logger.lines)
     send("alpha_1/base_link", 0.1)
     until(lambda: any(isinstance(each, Velocity) and each.left == 0.3 for each in rig.vehicle.applied), "a velocity")
 
@@ -321,7 +321,7 @@ def test_goals_of_other_frames_and_without_a_height_are_refused(rig: Rig) -> Non
     assert not any(isinstance(each, Position) for each in rig.vehicle.applied)
 
 
-def test_a_goal_that_is_refused_is_not_flown_to_by_its_repeats(rig: Rig) -> None:
+def test_repeats_of_a_refused_goal_are_not_flown(rig: Rig) -> None:
     rig.vehicle.position_m = (0.0, 0.0, 1.0)
     rig.node.call("authority/request")
     assert rig.node.call("takeoff").success
@@ -332,7 +332,7 @@ def test_a_goal_that_is_refused_is_not_flown_to_by_its_repeats(rig: Rig) -> None
     assert not any(isinstance(each, Position) for each in rig.vehicle.applied)
 
 
-def test_goals_are_places_with_a_heading(rig: Rig) -> None:
+def test_goals_are_positions_with_a_heading(rig: Rig) -> None:
     from skyloop.ros.pilot import Pilot
 
     flown: list[dict[str, Any]] = []
@@ -375,7 +375,7 @@ def test_parameters_both_ways(rig: Rig) -> None:
     rig.drone.request_authority()
     assert rig.node.set_parameters([ros_parameter(name, 1.5), ros_parameter("use_sim_time", True)]).successful
     assert rig.drone.config[name] == 1.5
-    rig.drone.config[name] = 1.25  # as anybody else would
+    rig.drone.config[name] = 1.25  # as another application would
     until(lambda: rig.node.parameters[name] == 1.25, "the parameter at the node")
 
 
@@ -391,7 +391,7 @@ def test_parameters_both_ways(rig: Rig) -> None:
         ({"drones": ("a-1", "a_1")}, "would both be /a_1"),
     ],
 )
-def test_settings_that_make_no_sense(wrong: dict[str, Any], reason: str) -> None:
+def test_invalid_settings(wrong: dict[str, Any], reason: str) -> None:
     with pytest.raises(UsageError, match=reason):
         Settings(**wrong)
 
@@ -410,7 +410,7 @@ def test_domains() -> None:
         domain_of("102")
 
 
-def test_a_priority_asks_at_once_and_arguments_go_to_ros(rclpy: Fake, served: FakeVehicle) -> None:
+def test_a_priority_requests_the_authority_at_once_and_arguments_go_to_ros(rclpy: Fake, served: FakeVehicle) -> None:
     settings = Settings(drones=("alpha-1",), priority=4, use_sim_time=True, arguments=("-r", "cmd_vel:=teleop"))
     with Bridge(settings) as bridge:
         status = bridge.drones["alpha-1"].authority
@@ -422,7 +422,7 @@ def test_a_priority_asks_at_once_and_arguments_go_to_ros(rclpy: Fake, served: Fa
         pass
 
 
-def test_without_rclpy_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rclpy_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rclpy", None)
     with pytest.raises(MissingExtraError, match=r"skyloop install ros"), Bridge(Settings(drones=("alpha",))):
         pass
@@ -439,7 +439,7 @@ def test_transforms_need_a_known_rclpy_or_the_package_of_their_type(
         tf_message_type()
 
 
-def test_this_machine_only_unless_the_environment_says_otherwise() -> None:
+def test_this_machine_only_unless_the_environment_configures_discovery() -> None:
     for variable in DISCOVERY_VARIABLES:
         environment = {variable: "something"}
         assert not stay_on_this_machine(environment)

@@ -1,4 +1,4 @@
-"""A furnished room, and where the drones and targets in it are."""
+"""A furnished room, and the positions of its drones and targets."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def state_at(
     board_yaw: float = np.pi,
     slab_yaw: float = 0.0,
 ) -> SceneState:
-    """Level drones facing east, and the two targets."""
+    """Return the state of level drones facing east, and the two targets."""
     targets = (
         TargetState("board", 0.0, board, board_yaw, (0.0, 0.0, 0.0)),
         TargetState("slab", 0.0, slab, slab_yaw, (0.0, 0.0, 0.0)),

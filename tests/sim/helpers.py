@@ -1,4 +1,4 @@
-"""Worlds and vehicles that the tests of the simulator share."""
+"""Worlds and vehicles shared by the simulator's tests."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skyloop.sim.parameters import with_ideal_sensors
 
 HALL = parse_world("[room]\nsize = [20, 20, 10]\n", "hall")
 
-#: A vehicle that knows exactly where it is.
+#: A vehicle with perfect sensors.
 IDEAL = with_ideal_sensors(VehicleParameters())
 
 
@@ -25,7 +25,7 @@ def flying(
     seed: int = 1,
     seconds: float = 5.0,
 ) -> Simulation:
-    """A simulation whose drones have taken off and hover."""
+    """Return a simulation whose drones have taken off and hover."""
     simulation = Simulation(world, drones, seed=seed, parameters=parameters, wind=wind)
     for drone in range(drones):
         simulation.command(drone, Takeoff())
@@ -34,7 +34,7 @@ def flying(
 
 
 def above_another(parameters: VehicleParameters) -> Simulation:
-    """Drone 1 in the air above drone 0, which stands."""
+    """Return a simulation with drone 1 in the air above drone 0, which is on the ground."""
     world = parse_world(
         "[room]\nsize = [5, 5, 3]\n[[spawn]]\nposition = [0, 0, 0]\n[[spawn]]\nposition = [1.5, 0, 0]\nyaw_deg = 180\n"
     )

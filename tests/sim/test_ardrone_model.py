@@ -1,4 +1,4 @@
-"""The simulated AR.Drone answers like the recorded one, and what it needed leaves other vehicles as they are."""
+"""The simulated AR.Drone responds like the recorded one, and the model's additions leave other vehicles unchanged."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from tests.support.recordings import recorded
 
 JUDGED = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1")
 FITTED = ("0.4sImpulseNoHover", "0.5sImpulseNH5", "1sImpulseHalfMagNH2", "1sImpulseNH3", "8sStepHalfMagNH1")
-HUNG = "1sImpulseNH1"  # here the radio link hung
-EXACT = SpeedEstimate(lag_s=1e-9, scale=1.0)  # a speed that is known, not estimated
+HUNG = "1sImpulseNH1"  # here the radio link stalled
+EXACT = SpeedEstimate(lag_s=1e-9, scale=1.0)  # a known speed, not an estimate
 
 
 def folder_of(name: str) -> Path:
@@ -45,7 +45,7 @@ def folder_of(name: str) -> Path:
 
 @cache
 def step_of(name: str) -> Recording:
-    """A run, with times from its step on."""
+    """Return a run, with times from its step on."""
     recording = read_recording(folder_of(name))
     return recording.since(recording.steps()[0])
 
@@ -54,7 +54,7 @@ def step_of(name: str) -> Recording:
 
 
 @pytest.mark.parametrize("name", [*FITTED, *JUDGED])
-def test_each_step_is_answered_as_recorded(name: str) -> None:
+def test_each_step_has_the_recorded_response(name: str) -> None:
     run = step_of(name)
     [misfit] = compare(replay(run.command, [AR_DRONE]), run)
     assert len(misfit.pitch) > 550
@@ -63,8 +63,8 @@ def test_each_step_is_answered_as_recorded(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", JUDGED)
-def test_the_vehicle_by_default_is_farther_off(name: str) -> None:
-    """In runs that the fit has not seen, even where its speed needs no estimating."""
+def test_the_default_vehicle_is_less_accurate(name: str) -> None:
+    """In runs outside the fit, even for the exact speed."""
     run = step_of(name)
     both = replay(run.command, [AR_DRONE, VehicleParameters()])
     ours, _ = compare(both, run)
@@ -73,15 +73,15 @@ def test_the_vehicle_by_default_is_farther_off(name: str) -> None:
     assert ours.forward_rms < 0.8 * default.forward_rms
 
 
-def test_the_vehicle_by_default_would_not_pass() -> None:
-    """So the recordings tell vehicles apart."""
+def test_the_default_vehicle_would_not_pass() -> None:
+    """The recordings therefore distinguish vehicles."""
     run = step_of(HUNG)
     _, default = compare(replay(run.command, [AR_DRONE, VehicleParameters()]), run)
     assert degrees(default.pitch_rms) > 2.0
 
 
-def test_the_simulated_drone_is_no_more_the_faster_one_after_three_seconds() -> None:
-    """It was by 0.28 m/s in the mean; the same command ends up to 0.35 m/s apart."""
+def test_the_simulated_drone_is_no_faster_after_three_seconds() -> None:
+    """It once was faster by 0.28 m/s on average; runs of the same command end up to 0.35 m/s apart."""
     faster = []
     for name in (*FITTED, *JUDGED):
         run = step_of(name)
@@ -120,7 +120,7 @@ def test_times_of_receipt_are_kept_on_demand() -> None:
     raw = np.loadtxt(folder_of(HUNG) / "theta_dump.dat")
     stamped, evened = (read_recording(folder_of(HUNG), as_stamped=flag).pitch.times_s for flag in (True, False))
     assert (stamped == raw[:, 0]).all()
-    assert (stamped - evened).max() > 0.3  # so long the link hung around the step
+    assert (stamped - evened).max() > 0.3  # the link stalled this long around the step
 
 
 @given(st.lists(st.floats(0.0, 0.5), min_size=1, max_size=60))
@@ -140,14 +140,14 @@ def test_a_link_without_jitter_changes_no_time() -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("0.0 1.0\n0.1\n", "line 2: a time and a value are wanted, not '0.1'"),
+        ("0.0 1.0\n0.1\n", "line 2: expected a time and a value, got '0.1'"),
         ("0.0 1.0\n0.1 north\n", "line 2"),
         ("0.1 1.0\n0.0 1.0\n", "times that don't fall"),
         ("0.1 nan\n0.2 1.0\n", "finite numbers"),
         ("", "at least two lines"),
     ],
 )
-def test_what_is_no_recording_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
+def test_an_invalid_recording_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
     for name in ("command", "theta", "vx"):
         (tmp_path / f"{name}_dump.dat").write_text("0.0 0.0\n1.0 0.0\n")
     (tmp_path / "theta_dump.dat").write_text(text)
@@ -155,12 +155,12 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, text: str, complaint: s
         read_recording(tmp_path)
 
 
-def test_a_recording_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_recording_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"command_dump\.dat can't be read: No such file"):
         read_recording(tmp_path)
 
 
-def test_a_recording_that_is_no_text_is_named(tmp_path: Path) -> None:
+def test_a_binary_recording_is_named(tmp_path: Path) -> None:
     (tmp_path / "command_dump.dat").write_bytes(b"\xff\xfe\x80")
     with pytest.raises(FileFormatError, match=r"command_dump\.dat is not UTF-8 text"):
         read_recording(tmp_path)
@@ -179,7 +179,7 @@ def test_a_command_beyond_half_is_the_tilt_limit() -> None:
     assert whole.pitch[0, -1] == pytest.approx(Limits().tilt_rad, abs=0.001)
 
 
-def test_before_its_first_line_a_command_is_none() -> None:
+def test_there_is_no_command_before_the_first_line() -> None:
     late = Track(np.array([1.0, 10.0]), np.array([1.0, 1.0]))
     response = replay(late, [IDEAL])
     assert np.abs(response.pitch[0, response.times_s <= 1.0]).max() < 0.002
@@ -190,16 +190,16 @@ def test_an_estimate_lags_behind_the_speed_and_scales_it() -> None:
     response = replay(constant(1.0), [IDEAL])
     slow = SpeedEstimate(lag_s=0.1, scale=2.0).of(response)
     assert EXACT.of(response) == pytest.approx(response.forward)
-    late = np.interp(response.times_s - 0.1, response.times_s, response.forward[0])  # in a steady climb, by its lag
+    late = np.interp(response.times_s - 0.1, response.times_s, response.forward[0])  # lags behind a steady increase
     assert slow[0, -200:] == pytest.approx(2.0 * late[-200:], abs=0.02)
 
 
-def test_no_vehicle_is_refused() -> None:
+def test_an_empty_list_of_vehicles_is_refused() -> None:
     with pytest.raises(UsageError, match="at least one vehicle"):
         replay(constant(1.0), [])
 
 
-# What was added to the model ------------------------------------------------------------------------------------------
+# Additions to the model -----------------------------------------------------------------------------------------------
 
 
 def fly(simulation: Simulation, action: AnyAction, seconds: float) -> None:
@@ -212,7 +212,7 @@ def test_both_additions_are_off_by_default() -> None:
     assert (default.airspeed_tilt_rad_s2_per_m2, default.level_brake_per_s) == (0.0, 0.0)
 
 
-def test_a_default_vehicle_flies_the_same_beside_an_ar_drone() -> None:
+def test_a_default_vehicle_flies_the_same_next_to_an_ar_drone() -> None:
     alone = Simulation(HALL, 1, seed=3)
     beside = Simulation(HALL, 2, seed=3, parameters=[VehicleParameters(), AR_DRONE])
     for simulation in (alone, beside):
@@ -226,7 +226,7 @@ def test_a_default_vehicle_flies_the_same_beside_an_ar_drone() -> None:
     ("wind", "pitch_sign", "roll_sign"),
     [((-2.0, 0.0, 0.0), -1, 0), ((2.0, 0.0, 0.0), 1, 0), ((0.0, -2.0, 0.0), 0, 1), ((0.0, 2.0, 0.0), 0, -1)],
 )
-def test_air_lifts_the_side_that_it_comes_to(wind: tuple[float, float, float], pitch_sign: int, roll_sign: int) -> None:
+def test_air_lifts_the_windward_side(wind: tuple[float, float, float], pitch_sign: int, roll_sign: int) -> None:
     tilt = 0.02
     simulation = flying(parameters=replace(IDEAL, airspeed_tilt_rad_s2_per_m2=tilt, linear_drag_per_s=0.0))
     simulation.set_wind(Wind(mean_m_s=wind))
@@ -238,7 +238,7 @@ def test_air_lifts_the_side_that_it_comes_to(wind: tuple[float, float, float], p
     assert truth.roll_rad == pytest.approx(roll_sign * expected, abs=0.01)
 
 
-def test_a_gale_tilts_no_further_than_three_metres_a_second() -> None:
+def test_a_gale_tilts_no_more_than_three_metres_a_second() -> None:
     simulation = flying(parameters=replace(IDEAL, airspeed_tilt_rad_s2_per_m2=0.01))
     simulation.set_wind(Wind(mean_m_s=(-12.0, 0.0, 0.0)))
     fly(simulation, Attitude(), 0.8)
@@ -247,7 +247,7 @@ def test_a_gale_tilts_no_further_than_three_metres_a_second() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_the_brake_fades_as_the_set_point_grows(share: float) -> None:
-    """Flying to the right, a drone that is told to pitch only leans left by the whole brake."""
+    """A drone that flies to the right and gets a pure pitch command leans left by the whole brake."""
     brake, limit = 0.3, Limits().tilt_rad
     simulation = flying(parameters=replace(IDEAL, level_brake_per_s=brake))
     fly(simulation, Velocity(left=-1.0), 2.0)
@@ -261,14 +261,14 @@ def test_the_brake_fades_as_the_set_point_grows(share: float) -> None:
     assert lean[0] < -radians(0.7)
 
 
-def test_an_ar_drone_holds_its_place_when_it_hovers() -> None:
+def test_an_ar_drone_holds_its_position_in_hover() -> None:
     simulation = flying(parameters=AR_DRONE, seconds=6.0)
     begin = np.array(simulation.truth(0).position_m)
     simulation.step(steps(10.0))
     assert np.abs(np.array(simulation.truth(0).position_m) - begin).max() < 0.5
 
 
-def test_an_ar_drone_stops_from_full_tilt_when_it_is_told_to_hover() -> None:
+def test_hover_stops_an_ar_drone_from_full_tilt() -> None:
     simulation = flying(parameters=with_ideal_sensors(AR_DRONE))
     fly(simulation, Attitude(pitch=Limits().tilt_rad), 1.0)
     assert simulation.truth(0).velocity_m_s[0] > 1.2
@@ -288,7 +288,7 @@ def test_the_page_has_the_parameters_of_the_code() -> None:
     assert table == {name: getattr(AR_DRONE, name) for name in changed}
 
 
-def test_the_page_has_the_figures_that_are_reached() -> None:
+def test_the_page_has_the_measured_figures() -> None:
     table = rows(section(PAGE, "## Figures"))
     parts = {**dict.fromkeys(FITTED, "fitted"), **dict.fromkeys(JUDGED, "judged")}
     assert {row[0]: row[1] for row in table if row[1] in ("fitted", "judged")} == parts

@@ -14,7 +14,7 @@ from skyloop.sim.streams import NormalBlocks, Purpose, stream
 from tests.sim.helpers import HALL, IDEAL, flying, steps
 
 
-def test_hovering_takes_the_power_that_the_parameters_say() -> None:
+def test_hovering_takes_the_power_of_the_parameters() -> None:
     simulation = flying()
     before = simulation.truth(0).battery
     simulation.step(steps(20))
@@ -43,7 +43,7 @@ def test_a_low_battery_lands_the_drone_and_refuses_takeoff() -> None:
 
 
 def test_an_empty_battery_stops_the_motors() -> None:
-    # So small a battery, so far up, that the landing on the last 3 % can't be finished.
+    # The battery is so small and the drone so high that the landing on the last 3 % can't be finished.
     limits = Limits(takeoff_altitude_m=8.0, altitude_m=9.0)
     parameters = replace(IDEAL, battery_charge_c=1500.0)
     simulation = Simulation(HALL, parameters=parameters, charge=0.1, limits=limits)
@@ -56,7 +56,7 @@ def test_an_empty_battery_stops_the_motors() -> None:
     assert simulation.feedback(0).altitude_m == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_fresh_battery_lets_a_drone_fly_again_and_is_warned_of_anew() -> None:
+def test_a_fresh_battery_lets_a_drone_fly_again_with_a_new_warning() -> None:
     simulation = Simulation(HALL, parameters=IDEAL)
     for _ in range(2):
         simulation.set_charge(0, 0.02)
@@ -77,7 +77,7 @@ def test_the_wind_can_be_changed_in_flight() -> None:
     assert simulation.truth(0).wind_m_s == (0.0, 1.0, 0.0)
 
 
-def test_wind_has_the_mean_deviation_and_memory_asked_for() -> None:
+def test_wind_has_the_requested_mean_deviation_and_memory() -> None:
     period, time_constant, gust = 0.016, 0.5, 0.8
     field = WindField(Wind((1.0, -0.5, 0.2), gust, time_constant), seed=3, drones=20, period_s=period)
     air = np.zeros((3, 20))
@@ -103,7 +103,7 @@ def test_wind_pushes_a_drone_that_holds_its_attitude() -> None:
     assert simulation.truth(0).wind_m_s == (2.0, 0.0, 0.0)
 
 
-def test_sensors_scatter_about_the_truth_as_the_parameters_say() -> None:
+def test_sensors_have_the_noise_of_the_parameters() -> None:
     simulation = flying(parameters=VehicleParameters())
     parameters = simulation.parameters[0]
     errors = []
@@ -117,7 +117,7 @@ def test_sensors_scatter_about_the_truth_as_the_parameters_say() -> None:
                 feedback.angular_velocity_rad_s[1] - truth.angular_velocity_rad_s[1],
             ]
         )
-    noise = np.std(np.diff(errors, axis=0), axis=0) / np.sqrt(2)  # differences leave the slow bias out
+    noise = np.std(np.diff(errors, axis=0), axis=0) / np.sqrt(2)  # differences remove the slow bias
     wanted = (parameters.tilt_noise_rad, parameters.yaw_noise_rad, parameters.gyro_noise_rad_s)
     assert noise == pytest.approx(wanted, rel=0.1)
     bias = np.abs(np.mean(errors, axis=0))
@@ -148,15 +148,15 @@ def test_streams_are_independent_and_repeatable() -> None:
     assert len(numbers) == 4 * len(Purpose)
 
 
-def test_a_drone_draws_the_same_numbers_whoever_else_draws() -> None:
+def test_a_drones_random_numbers_do_not_depend_on_other_drones() -> None:
     few, many = (NormalBlocks(1, Purpose.WIND, 3, n, ahead=4) for n in (1, 5))
     for _ in range(10):
         assert np.array_equal(few.take()[:, 0], many.take()[:, 0])
 
 
-def test_gusts_leave_sensor_noise_as_it_was() -> None:
+def test_gusts_leave_sensor_noise_unchanged() -> None:
     calm, gusty = (Simulation(HALL, seed=1, wind=Wind(gust_m_s=g)) for g in (0.0, 1.0))
     for simulation in (calm, gusty):
         simulation.step(round(1 / STEP_S))
-    # Standing on the ground, the gusts move nothing.
+    # Drones on the ground are not moved by gusts.
     assert calm.feedback(0) == gusty.feedback(0)

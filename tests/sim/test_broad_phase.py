@@ -1,4 +1,4 @@
-"""What the broad phase leaves out touches nothing: compared with looking at all pairs, and at every step."""
+"""The broad phase misses no contact: compared with checking all pairs, and in every step."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ boxes = st.integers(1, 25).flatmap(
 
 
 @given(boxes)
-def test_the_sweep_finds_the_pairs_that_comparing_all_finds(drawn: tuple[Floats, Floats, int]) -> None:
+def test_the_sweep_finds_the_same_pairs_as_comparing_all(drawn: tuple[Floats, Floats, int]) -> None:
     low, size, movable = drawn
     high = low + size
     wanted = [
@@ -40,7 +40,7 @@ def test_the_sweep_finds_the_pairs_that_comparing_all_finds(drawn: tuple[Floats,
 
 
 @pytest.mark.parametrize("name", ["gates", "park", "platform"])
-def test_solids_looked_at_together_are_those_looked_at_one_by_one(name: str) -> None:
+def test_solids_checked_together_match_those_checked_one_by_one(name: str) -> None:
     world = load_world(name)
     solids = Solids(world, tuple(TargetTrack(target, 1, n) for n, target in enumerate(world.targets)))
     solids.move(3.0)
@@ -70,11 +70,11 @@ TOUGH = VehicleParameters(crash_speed_m_s=100.0, restitution=0.9)
 
 
 def crowd(
-    commands: list[AnyAction], world: str, drones: int, seed: int, look_steps: int, few_pairs: int
+    commands: list[AnyAction], world: str, drones: int, seed: int, phase_steps: int, few_pairs: int
 ) -> tuple[list[VehicleTruth], list[Occurrence]]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collisions, "LOOK_STEPS", look_steps)
-        patch.setattr(collisions, "LOOK_STEPS_OF_FEW", look_steps)
+        patch.setattr(collisions, "BROAD_PHASE_STEPS", phase_steps)
+        patch.setattr(collisions, "BROAD_PHASE_STEPS_OF_FEW", phase_steps)
         patch.setattr(collisions, "FEW_PAIRS", few_pairs)
         limits = Limits(tilt_rad=0.6, climb_m_s=2.0, speed_m_s=6.0)
         simulation = Simulation(load_world(world, seed), drones, seed=seed, parameters=TOUGH, limits=limits)
@@ -97,14 +97,14 @@ def crowd(
     st.sampled_from([2, 12]),
     st.integers(0, 99),
 )
-def test_a_crowd_flies_as_if_all_were_looked_at_in_every_step(
+def test_a_crowd_flies_as_if_all_pairs_were_checked_in_every_step(
     commands: list[AnyAction], world: str, drones: int, seed: int
 ) -> None:
-    rarely = crowd(commands, world, drones, seed, collisions.LOOK_STEPS, collisions.FEW_PAIRS)
+    rarely = crowd(commands, world, drones, seed, collisions.BROAD_PHASE_STEPS, collisions.FEW_PAIRS)
     assert rarely == crowd(commands, world, drones, seed, 1, 0)
 
 
-def test_a_drone_that_was_put_meets_what_is_there() -> None:
+def test_a_moved_drone_collides_at_its_new_position() -> None:
     simulation = Simulation(load_world("empty"), 2, seed=1, parameters=TOUGH)
     for drone in (0, 1):
         simulation.command(drone, Takeoff())

@@ -28,7 +28,7 @@ PLAIN = replace(FRONT_CAMERA, distortion=(0.0,) * 5)
 
 
 def seen_at(camera: CameraModel, body_point: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Pixel of a point given in body axes, for a drone at the origin."""
+    """Return the pixel of a point in body axes, for a drone at the origin."""
     pose = camera.pose(np.zeros(3), np.eye(3))
     pixel: NDArray[np.float64] = camera.project((np.array([body_point]) - pose.position_m) @ pose.rotation)[0]
     return pixel
@@ -54,14 +54,14 @@ def test_mountings_are_rotations(rotation: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize(("camera", "degrees"), [(FRONT_CAMERA, 92.0), (BOTTOM_CAMERA, 64.0)])
-def test_presets_have_the_fields_of_view_that_they_state(camera: CameraModel, degrees: float) -> None:
+def test_presets_have_their_stated_fields_of_view(camera: CameraModel, degrees: float) -> None:
     corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
     rays = np.column_stack([camera.rays(corners), np.ones(2)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     assert np.degrees(np.arccos(rays[0] @ rays[1])) == pytest.approx(degrees, abs=1.0)
 
 
-def test_pose_puts_the_camera_where_the_turned_body_carries_it() -> None:
+def test_the_pose_follows_the_rotated_body() -> None:
     body = rotation_from_euler(0.0, 0.0, np.pi / 2)  # facing north
     pose = FRONT_CAMERA.pose(np.array([1.0, 2.0, 3.0]), body, drone=4)
     assert pose.position_m == pytest.approx([1.0, 2.0 + FRONT_CAMERA.position_m[0], 3.0])
@@ -90,7 +90,7 @@ def test_scaling_keeps_rays_in_place() -> None:
     assert double.rays(np.array([[-0.5, -0.5]])) == pytest.approx(FRONT_CAMERA.rays(np.array([[-0.5, -0.5]])))
 
 
-def test_what_travels_with_frames() -> None:
+def test_the_intrinsics_of_frames() -> None:
     info = FRONT_CAMERA.info()
     assert (info.name, info.width, info.height, info.rotation) == ("front", 320, 240, LOOKING_FORWARD)
     assert info.intrinsics is not None
@@ -98,7 +98,7 @@ def test_what_travels_with_frames() -> None:
     assert PLAIN.intrinsics().distortion == ()
 
 
-def test_a_lens_that_folds_its_picture_is_refused() -> None:
+def test_a_lens_that_folds_its_image_is_refused() -> None:
     with pytest.raises(UsageError, match="folds"):
         replace(FRONT_CAMERA, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0)).rays(np.array([[0.0, 0.0]]))
 
@@ -123,7 +123,7 @@ def test_impossible_values_are_refused_by_name(change: dict[str, Any], word: str
         FRONT_CAMERA.scaled(0.0)
 
 
-def test_a_large_picture_is_undistorted_in_parts_as_it_is_at_once() -> None:
+def test_a_large_image_is_undistorted_in_parts_as_in_one_go() -> None:
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (40_000, 2))
     bent = (-0.05, 0.1, 0.001, -0.006, 0.0)
     straight = undistort(points, bent)
@@ -140,5 +140,5 @@ def test_the_racers_camera_is_wide_and_looks_up() -> None:
     assert np.degrees(np.arctan(right) - np.arctan(left)) == pytest.approx(100.0, abs=1.5)
     ahead = camera.rotation_matrix @ [0.0, 0.0, 1.0]
     assert np.degrees(np.arctan2(ahead[2], ahead[0])) == pytest.approx(25.0)
-    assert camera.rotation_matrix @ [1.0, 0.0, 0.0] == pytest.approx([0.0, -1.0, 0.0])  # its right is the body's
+    assert camera.rotation_matrix @ [1.0, 0.0, 0.0] == pytest.approx([0.0, -1.0, 0.0])  # its right is the body's right
     assert looking_up(0.0) == pytest.approx(LOOKING_FORWARD)

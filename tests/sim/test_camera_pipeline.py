@@ -1,4 +1,4 @@
-"""The thread that draws: what is overtaken, what is forgotten, and what it does when drawing fails."""
+"""The rendering thread: replaced exposures, forgotten cameras, and failures."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STATE = SceneState(np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], ())
 
 
 class Wall:
-    """A screen that remembers."""
+    """A screen that records its frames."""
 
     def __init__(self) -> None:
         self.shown: list[int] = []
@@ -70,7 +70,7 @@ def test_only_the_newest_exposure_of_a_camera_is_drawn() -> None:
     assert not wall.failures
 
 
-def test_a_forgotten_camera_is_shown_nothing_more() -> None:
+def test_a_forgotten_camera_gets_no_more_frames() -> None:
     gone, stays = Wall(), Wall()
     left, right = camera(gone), camera(stays)
     pipeline = CameraPipeline(load_world("empty"), 1, "fast")
@@ -81,7 +81,7 @@ def test_a_forgotten_camera_is_shown_nothing_more() -> None:
     assert not gone.shown
 
 
-def test_a_renderer_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renderer_that_cannot_be_created_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise RuntimeError("no scene")
 
@@ -93,7 +93,7 @@ def test_a_renderer_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch)
     assert [str(error) for error in wall.failures] == ["no scene"]
 
 
-def test_a_picture_that_cannot_be_drawn_is_told_and_the_next_one_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_frame_is_reported_and_the_next_one_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     finish, fail = Camera.finish, [True]
 
     def sometimes(self: Camera, *arguments: object) -> NDArray[np.uint8]:
@@ -120,7 +120,7 @@ def test_no_more_is_rendered_than_is_used(fps: float, rendered: int) -> None:
     assert sum(front.wanted(at_ns, fps) for at_ns in times_ns) == pytest.approx(3 * rendered, abs=2)
 
 
-def test_whoever_takes_fewer_finds_one_in_time_whenever_it_began() -> None:
+def test_a_slower_consumer_always_finds_a_frame_in_time() -> None:
     front, chosen = camera(Wall()), RateLimiter(12.0)
     times_ns = [round(n * 1e9 / 30.0) for n in range(300)]
     rendered = [at_ns for at_ns in times_ns if front.wanted(at_ns, chosen.max_hz)]
@@ -128,7 +128,7 @@ def test_whoever_takes_fewer_finds_one_in_time_whenever_it_began() -> None:
     assert sum(chosen.in_time(at_ns) for at_ns in rendered[1:]) >= 115
 
 
-def test_after_nobody_looked_the_next_exposure_is_rendered() -> None:
+def test_the_next_exposure_is_rendered_after_a_time_without_viewers() -> None:
     front = camera(Wall())
     assert front.wanted(0, 12.0)
     assert not front.wanted(1_000_000_000, 0.0)

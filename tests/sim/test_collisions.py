@@ -19,7 +19,7 @@ TOUGH = replace(IDEAL, crash_speed_m_s=100.0)
 
 
 def depth_in_solids(world: World, position: tuple[float, float, float]) -> float:
-    """How far the hull of a drone at ``position`` reaches into a box or a wall, worked out anew and plainly."""
+    """Return how far the hull of a drone at ``position`` overlaps a box or a wall, computed independently."""
     x, y, z = position
     radius, half = IDEAL.radius_m, IDEAL.half_height_m
     size_x, size_y, height = world.room.size_m
@@ -50,9 +50,9 @@ set_points = st.builds(
 
 @pytest.mark.slow
 @settings(max_examples=25, deadline=None)
-@example("gates", [Attitude(pitch=-0.5), Velocity(up=-1.0), Velocity(up=-2.0)], 0)  # one came down upon the other
+@example("gates", [Attitude(pitch=-0.5), Velocity(up=-1.0), Velocity(up=-2.0)], 0)  # one came down on the other
 @given(st.sampled_from(["room", "gates"]), st.lists(set_points, min_size=1, max_size=6), st.integers(0, 1000))
-def test_no_drone_ends_within_a_solid_or_outside_of_the_room(
+def test_no_drone_ends_inside_a_solid_or_outside_the_room(
     name: str, actions: list[Velocity | Attitude], seed: int
 ) -> None:
     world = load_world(name, seed)
@@ -101,7 +101,7 @@ def test_bounces_never_gain_energy() -> None:
         simulation.step(5)
         truth = simulation.truth(0)
         energy = GRAVITY_M_S2 * truth.position_m[2] + float(np.dot(truth.velocity_m_s, truth.velocity_m_s)) / 2
-        assert energy <= before + 2e-2  # the fixed step itself is worth some g·v·Δt
+        assert energy <= before + 2e-2  # the fixed step itself adds some g·v·Δt
         before = min(before, energy)
     assert before < GRAVITY_M_S2 * 2
 
@@ -167,7 +167,7 @@ def test_a_fast_platform_that_turns_takes_a_drone_along(speed: float, radius: fl
     )
     simulation = Simulation(world, parameters=IDEAL)
     places = []
-    for wait in (1.0, 8.0):  # it slides while the platform, which does not start from rest, accelerates it
+    for wait in (1.0, 8.0):  # the platform is already moving, so the drone slides at first
         simulation.step(steps(wait))
         truth, (platform,) = simulation.truth(0), simulation.target_states()
         east, north = truth.position_m[0] - platform.position_m[0], truth.position_m[1] - platform.position_m[1]
@@ -176,7 +176,7 @@ def test_a_fast_platform_that_turns_takes_a_drone_along(speed: float, radius: fl
         places.append((c * east + s * north, c * north - s * east, turned))
     assert truth.state is FlightState.LANDED
     assert truth.position_m[2] == pytest.approx(0.2 + IDEAL.half_height_m, abs=5e-3)
-    assert places[1] == pytest.approx(places[0], abs=0.03), "where it stands on the platform, and how it is turned"
+    assert places[1] == pytest.approx(places[0], abs=0.03), "its position and heading on the platform"
 
 
 def test_a_gate_lets_a_drone_through_its_opening_and_stops_it_at_its_frame() -> None:
@@ -211,7 +211,7 @@ def test_drones_do_not_pass_through_one_another() -> None:
     assert "another drone" in occurrences[0].text
 
 
-def test_a_drone_that_lands_on_another_does_not_push_it_into_the_floor() -> None:
+def test_a_drone_landing_on_another_does_not_push_it_into_the_floor() -> None:
     simulation = above_another(replace(TOUGH, restitution=0.0))
     simulation.command(1, Velocity(up=-2.0))
     for _ in range(steps(4)):
@@ -219,7 +219,7 @@ def test_a_drone_that_lands_on_another_does_not_push_it_into_the_floor() -> None
         assert min(simulation.truth(drone).position_m[2] for drone in (0, 1)) > IDEAL.half_height_m - 1e-6
 
 
-def test_a_spawn_within_a_box_is_refused() -> None:
+def test_a_spawn_inside_a_box_is_refused() -> None:
     world = parse_world(
         "[room]\nsize = [5, 5, 3]\n[[box]]\nstands_at = [0, 0]\nsize = [1, 1, 1]\n[[spawn]]\nposition = [0.4, 0, 0]\n"
     )
@@ -227,7 +227,7 @@ def test_a_spawn_within_a_box_is_refused() -> None:
         Simulation(world)
 
 
-def test_drones_beyond_the_spawns_stand_apart() -> None:
+def test_drones_without_a_spawn_are_placed_apart() -> None:
     positions, _ = Simulation(load_world("empty"), 100).poses()
     apart = np.linalg.norm(positions[:, None] - positions[None], axis=2) + 9 * np.eye(100)
     assert apart.min() > 2 * IDEAL.radius_m

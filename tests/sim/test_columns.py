@@ -1,4 +1,4 @@
-"""Drones computed one by one in plain numbers fly, bit by bit, as those that are computed together in arrays."""
+"""Drones computed one by one in plain numbers fly, bit by bit, like those computed together in arrays."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ actions = set_points | st.sampled_from([Hover(), Land(), Takeoff(), EmergencySto
 
 
 def fly(commands: list[AnyAction], world: str, seed: int, one_by_one: bool) -> Flight:
-    """Three different vehicles near one another and to walls, in gusts."""
+    """Fly three different vehicles close to one another and to walls, in gusts."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columns, "FEW", 3 if one_by_one else 0)
         simulation = Simulation(
@@ -69,7 +69,7 @@ def test_a_few_drones_are_read_and_written_as_numbers() -> None:
 
 
 @given(st.floats(-9, 9), st.floats(-9, 9))
-def test_operations_mean_the_same_for_numbers_and_arrays(one: float, other: float) -> None:
+def test_operations_are_the_same_for_numbers_and_arrays(one: float, other: float) -> None:
     for do in (NUMBERS, ARRAYS):
         assert do.least(one, other) == min(one, other)
         assert do.most(one, other) == max(one, other)

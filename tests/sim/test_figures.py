@@ -68,25 +68,25 @@ def test_a_figure_is_read_with_its_shape_size_look_and_colour() -> None:
         ("marker_size = 0.2", "marker_size"),
     ],
 )
-def test_what_a_figure_can_not_be_is_refused(line: str, wrong: str) -> None:
+def test_invalid_figures_are_refused(line: str, wrong: str) -> None:
     with pytest.raises(FileFormatError, match=wrong):
         parse_world(OUTSIDE + PERSON + line + "\n")
 
 
 def test_a_path_out_of_the_world_and_light_out_of_range_are_refused() -> None:
-    with pytest.raises(FileFormatError, match="outside of the room"):
+    with pytest.raises(FileFormatError, match="outside the room"):
         parse_world(OUTSIDE + PERSON.replace("[1, 0, 0]", "[9, 0, 0]"))
     with pytest.raises(FileFormatError, match="amplitude"):
         parse_world(OUTSIDE + "[light]\namplitude = 1.5\n")
 
 
-def test_the_way_walked_grows_with_the_speed_and_not_at_rest() -> None:
+def test_the_distance_walked_grows_with_the_speed_and_not_at_rest() -> None:
     walking, standing = (parse_world(OUTSIDE + text) for text in (WALKER, PERSON))
     assert Simulation(walking).target_states(3.0)[0].walked_m == pytest.approx(4.5, abs=0.05)
     assert Simulation(standing).target_states(3.0)[0].walked_m == 0.0
 
 
-def test_legs_move_with_the_way_walked() -> None:
+def test_legs_move_with_the_distance_walked() -> None:
     scene = Scene(parse_world(OUTSIDE + PERSON), 0)
     still = state(scene.world)
     (anna,) = still.targets
@@ -95,7 +95,7 @@ def test_legs_move_with_the_way_walked() -> None:
     assert np.ptp(legs[1][..., 0]) > np.ptp(legs[0][..., 0]) + 0.4  # feet apart along x
 
 
-def test_a_person_is_solid_wherever_it_walks_and_a_drone_that_hits_it_is_told() -> None:
+def test_a_walking_person_is_solid_and_a_drone_that_hits_it_is_reported() -> None:
     simulation = Simulation(parse_world(OUTSIDE + PERSON), parameters=IDEAL)
     simulation.command(0, Takeoff())
     simulation.step(steps(4))
@@ -132,7 +132,7 @@ def test_light_dims_the_whole_picture_and_full_light_changes_no_bit() -> None:
     assert (dimmed(full.copy(), 1.0) == full).all()
 
 
-def test_people_and_changing_light_are_the_same_compiled_bit_by_bit() -> None:
+def test_compiled_people_and_changing_light_are_the_same_bit_by_bit() -> None:
     pytest.importorskip("numba")
     compiler = Compiler(load_kernels)
     compiler.start().join()
@@ -147,7 +147,7 @@ def test_people_and_changing_light_are_the_same_compiled_bit_by_bit() -> None:
         assert (plain.render(now, pose, MODEL) == compiled.render(now, pose, MODEL)).all()
 
 
-def test_boxes_say_where_a_person_is_and_how_much_a_crate_hides() -> None:
+def test_boxes_give_a_persons_position_and_visible_share() -> None:
     def label(crates: str) -> dict[str, object]:
         world = parse_world(OUTSIDE + PERSON + crates)
         found = target_boxes(Scene(world, 0), state(world), camera(-3, 0, 0.9), MODEL)

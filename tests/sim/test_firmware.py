@@ -1,4 +1,4 @@
-"""Drones that firmware flies, and the instruments that it reads."""
+"""Drones flown by firmware, and the instruments that it reads."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STILL = (0.0, 0.0, 0.0)
 
 
 class Scripted:
-    """Firmware that remembers its readings and does what a function says."""
+    """Firmware that records its readings and takes its commands from a function."""
 
     def __init__(self, fly: Callable[[Readings], Sequence[float] | None]) -> None:
         self.fly = fly
@@ -43,10 +43,10 @@ class Scripted:
 
 
 class Hovering:
-    """A flight controller as simple as can be, which knows no more than its instruments tell.
+    """A very simple flight controller that uses only its instruments.
 
-    Attitude: gyro, corrected slowly by where the accelerometer feels down. Height: barometer. Over the ground: what the
-    flow sensor sees.
+    Attitude: gyro, slowly corrected towards the accelerometer's down. Height: barometer. Horizontal motion: flow
+    sensor.
     """
 
     def __init__(self, vehicle: VehicleParameters, height_m: float) -> None:
@@ -58,7 +58,7 @@ class Hovering:
         )
         ix, iy, iz = rotors.inertia_kg_m2
         (x, y), *_ = rotors.places_m
-        # Commands per rad/s²: by how much the thrust of one rotor changes with its command.
+        # Commands per rad/s²: change of one rotor's thrust with its command.
         hover = self.hover * (rotors.full_speed_rad_s - rotors.idle_speed_rad_s) + rotors.idle_speed_rad_s
         slope = 2 * rotors.thrust_n_s2 * hover * (rotors.full_speed_rad_s - rotors.idle_speed_rad_s)
         self.gains = ix / (4 * y * slope), iy / (4 * x * slope), iz / (4 * rotors.torque_m * slope)
@@ -103,7 +103,7 @@ def ideal(vehicle: VehicleParameters) -> VehicleParameters:
 
 
 def standing(firmware: Firmware, vehicle: VehicleParameters = IRIS, world: World = HALL, seed: int = 1) -> Simulation:
-    """A drone on the ground that firmware flies."""
+    """Return a simulation with a drone on the ground, flown by firmware."""
     simulation = Simulation(world, seed=seed, parameters=vehicle)
     simulation.fly_by(0, firmware)
     return simulation
@@ -114,7 +114,7 @@ def idle(_: Readings) -> tuple[float, ...]:
 
 
 @VEHICLES
-def test_a_simple_controller_hovers_by_what_it_reads(vehicle: VehicleParameters) -> None:
+def test_a_simple_controller_hovers_with_its_instruments(vehicle: VehicleParameters) -> None:
     simulation = standing(Hovering(vehicle, 1.5), vehicle)
     simulation.step(steps(6))
     for _ in range(20):
@@ -127,7 +127,7 @@ def test_a_simple_controller_hovers_by_what_it_reads(vehicle: VehicleParameters)
     assert simulation.take_occurrences() == []
 
 
-def test_it_is_called_each_millisecond_with_the_truth_beside_the_readings() -> None:
+def test_it_is_called_each_millisecond_with_readings_and_truth() -> None:
     firmware = Scripted(idle)
     simulation = Simulation(HALL, parameters=ideal(IRIS))
     simulation.step(3)
@@ -142,18 +142,18 @@ def test_it_is_called_each_millisecond_with_the_truth_beside_the_readings() -> N
     assert last.battery_v == pytest.approx(12.6, abs=0.01)
 
 
-def test_commands_stay_in_force_until_new_ones_come_and_are_clamped() -> None:
+def test_commands_are_clamped_and_stay_in_force_until_new_ones_arrive() -> None:
     asked = {0.0: (2.0, 2.0, 2.0, 2.0), 0.5: (-1.0, -1.0, -1.0, -1.0)}
     firmware = Scripted(lambda readings: asked.get(readings.time_s))
     simulation = standing(firmware, ideal(RACER))
     simulation.step(steps(0.12))
-    assert simulation.truth(0).thrust > 3.0  # full, less what the battery sags and the climb takes away
+    assert simulation.truth(0).thrust > 3.0  # full, less the battery's sag and the effect of the climb
     simulation.step(steps(1.0))
     assert simulation.truth(0).thrust == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("commands", [(0.5, 0.5, 0.5), (0.5, 0.5, 0.5, math.nan)])
-def test_commands_that_are_none_end_the_step_with_an_error(commands: tuple[float, ...]) -> None:
+def test_invalid_commands_end_the_step_with_an_error(commands: tuple[float, ...]) -> None:
     simulation = standing(Scripted(lambda _: commands))
     with pytest.raises(UsageError, match="4 finite rotor commands, front left first"):
         simulation.step()
@@ -173,7 +173,7 @@ def test_the_built_in_autopilot_leaves_it_alone() -> None:
     assert [o.kind for o in simulation.take_occurrences()] == [OccurrenceKind.BATTERY_LOW]
 
 
-def test_who_cannot_be_flown_by_firmware_is_told_why() -> None:
+def test_drones_that_firmware_cannot_fly_are_refused_with_the_reason() -> None:
     with pytest.raises(UsageError, match="RACER, IRIS and CRAZYFLIE"):
         Simulation(HALL).fly_by(0, Scripted(idle))
     simulation = flying(parameters=ideal(IRIS))
@@ -185,7 +185,7 @@ def test_who_cannot_be_flown_by_firmware_is_told_why() -> None:
         simulation.fly_by(1, Scripted(idle))
 
 
-def test_its_state_is_landed_while_it_stands_idle_and_flying_else() -> None:
+def test_its_state_is_landed_while_idle_on_the_ground_and_flying_otherwise() -> None:
     firmware = Scripted(idle)
     simulation = standing(firmware, ideal(IRIS))
     simulation.step()
@@ -193,7 +193,7 @@ def test_its_state_is_landed_while_it_stands_idle_and_flying_else() -> None:
     firmware.fly = lambda _: (0.1, 0.1, 0.1, 0.1)  # armed, and idle
     simulation.step(steps(0.5))
     assert simulation.state(0) is FlightState.LANDED
-    firmware.fly = lambda _: (0.3, 0.3, 0.3, 0.3)  # turns, and still stands
+    firmware.fly = lambda _: (0.3, 0.3, 0.3, 0.3)  # the rotors turn, and it is still on the ground
     simulation.step(steps(0.5))
     assert simulation.state(0) is FlightState.FLYING
     assert simulation.truth(0).position_m[2] == pytest.approx(IRIS.half_height_m, abs=1e-3)
@@ -216,7 +216,7 @@ def test_collisions_are_reported_and_stop_no_rotor() -> None:
     assert simulation.truth(0).thrust > 0.5
 
 
-def test_released_on_the_ground_the_autopilot_has_it_again() -> None:
+def test_the_autopilot_takes_over_a_drone_released_on_the_ground() -> None:
     simulation = standing(Scripted(idle), ideal(IRIS))
     simulation.step()
     simulation.release(0)
@@ -226,7 +226,7 @@ def test_released_on_the_ground_the_autopilot_has_it_again() -> None:
     assert simulation.state(0) is FlightState.HOVERING
 
 
-def test_released_in_the_air_it_falls_in_an_emergency_and_firmware_may_take_it_again() -> None:
+def test_a_drone_released_in_the_air_falls_in_an_emergency_and_firmware_may_take_it_again() -> None:
     simulation = standing(Scripted(lambda _: (0.95, 0.95, 0.95, 0.95)), ideal(IRIS))
     simulation.step(steps(1.5))
     simulation.release(0)
@@ -249,7 +249,7 @@ def test_with_an_empty_battery_the_rotors_stop() -> None:
     assert simulation.feedback(0).battery_v == 0.0
 
 
-def test_a_drone_beside_it_is_flown_as_ever() -> None:
+def test_another_drone_is_flown_as_usual() -> None:
     simulation = Simulation(HALL, 2, parameters=ideal(CRAZYFLIE))
     simulation.fly_by(1, Scripted(idle))
     simulation.command(0, Takeoff())
@@ -261,7 +261,7 @@ def test_a_drone_beside_it_is_flown_as_ever() -> None:
 
 
 def test_a_racer_flips() -> None:
-    """Left rotors faster than right ones for a moment, then the other way round: once about the forward axis."""
+    """Left rotors faster than right ones for a moment, then the reverse: one turn about the forward axis."""
 
     def flip(readings: Readings) -> tuple[float, ...]:
         t = readings.time_s
@@ -310,7 +310,7 @@ def read(
     return [one.read(step, position, velocity, quaternion, rates, force, 12.0, 1.0) for step in range(count)]
 
 
-def test_noise_and_bias_are_as_large_as_the_parameters_say() -> None:
+def test_noise_and_bias_match_the_parameters() -> None:
     readings = read(instruments(IRIS), 20_000)
     errors = InstrumentParameters()
     gyro = np.array([reading.gyro_rad_s for reading in readings])
@@ -319,7 +319,7 @@ def test_noise_and_bias_are_as_large_as_the_parameters_say() -> None:
     pressure = np.array([[reading.pressure_pa] for reading in readings[::20]])
 
     def noise(samples: np.typing.NDArray[np.float64]) -> list[float]:
-        """From one sample to the next, which the wandering does not reach."""
+        """Return the deviation between successive samples, which the wandering bias hardly affects."""
         return (np.diff(samples, axis=0).std(axis=0) / math.sqrt(2)).tolist()  # type: ignore[no-any-return]
 
     assert noise(gyro) == pytest.approx([errors.gyro_noise_rad_s] * 3, rel=0.05)
@@ -331,17 +331,17 @@ def test_noise_and_bias_are_as_large_as_the_parameters_say() -> None:
     assert pressure.mean() == pytest.approx(pressure_pa(1.0), abs=4 * errors.barometer_bias_pa)
 
 
-def test_gyros_keep_their_error_and_accelerometers_do_not() -> None:
+def test_gyro_biases_last_and_accelerometer_biases_wander() -> None:
     one = instruments(IRIS, gyro_noise_rad_s=0.0, accelerometer_noise_m_s2=0.0)
     first, *_, last = read(one, 30_000)
     errors = InstrumentParameters()
     moved = np.abs(np.subtract(last.gyro_rad_s, first.gyro_rad_s))
-    assert 0.0 < moved.max() < 0.15 * errors.gyro_bias_rad_s  # 0.045 of it, 1 σ: heading is lost slowly
+    assert 0.0 < moved.max() < 0.15 * errors.gyro_bias_rad_s  # 0.045 of it, 1 σ: the heading drifts slowly
     moved = np.abs(np.subtract(last.acceleration_m_s2, first.acceleration_m_s2))
     assert moved.max() > 0.15 * errors.accelerometer_bias_m_s2
 
 
-def test_gps_comes_in_its_time_with_its_delay() -> None:
+def test_gps_arrives_at_its_rate_with_its_delay() -> None:
     errors = InstrumentParameters()
     fixes = [(reading.time_s, reading.gps) for reading in read(instruments(IRIS), 2000) if reading.gps is not None]
     assert [round(time * 1000) for time, _ in fixes] == list(range(120, 2000, 100))
@@ -364,7 +364,7 @@ def test_the_field_of_the_earth_turns_with_the_body() -> None:
     assert on_its_side.magnetic_gauss == pytest.approx((east, up, -north))
 
 
-def test_flow_is_what_a_camera_sees_move() -> None:
+def test_flow_is_the_motion_seen_by_a_camera() -> None:
     one = ideal(IRIS)
     still = read(instruments(one, 2.0), 40, rates=(0.3, -0.2, 0.0))
     moving = read(instruments(one, 2.0), 40, velocity=(1.0, 0.5, 0.0))
@@ -379,7 +379,7 @@ def test_flow_is_what_a_camera_sees_move() -> None:
 
 
 @pytest.mark.parametrize(("below_m", "range_m", "quality"), [(3.0, 3.0, 1.0), (0.05, 0.05, 0.0), (9.0, None, 0.0)])
-def test_out_of_reach_there_is_neither_range_nor_flow(below_m: float, range_m: float | None, quality: float) -> None:
+def test_out_of_range_there_is_neither_range_nor_flow(below_m: float, range_m: float | None, quality: float) -> None:
     readings = read(instruments(ideal(IRIS), below_m), 20, velocity=(1.0, 0.0, 0.0))
     assert readings[-1].range_m == range_m
     flow = readings[-1].flow
@@ -401,7 +401,7 @@ def test_the_range_finder_sees_boxes_platforms_and_the_floor() -> None:
     assert solids.distance_along((1.0, 0.0, 2.0), slanting, 0.0) == pytest.approx(1.2 / math.cos(0.4))
     assert solids.distance_along((0.0, 0.0, 2.0), (0.0, 0.0, 1.0), 0.0) == pytest.approx(3.0)  # the ceiling
     assert solids.distance_along((0.0, 0.0, 2.0), (0.0, -1.0, 0.0), 0.0) == pytest.approx(10.0)  # a wall
-    assert solids.distance_along((2.0, 0.0, 0.4), down, 0.0) == 0.0  # within
+    assert solids.distance_along((2.0, 0.0, 0.4), down, 0.0) == 0.0  # inside
     outdoors = Solids(parse_world("[room]\nsize = [20, 20, 5]\nenclosed = false\n"), ())
     assert math.isinf(outdoors.distance_along((0.0, 0.0, 2.0), (0.0, 0.0, 1.0), 0.0))
 
@@ -415,7 +415,7 @@ def test_the_range_finder_follows_a_platform() -> None:
     assert solids.distance_along((x, y, top + 1.0), (0.0, 0.0, -1.0), 5.0) == pytest.approx(1.0)
 
 
-def test_places_on_earth_and_back() -> None:
+def test_positions_on_earth_and_back() -> None:
     for place in ((0.0, 0.0, 0.0), (120.0, -45.0, 30.0)):
         assert local(*geodetic(place)) == pytest.approx(place, abs=1e-6)
     latitude, longitude, altitude = geodetic((0.0, 1852.0, 0.0))

@@ -84,7 +84,7 @@ def test_takeoff_climbs_to_a_metre_and_hovers() -> None:
     assert simulation.feedback(0).altitude_m == pytest.approx(1.0, abs=0.02)
 
 
-def test_hover_holds_its_place_in_still_air() -> None:
+def test_hover_holds_its_position_in_still_air() -> None:
     simulation = flying()
     before = np.array(simulation.truth(0).position_m)
     simulation.step(steps(10))
@@ -121,7 +121,7 @@ def test_landing_ends_on_the_ground_with_the_motors_off() -> None:
 
 
 @pytest.mark.parametrize("action", [Velocity(0.5), Attitude(pitch=0.1), Hover(), Land(), Idle(), ResetEmergency()])
-def test_what_does_not_fit_on_the_ground_is_ignored(action: AnyAction) -> None:
+def test_unsuitable_actions_on_the_ground_are_ignored(action: AnyAction) -> None:
     simulation = Simulation(HALL)
     assert simulation.command(0, action) == Idle()
     simulation.step(100)
@@ -222,7 +222,7 @@ def test_an_attitude_step_is_a_second_order_response() -> None:
 
 
 @pytest.mark.parametrize("tilt", [0.1, 0.3])
-def test_speed_under_a_steady_tilt_is_where_drag_balances_thrust(tilt: float) -> None:
+def test_drag_balances_thrust_under_a_steady_tilt(tilt: float) -> None:
     world = replace(HALL, room=replace(HALL.room, size_m=(300.0, 20.0, 10.0)))
     simulation = Simulation(world, parameters=IDEAL, limits=Limits(tilt_rad=0.5))
     simulation.command(0, Takeoff())
@@ -263,7 +263,7 @@ def test_the_ground_effect_saves_thrust_near_the_floor() -> None:
     assert thrusts[1] < thrusts[0]
 
 
-def test_limits_clamp_and_the_applied_set_point_is_told() -> None:
+def test_limits_clamp_and_the_applied_set_point_is_returned() -> None:
     simulation = flying()
     limits = Limits(tilt_rad=0.1, climb_m_s=0.5, yaw_rate_rad_s=1.0, altitude_m=1.5, speed_m_s=1.0)
     simulation.set_limits(0, limits)
@@ -302,7 +302,7 @@ def test_wrong_arguments_are_refused() -> None:
         Simulation(HALL).feedback(1)
     with pytest.raises(UsageError, match=r"skyloop\.messages"):
         Simulation(HALL).command(0, "takeoff")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=r"place for \d+ drones only"):
+    with pytest.raises(UsageError, match=r"room for \d+ drones only"):
         Simulation(load_world("room"), 200)
     with pytest.raises(UsageError, match="tilt_rad must be a number from"):
         Limits(tilt_rad=math.nan)
@@ -336,7 +336,7 @@ def test_the_same_seed_and_commands_give_the_same_bits() -> None:
     assert fly_about(3, seed=6).truth(0) != one.truth(0)
 
 
-def test_looking_changes_nothing() -> None:
+def test_queries_change_nothing() -> None:
     watched, alone = flying(parameters=VehicleParameters()), flying(parameters=VehicleParameters())
     for _ in range(50):
         watched.step(7)
@@ -347,7 +347,7 @@ def test_looking_changes_nothing() -> None:
     assert watched.truth(0) == alone.truth(0)
 
 
-def test_steps_in_one_go_are_the_same_as_one_by_one() -> None:
+def test_many_steps_at_once_equal_single_steps() -> None:
     one, many = flying(), flying()
     one.step(200)
     for _ in range(200):
@@ -355,7 +355,7 @@ def test_steps_in_one_go_are_the_same_as_one_by_one() -> None:
     assert one.truth(0) == many.truth(0)
 
 
-def test_a_drone_among_others_flies_as_it_does_alone() -> None:
+def test_a_drone_among_others_flies_as_if_alone() -> None:
     wind = Wind((0.5, 0.0, 0.0), 0.3, 1.0)
     alone, among = (fly_about(n, seed=2, wind=wind, world="empty") for n in (1, 12))
     assert among.take_occurrences() == []
@@ -364,7 +364,7 @@ def test_a_drone_among_others_flies_as_it_does_alone() -> None:
     assert among.feedback(0).acceleration_m_s2 == pytest.approx(alone.feedback(0).acceleration_m_s2, abs=1e-9)
 
 
-def test_poses_are_those_of_the_truth() -> None:
+def test_poses_match_the_truth() -> None:
     simulation = fly_about(3, seed=1)
     positions, rotations = simulation.poses()
     assert positions.shape == (3, 3)
@@ -380,7 +380,7 @@ def test_poses_are_those_of_the_truth() -> None:
 
 
 @pytest.mark.parametrize("drones", [2, 6])
-def test_motions_are_those_of_truth_and_feedback(drones: int) -> None:
+def test_motions_match_truth_and_feedback(drones: int) -> None:
     simulation = Simulation(HALL, drones, seed=1)
     simulation.command(1, Takeoff())
     simulation.step(steps(4))
@@ -397,9 +397,9 @@ def test_motions_are_those_of_truth_and_feedback(drones: int) -> None:
     assert simulation.motions()[0].any(), "they are copies"
 
 
-def test_a_flying_drone_can_be_put_elsewhere_and_holds_that_place() -> None:
+def test_a_flying_drone_can_be_moved_and_holds_its_new_position() -> None:
     simulation = Simulation(load_world("empty"), 2, seed=1)
-    with pytest.raises(UsageError, match="only one that flies"):
+    with pytest.raises(UsageError, match="only a flying drone"):
         simulation.put(0, (1.0, 2.0, 2.0))
     for drone in (0, 1):
         simulation.command(drone, Takeoff())
@@ -414,7 +414,7 @@ def test_a_flying_drone_can_be_put_elsewhere_and_holds_that_place() -> None:
     after = simulation.truth(0)
     assert math.dist(after.position_m, (3.0, -2.0, 2.5)) < 0.3
     assert after.yaw_rad == pytest.approx(1.0, abs=0.05)
-    assert math.dist(simulation.truth(1).position_m, other) < 0.5, "the other one stays where it was"
+    assert math.dist(simulation.truth(1).position_m, other) < 0.5, "the other one keeps its position"
     for wrong in ((math.nan, 0.0, 1.0), (0.0, 1.0)):
-        with pytest.raises(UsageError, match="three finite numbers"):
+        with pytest.raises(UsageError, match="three finite coordinates"):
             simulation.put(0, wrong)  # type: ignore[arg-type]

@@ -51,7 +51,7 @@ def test_late_calls_are_caught_up_without_drift(waits: list[float], speed: float
     assert pacer.lost_s == 0
 
 
-def test_a_long_pause_is_given_up_and_counted() -> None:
+def test_a_long_pause_is_skipped_and_counted() -> None:
     clock, counter = ManualClock(), Counter()
     pacer = Pacer(counter, clock=clock)
     clock.advance(10.0)
@@ -66,7 +66,7 @@ def test_a_long_pause_is_given_up_and_counted() -> None:
     assert counter.steps - done == pytest.approx(0.1 / STEP_S, abs=1)
 
 
-def test_how_much_is_caught_up_can_be_less() -> None:
+def test_the_catch_up_can_be_limited() -> None:
     clock, counter = ManualClock(), Counter()
     pacer = Pacer(counter, most_lag_s=0.02, clock=clock)
     clock.advance(1.0)
@@ -83,35 +83,35 @@ def test_one_call_does_not_run_for_long() -> None:
     assert counter.steps == 25
 
 
-def test_times_of_the_simulation_map_to_the_clock() -> None:
+def test_simulation_times_map_to_the_clock() -> None:
     clock = ManualClock()
     pacer = Pacer(Counter(), speed=2.0, clock=clock)
     assert pacer.clock_ns(1.0) == clock.now_ns + 500_000_000
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf])
-def test_a_speed_that_is_none_is_refused(speed: float) -> None:
+def test_an_invalid_speed_is_refused(speed: float) -> None:
     with pytest.raises(UsageError, match="speed"):
         Pacer(Counter(), speed=speed)
 
 
-def test_a_simulation_that_stays_behind_is_said_now_and_then() -> None:
+def test_a_slow_simulation_is_reported_periodically() -> None:
     watch, lost_s = SlownessWatch(0), 0.0
     said = []
     for n in range(1, 40):
         now_ns = n * SLOW_NS
         lost_s += 0.0 if n < 3 else 0.1 if n < 5 else 1.0  # of 5 s each
         share = watch.update(lost_s, now_ns)
-        assert watch.update(lost_s + 1.0, now_ns + 1) is None, "over a while only"
+        assert watch.update(lost_s + 1.0, now_ns + 1) is None, "only over some time"
         if share is not None:
             assert share == pytest.approx(0.8)
             said.append(now_ns)
-    assert said[0] == 5 * SLOW_NS, "a little is no matter"
+    assert said[0] == 5 * SLOW_NS, "a small lag is not reported"
     assert [b - a for a, b in itertools.pairwise(said)] == [SLOW_AGAIN_NS] * 2
 
 
-def test_one_thread_at_a_time_steps_a_world_that_is_left_and_joined_again() -> None:
-    """The one that ended was still in a step when the next one began."""
+def test_one_thread_at_a_time_steps_a_world_after_a_restart() -> None:
+    """The ending thread was once still in a step when the next one began."""
 
     class Observer:
         def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Drones that land while they are pressed against something, or stand on one another."""
+"""Drones that land while pressed against something, or on one another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.sim.helpers import IDEAL, above_another, flying, steps
 
 TOUGH = replace(VehicleParameters(), crash_speed_m_s=100.0)
 CORNERS = "[room]\nsize = [5, 5, 3]\n"
-#: Two slabs that leave a gap which narrows: pushing a drone out of one of them leads into the other.
+#: Two slabs with a narrowing gap: pushing a drone out of one of them leads into the other.
 FUNNEL = (
     "[room]\nsize = [8, 8, 3]\n[[spawn]]\nposition = [-2, 0, 0]\n"
     "[[box]]\nposition = [1, 0.7, 1.5]\nsize = [3, 0.4, 3]\nyaw_deg = {left}\n"
@@ -25,7 +25,7 @@ FUNNEL = (
 
 
 def seconds_to_land(simulation: Simulation, patience_s: float = 20.0) -> float:
-    """Tell all to land and wait until each has; fails if one does not within the time of the simulation."""
+    """Land all drones and return the time until they have landed; fail if one takes too long in simulation time."""
     begun_s = simulation.time_s
     for drone in range(simulation.drones):
         simulation.command(drone, Land())
@@ -36,7 +36,7 @@ def seconds_to_land(simulation: Simulation, patience_s: float = 20.0) -> float:
 
 
 def pressed(world: World, action: Velocity | Attitude, limits: Limits, seed: int = 1) -> Simulation:
-    """A drone that followed a set-point for long enough to be held by something, and to have learnt from it."""
+    """Return a simulation whose drone followed a set-point until something held it and its loops had adapted."""
     simulation = Simulation(world, parameters=TOUGH, limits=limits, seed=seed)
     simulation.command(0, Takeoff())
     simulation.step(steps(4))
@@ -49,7 +49,7 @@ def pressed(world: World, action: Velocity | Attitude, limits: Limits, seed: int
 @pytest.mark.parametrize("climb_m_s", [0.1, 0.3, 0.7])
 @pytest.mark.parametrize("tilt_rad", [0.21, 0.6])
 @pytest.mark.parametrize("action", [Velocity(1.0), Velocity(1.0, 1.0), Velocity(0.2, 0.2), Attitude(0.2, 0.2)])
-def test_a_drone_in_a_corner_gets_down(action: Velocity | Attitude, tilt_rad: float, climb_m_s: float) -> None:
+def test_a_drone_in_a_corner_lands(action: Velocity | Attitude, tilt_rad: float, climb_m_s: float) -> None:
     simulation = pressed(parse_world(CORNERS), action, Limits(tilt_rad=tilt_rad, climb_m_s=climb_m_s))
     assert seconds_to_land(simulation) < 4.0 + 2.0 / climb_m_s
     assert math.hypot(*simulation.truth(0).velocity_m_s) < 1.0
@@ -63,18 +63,18 @@ def test_a_drone_in_a_corner_gets_down(action: Velocity | Attitude, tilt_rad: fl
     st.sampled_from([Velocity(0.3), Velocity(1.5), Velocity(1.0, 0.4), Attitude(pitch=0.2)]),
     st.integers(0, 1000),
 )
-def test_a_drone_in_a_funnel_gets_down(left: float, right: float, action: Velocity | Attitude, seed: int) -> None:
+def test_a_drone_in_a_funnel_lands(left: float, right: float, action: Velocity | Attitude, seed: int) -> None:
     world = parse_world(FUNNEL.format(left=left, right=right))
     simulation = pressed(world, action, Limits(tilt_rad=LIMIT_RANGES["tilt_rad"][1]), seed)
     seconds_to_land(simulation)
 
 
-def test_a_landing_without_hindrance_is_a_landing_as_before() -> None:
+def test_an_unhindered_landing_is_unchanged() -> None:
     simulation = flying()
     assert seconds_to_land(simulation) == pytest.approx(2.0, abs=0.5)
 
 
-def test_a_drone_that_lands_on_one_that_stands_has_landed() -> None:
+def test_a_drone_on_another_one_has_landed() -> None:
     simulation = above_another(replace(IDEAL, restitution=0.0))
     seconds_to_land(simulation)
     assert simulation.truth(1).position_m[2] == pytest.approx(3 * IDEAL.half_height_m, abs=1e-3)

@@ -1,5 +1,5 @@
-"""The renderer against a ray caster that shares none of its mathematics: every pixel's ray is cut with every quad's
-plane in world axes, the point is tested against the quad's edges there, and the nearest wins."""
+"""The renderer against a ray caster with independent mathematics: it intersects every pixel's ray with every quad's
+plane in world axes, tests the point against the quad's edges there, and takes the nearest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TEXELS = 256
 
 
 def smooth_texture(seed: int) -> NDArray[np.uint8]:
-    """Colours that change slowly, so that a mip level or a filter hardly changes what is seen at a place."""
+    """Return slowly changing colours, so that a mip level or a filter hardly changes the colour of a place."""
     rng = np.random.default_rng(seed)
     small = rng.integers(30, 225, (4, 4, 3)).astype(np.uint8)
     return np.asarray(cv2.resize(small, (TEXELS, TEXELS), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
@@ -33,7 +33,7 @@ def smooth_texture(seed: int) -> NDArray[np.uint8]:
 
 @dataclass
 class Stage:
-    """A room with tilted boxes and a triangle, drawn from quads alone: stands in for a Scene."""
+    """A room with tilted boxes and a triangle, drawn from quads alone; replaces a Scene."""
 
     quads: Quads
     atlas: Atlas
@@ -82,7 +82,7 @@ def build_stage() -> Stage:
 
 
 def random_poses(count: int) -> list[CameraPose]:
-    """Anywhere in the room, every other one within 3 cm to 30 cm of a wall and looking along it."""
+    """Return poses anywhere in the room, every other one 3 cm to 30 cm from a wall and looking along it."""
     rng = np.random.default_rng(11)
     poses = []
     for k in range(count):
@@ -103,7 +103,7 @@ def random_poses(count: int) -> list[CameraPose]:
 
 
 def cast(quads: Quads, pose: CameraPose, rays: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Which quad each ray (n, 3; optical axes, z = 1) meets first, -1 for none, and at which z [m]."""
+    """Return the quad that each ray (n, 3; optical axes, z = 1) meets first, -1 for none, and its z [m]."""
     world = rays @ pose.rotation.T
     nearest, hit = np.full(len(rays), np.inf), np.full(len(rays), -1, np.intp)
     for k, corners in enumerate(quads.corners):
@@ -121,14 +121,14 @@ def cast(quads: Quads, pose: CameraPose, rays: NDArray[np.float64]) -> tuple[NDA
 
 
 def away_from_edges(hit: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Pixels whose neighbours all show the same quad."""
+    """Return the pixels whose neighbours all show the same quad."""
     numbers = hit.astype(np.float32)
     around = np.ones((3, 3), np.uint8)
     return np.asarray(cv2.dilate(numbers, around) == cv2.erode(numbers, around))
 
 
 def pixel_rays(model: CameraModel) -> NDArray[np.float64]:
-    """Rays by a table of what the lens does to the radius, shape (pixels, 3)."""
+    """Return rays from a table of the lens's effect on the radius, shape (pixels, 3)."""
     x, y = np.meshgrid(np.arange(model.width) - model.cx, np.arange(model.height) - model.cy)
     bent = np.column_stack([x.ravel() / model.fx, y.ravel() / model.fy])
     straight = np.linspace(0.0, 1.2, 200_001)
@@ -145,8 +145,8 @@ def stage() -> Stage:
 
 @pytest.mark.slow
 def test_no_quad_is_lost_and_depth_is_true_at_200_poses(stage: Stage) -> None:
-    """Coverage: apart from pixels on an edge, each sample shows the very quad that the ray caster finds, and none shows
-    nothing. Depth: within 1e-9 of the distance."""
+    """Coverage: apart from pixels on an edge, each sample shows exactly the quad found by the ray caster, and none is
+    empty. Depth: within 1e-9 of the distance."""
     grid = Grid(PLAIN.width, PLAIN.height, PLAIN.fx, PLAIN.fy, PLAIN.cx, PLAIN.cy)
     buffer = DepthBuffer(grid)
     rays = pixel_rays(PLAIN)
@@ -168,8 +168,8 @@ def test_no_quad_is_lost_and_depth_is_true_at_200_poses(stage: Stage) -> None:
 @pytest.mark.parametrize("model", [PLAIN, BENT], ids=["pinhole", "barrel"])
 @pytest.mark.parametrize("quality", list(Quality))
 def test_colours_agree_away_from_edges(stage: Stage, model: CameraModel, quality: Quality) -> None:
-    """Within 3 of 255 on the average of a picture and 16 for 99.9 % of its pixels; a texel differs from the next by up
-    to 3."""
+    """Within 3 of 255 on average over a picture and 16 for 99.9 % of its pixels; neighbouring texels differ by up to
+    3."""
     renderer = PlanarRenderer(stage, quality)  # type: ignore[arg-type]
     rays = pixel_rays(model)
     worst, means = [], []

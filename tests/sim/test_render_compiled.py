@@ -1,4 +1,4 @@
-"""The compiled way of drawing against the plain one, and what happens where nothing can be compiled."""
+"""Compiled drawing compared with plain drawing, and the behaviour without a compiler."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STRONG = replace(FRONT_CAMERA, name="strong", distortion=(-0.3, 0.1, 0.01, -0.01
 
 
 def ready(functions: Kernels) -> Compiler:
-    """A compiler that is done."""
+    """Return a compiler that is done."""
     compiler = Compiler(lambda: functions)
     compiler.start().join()
     assert compiler.kernels is not None, compiler.problem
@@ -38,7 +38,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def random_view(rng: np.random.Generator, model: CameraModel) -> tuple[SceneState, CameraPose]:
-    """Drones low over the floor, over one another and in front of the camera, which looks anywhere."""
+    """Return drones low over the floor, above one another and in front of the camera, which looks anywhere."""
     size = np.array(WORLD.room.size_m)
     places = rng.uniform(-0.45, 0.45, (3, 3)) * size + (0.0, 0.0, size[2] / 2)
     places[1, 2] = rng.uniform(0.05, 0.3)
@@ -68,14 +68,14 @@ def assert_the_same(
 
 @pytest.mark.parametrize("quality", list(Quality))
 @pytest.mark.parametrize("model", [FRONT_CAMERA, BOTTOM_CAMERA, STRONG], ids=lambda model: model.name)
-def test_compiled_pictures_are_the_plain_ones_bit_by_bit(scene: Scene, model: CameraModel, quality: Quality) -> None:
+def test_compiled_pictures_equal_the_plain_ones_bit_by_bit(scene: Scene, model: CameraModel, quality: Quality) -> None:
     pytest.importorskip("numba")
     assert_the_same(scene, load_kernels(), model.scaled(0.5), quality, views=12, seed=1)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 40), (40, 1), (7, 5), (84, 84), (1100, 3)])
-def test_compiled_pictures_of_any_size_are_the_plain_ones(scene: Scene, width: int, height: int) -> None:
-    """Narrower and wider than what the kernels work on at a time."""
+def test_compiled_pictures_of_any_size_equal_the_plain_ones(scene: Scene, width: int, height: int) -> None:
+    """Narrower and wider than the kernels' batches."""
     pytest.importorskip("numba")
     focal = 1.0 * max(width, height)
     model = CameraModel("odd", width, height, 30.0, focal, focal, width / 2 - 0.5, height / 2 - 0.5, (-0.2, 0, 0, 0, 0))
@@ -83,12 +83,12 @@ def test_compiled_pictures_of_any_size_are_the_plain_ones(scene: Scene, width: i
 
 
 @pytest.mark.parametrize("model", [FRONT_CAMERA, BOTTOM_CAMERA], ids=lambda model: model.name)
-def test_the_kernels_draw_the_same_where_nothing_compiles_them(scene: Scene, model: CameraModel) -> None:
+def test_uncompiled_kernels_draw_the_same(scene: Scene, model: CameraModel) -> None:
     with np.errstate(over="ignore"):
         assert_the_same(scene, Kernels(), model.scaled(0.08), Quality.SMOOTH, views=2, seed=2)
 
 
-def test_a_picture_within_a_larger_one_is_drawn_too(scene: Scene) -> None:
+def test_a_picture_within_a_larger_one_is_drawn(scene: Scene) -> None:
     state, pose = random_view(np.random.default_rng(3), FRONT_CAMERA)
     renderer = PlanarRenderer(scene, compiler=None)
     twice = np.zeros((240, 640, 3), np.uint8)
@@ -97,7 +97,7 @@ def test_a_picture_within_a_larger_one_is_drawn_too(scene: Scene) -> None:
     assert not twice[:, :320].any()
 
 
-def test_it_draws_the_plain_way_until_the_kernels_are_compiled(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_draws_plainly_until_the_kernels_are_compiled(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planar, "WORTH_COMPILING", 2)
     loads: list[int] = []
 
@@ -111,8 +111,8 @@ def test_it_draws_the_plain_way_until_the_kernels_are_compiled(scene: Scene, mon
     state, pose = random_view(np.random.default_rng(4), model)
     first = renderer.render(state, pose, model)
     renderer.render(state, pose, model)
-    assert not loads, "too few pictures to compile for"
-    with np.errstate(over="ignore"):  # what wraps round is meant to
+    assert not loads, "too few pictures for a compilation"
+    with np.errstate(over="ignore"):  # intended wrap-around
         renderer.render(state, pose, model)
         compiler.start().join()
         assert np.array_equal(renderer.render(state, pose, model), first)
@@ -120,7 +120,7 @@ def test_it_draws_the_plain_way_until_the_kernels_are_compiled(scene: Scene, mon
     assert compiler.problem == ""
 
 
-def test_a_process_that_ends_begins_to_compile_no_other_function(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ending_process_compiles_no_further_function(monkeypatch: pytest.MonkeyPatch) -> None:
     at_exit: list[Callable[[], object]] = []
     monkeypatch.setattr("atexit.register", at_exit.append)
     called, going = [], threading.Event()
@@ -135,7 +135,7 @@ def test_a_process_that_ends_begins_to_compile_no_other_function(monkeypatch: py
 
     compiler = Compiler(load)
     thread = compiler.start()
-    assert thread.daemon, "the process would wait for it"
+    assert thread.daemon, "otherwise the process would wait for it"
     at_exit[0]()
     going.set()
     thread.join(0.1)
@@ -147,12 +147,12 @@ def test_a_process_that_ends_begins_to_compile_no_other_function(monkeypatch: py
 @pytest.mark.parametrize(
     ("error", "problem", "told"),
     [
-        (ImportError("No module named 'numba'"), "Numba is not there: No module named 'numba'", 0),
+        (ImportError("No module named 'numba'"), "Numba is not installed: No module named 'numba'", 0),
         (RuntimeError("cannot cache function\nmore"), "Numba can't compile here: cannot cache function", 1),
         (ValueError(), "Numba can't compile here: ValueError()", 1),
     ],
 )
-def test_where_nothing_can_be_compiled_it_says_so_once_and_draws_the_plain_way(
+def test_without_a_compiler_it_warns_once_and_draws_plainly(
     scene: Scene, caplog: pytest.LogCaptureFixture, error: Exception, problem: str, told: int
 ) -> None:
     def load() -> Kernels:

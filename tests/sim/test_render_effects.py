@@ -28,7 +28,7 @@ def test_noise_has_its_sigma_and_no_bias() -> None:
     assert picture.std() == pytest.approx(4.0, abs=0.1)
 
 
-def test_noise_depends_on_seed_and_number_alone() -> None:
+def test_noise_depends_only_on_seed_and_number() -> None:
     noisy = replace(CLEAN, noise_sigma=4.0)
     one = SensorEffects(noisy, seed=1)
     first, second = one.apply(grey(), 0), one.apply(grey(), 1)
@@ -37,7 +37,7 @@ def test_noise_depends_on_seed_and_number_alone() -> None:
     assert not np.array_equal(SensorEffects(noisy, seed=2).apply(grey(), 1), second)
 
 
-def test_noise_saturates_instead_of_wrapping_round() -> None:
+def test_noise_saturates_instead_of_wrapping_around() -> None:
     effects = SensorEffects(replace(CLEAN, noise_sigma=10.0))
     assert effects.apply(grey(255), 0).min() > 180
     assert effects.apply(grey(0), 0).max() < 75
@@ -50,7 +50,7 @@ def test_vignetting_takes_its_share_from_the_corners_and_gain_brightens() -> Non
     assert SensorEffects(replace(CLEAN, exposure_gain=1.5)).apply(grey(100), 0)[50, 50, 0] == 150
 
 
-def test_turning_left_smears_along_the_rows_and_pitching_along_the_columns() -> None:
+def test_turning_left_blurs_along_the_rows_and_pitching_along_the_columns() -> None:
     dot = grey(0)
     dot[120, 160] = 255
     effects = SensorEffects(replace(CLEAN, exposure_s=0.02))

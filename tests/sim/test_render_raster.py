@@ -1,4 +1,4 @@
-"""Where a lens puts the samples of its pictures."""
+"""The sample positions of a lens."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from skyloop.sim.world import TEXTURES, MarkerPattern
 
 @pytest.mark.parametrize("name", TEXTURES)
 @pytest.mark.parametrize("size", [(1.2, 0.8), (0.12, 2.0)], ids=["wide", "sliver"])
-def test_every_surface_can_be_drawn_repeatably_and_has_detail(name: str, size: tuple[float, float]) -> None:
+def test_every_surface_is_reproducible_and_has_detail(name: str, size: tuple[float, float]) -> None:
     picture = draw_surface(name, *size, per_m=120.0)
     assert picture.shape == (max(4, round(size[1] * 120)), max(4, round(size[0] * 120)), 3)
     assert picture.dtype == np.uint8
@@ -20,17 +20,17 @@ def test_every_surface_can_be_drawn_repeatably_and_has_detail(name: str, size: t
     assert picture.std(axis=(0, 1)).max() > 1.5
 
 
-def test_unknown_surface_is_refused_with_the_nearest_name() -> None:
+def test_an_unknown_surface_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(UnknownNameError, match="parquet"):
         draw_surface("parket", 1.0, 1.0, 50.0)
 
 
-def test_paint_has_the_colour_asked_for() -> None:
+def test_paint_has_the_requested_colour() -> None:
     blue, green, red = draw_paint((200, 100, 50))[20:40, 20:40].mean(axis=(0, 1))
     assert (red, green, blue) == pytest.approx((200, 100, 50), rel=0.12)
 
 
-def test_each_level_of_a_texture_lies_where_the_closed_form_says_with_its_rim_repeated() -> None:
+def test_each_level_of_a_texture_is_at_its_computed_place_with_its_rim_repeated() -> None:
     builder = AtlasBuilder()
     rng = np.random.default_rng(2)
     pictures = [rng.integers(0, 255, (h, w, 3)).astype(np.uint8) for h, w in ((128, 64), (50, 200), (7, 7))]

@@ -1,4 +1,4 @@
-"""Formulas of the rotor-level model: what physics says, for any state."""
+"""Formulas of the rotor-level model: laws of physics, for any state."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def quaternions(draw: st.DrawFn) -> tuple[float, float, float, float]:
 
 
 def motion(velocity: tuple[float, ...], height: float = HIGH) -> tuple[float, ...]:
-    """In still air."""
+    """Return the motion in still air."""
     return (0.0, 0.0, 0.0, 0.0, 0.0, height, *velocity)
 
 
@@ -64,7 +64,9 @@ def energy(moved: tuple[float, ...]) -> float:
 
 
 @given(which, quaternions(), velocities)
-def test_a_stone_keeps_its_energy(one: int, quaternion: tuple[float, ...], velocity: tuple[float, ...]) -> None:
+def test_a_body_in_vacuum_keeps_its_energy(
+    one: int, quaternion: tuple[float, ...], velocity: tuple[float, ...]
+) -> None:
     turning, state = (*quaternion, 0.0, 0.0, 0.0), (0.0, 0.0, HIGH, *velocity)
     start = energy(state)
     for _ in range(50):
@@ -77,13 +79,13 @@ def test_a_stone_keeps_its_energy(one: int, quaternion: tuple[float, ...], veloc
 
 
 @given(which, quaternions(), rates, velocities)
-def test_air_takes_energy_from_a_body_whose_rotors_stand(
+def test_air_takes_energy_from_a_body_with_stopped_rotors(
     one: int, quaternion: tuple[float, ...], turning: tuple[float, ...], velocity: tuple[float, ...]
 ) -> None:
     _, moved, force, _ = advance(
         NUMBERS, CONSTANTS[one], (*quaternion, *turning), STILL, 0.0, motion(velocity), UNTOUCHED, False
     )
-    # To second order in the step: a force that is constant through a step overdoes it by that.
+    # To second order in the step: a force held constant for a step overshoots by this amount.
     spare = sum(f * f for f in force) * PLANT_STEP_S**2
     assert energy(moved) <= energy((0.0, 0.0, HIGH, *velocity)) + spare + 1e-9
 
@@ -103,12 +105,12 @@ def test_in_hover_thrust_balances_weight_whatever_the_heading(one: int, yaw: flo
 
 
 @given(
-    st.sampled_from([0, 2]),  # the Iris is not the same in front and behind
+    st.sampled_from([0, 2]),  # the Iris is not symmetric front to rear
     st.tuples(*[st.floats(100, 2000)] * 4),
     rates,
     velocities,
 )
-def test_a_mirrored_vehicle_flies_the_mirrored_way(
+def test_a_mirrored_vehicle_flies_a_mirrored_path(
     one: int, speeds: tuple[float, ...], turning: tuple[float, ...], velocity: tuple[float, ...]
 ) -> None:
     constants = CONSTANTS[one]
@@ -149,10 +151,10 @@ def test_a_quaternion_stays_a_rotation(
     ("faster", "axis", "sign"),
     [((0, 2), 0, 1), ((1, 3), 0, -1), ((2, 3), 1, 1), ((0, 1), 1, -1), ((0, 3), 2, 1), ((1, 2), 2, -1)],
 )
-def test_rotors_turn_the_body_as_their_places_and_spins_say(
+def test_rotors_turn_the_body_according_to_position_and_spin(
     one: int, faster: tuple[int, int], axis: int, sign: int
 ) -> None:
-    """Left ones faster: right side down. Rear ones: nose down. Front left and rear right, clockwise: to the left."""
+    """Faster on the left: right side down. Rear: nose down. Front left and rear right, clockwise: to the left."""
     one_s, two_s, three_s, four_s = [500.0 + 50.0 * (rotor in faster) for rotor in range(4)]
     turned, *_ = advance(
         NUMBERS,
@@ -166,13 +168,13 @@ def test_rotors_turn_the_body_as_their_places_and_spins_say(
     )
     about = turned[4:]
     assert about[axis] * sign > 0
-    # (The Iris's rear rotors are nearer to its middle: what yaws it rolls it a little.)
+    # (The Iris's rear rotors are closer to its middle: a yaw command rolls it slightly.)
     if one != 1:
         assert about[axis] * sign == pytest.approx(max(abs(rate) for rate in about))
 
 
 @given(which, st.tuples(*[st.floats(-1, 1)] * 3), st.floats(8, 11))
-def test_the_mixer_gets_the_torques_and_the_thrust_that_it_is_asked_for(
+def test_the_mixer_produces_the_requested_torques_and_thrust(
     one: int, wanted: tuple[float, float, float], thrust: float
 ) -> None:
     vehicle, constants = VEHICLES[one], replace(CONSTANTS[one], lead=1.0)
@@ -187,7 +189,7 @@ def test_the_mixer_gets_the_torques_and_the_thrust_that_it_is_asked_for(
 
 
 @given(which, rates, rates, st.floats(0, 60), st.floats(0.6, 1.0))
-def test_the_mixer_stays_within_what_rotors_can(
+def test_the_mixer_stays_within_the_rotors_limits(
     one: int, now: tuple[float, float, float], wanted: tuple[float, float, float], thrust: float, sag: float
 ) -> None:
     constants = CONSTANTS[one]
@@ -250,15 +252,15 @@ def test_a_rotor_follows_its_command_with_its_lag(vehicle: VehicleParameters) ->
         assert (speeds[0] - start) / (end - start) == pytest.approx(1 - math.exp(-done), rel=1e-9)
 
 
-def test_rotors_that_get_faster_turn_the_body_the_other_way() -> None:
+def test_accelerating_rotors_turn_the_body_the_other_way() -> None:
     slow, fast = 800.0, 900.0
-    _, twist = spin(NUMBERS, CONSTANTS[0], (slow,) * 4, (fast, slow, slow, fast))  # those that turn clockwise
+    _, twist = spin(NUMBERS, CONSTANTS[0], (slow,) * 4, (fast, slow, slow, fast))  # the clockwise ones
     assert twist > 0.0
     _, twist = spin(NUMBERS, CONSTANTS[0], (slow,) * 4, (slow, fast, fast, slow))
     assert twist < 0.0
 
 
-def test_air_from_above_takes_thrust_away_and_wind_along_the_rotors_pushes() -> None:
+def test_air_from_above_reduces_thrust_and_wind_along_the_rotors_pushes() -> None:
     speeds, turning = (1000.0,) * 4, (*LEVEL, 0.0, 0.0, 0.0)
 
     def force(velocity: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -280,7 +282,7 @@ def test_the_floor_lifts_a_drone_above_it_but_not_one_on_its_back() -> None:
     assert lift(0.05, (0.0, 1.0, 0.0, 0.0)) == pytest.approx(lift(5.0, (0.0, 1.0, 0.0, 0.0)))
 
 
-def test_a_battery_gives_no_more_than_at_half_its_voltage() -> None:
+def test_a_batterys_power_is_limited_to_half_its_voltage() -> None:
     volts, amps = load(NUMBERS, CONSTANTS[0], 300.0, 16.8, 16.8)
     assert (volts, amps) == pytest.approx((16.8 - 300 / 16.8 * 0.02, 300 / 16.8))
     assert load(NUMBERS, CONSTANTS[0], 1e5, 16.8, 16.8)[0] == 8.4
@@ -301,27 +303,27 @@ def test_a_battery_gives_no_more_than_at_half_its_voltage() -> None:
         ({"places_m": ((0.1, -0.1), (0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1))}, "front left, front right"),
     ],
 )
-def test_rotors_that_make_no_sense_are_refused(change: dict[str, object], message: str) -> None:
+def test_invalid_rotors_are_refused(change: dict[str, object], message: str) -> None:
     assert RACER.rotors is not None
     with pytest.raises(UsageError, match=message):
         replace(RACER.rotors, **change)  # type: ignore[arg-type]
 
 
-def test_instruments_that_make_no_sense_are_refused() -> None:
+def test_invalid_instruments_are_refused() -> None:
     with pytest.raises(UsageError, match="gps_period_s must be greater than 0"):
         InstrumentParameters(gps_period_s=0.0)
     with pytest.raises(UsageError, match="gyro_noise_rad_s must be at least 0"):
         InstrumentParameters(gyro_noise_rad_s=-1.0)
 
 
-def test_thrust_has_to_leave_something_for_the_attitude() -> None:
+def test_thrust_must_leave_a_reserve_for_the_attitude() -> None:
     with pytest.raises(UsageError, match="most_thrust 5 of the weight must be below what the rotors give"):
         replace(RACER, most_thrust=5.0)
     with pytest.raises(UsageError, match="no rotors"):
         constants_of(VehicleParameters())
 
 
-def test_ideal_sensors_are_ideal_instruments_too() -> None:
+def test_ideal_sensors_include_ideal_instruments() -> None:
     ideal = with_ideal_sensors(IRIS).rotors
     assert ideal is not None
     assert ideal.instruments.gyro_noise_rad_s == ideal.instruments.gps_bias_m == 0.0

@@ -1,4 +1,4 @@
-"""Drones modelled down to their rotors, flown by the built-in autopilot as all others are."""
+"""Drones modelled down to their rotors, flown by the built-in autopilot like all others."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ actions = set_points | st.sampled_from([Hover(), Land(), Takeoff(), EmergencySto
 
 
 class Held:
-    """Firmware that commands the same all the time."""
+    """Firmware with constant commands."""
 
     def __init__(self, *commands: float) -> None:
         self.commands = commands
@@ -92,7 +92,7 @@ def test_at_rest_its_accelerometer_reads_gravity(vehicle: VehicleParameters) -> 
     assert simulation.truth(0).position_m == pytest.approx((0, 0, vehicle.half_height_m), abs=1e-6)
 
 
-def test_stopped_in_the_air_it_falls_and_gets_on_its_feet() -> None:
+def test_stopped_in_the_air_it_falls_and_rights_itself() -> None:
     vehicle = RACER
     simulation = flying(parameters=with_ideal_sensors(vehicle))
     simulation.command(0, Attitude(roll=0.2))
@@ -111,7 +111,7 @@ def test_stopped_in_the_air_it_falls_and_gets_on_its_feet() -> None:
     assert simulation.truth(0).state is FlightState.HOVERING
 
 
-def test_it_comes_down_on_a_box_and_starts_from_there() -> None:
+def test_it_lands_on_a_box_and_takes_off_from_it() -> None:
     world = parse_world(
         "[room]\nsize = [20, 20, 10]\n[[box]]\nname = 'table'\nposition = [0, 0, 0.4]\nsize = [2, 2, 0.8]\n"
         "[[spawn]]\nposition = [2.0, 0, 0]\nyaw_deg = 180\n"
@@ -142,7 +142,7 @@ def test_a_wall_stops_it_and_a_hard_hit_is_a_crash() -> None:
     assert truth.position_m[0] <= 10 - RACER.radius_m + 1e-9
 
 
-def test_two_of_them_collide_and_part() -> None:
+def test_two_of_them_collide_and_separate() -> None:
     world = parse_world(
         "[room]\nsize = [8, 5, 3]\n[[spawn]]\nposition = [-1, 0, 0]\n[[spawn]]\nposition = [1, 0, 0]\nyaw_deg = 180\n"
     )
@@ -157,15 +157,15 @@ def test_two_of_them_collide_and_part() -> None:
     assert apart >= 2 * CRAZYFLIE.radius_m - 1e-9
 
 
-def test_a_platform_that_turns_takes_it_along() -> None:
+def test_a_turning_platform_takes_it_along() -> None:
     simulation = Simulation(HALL, parameters=with_ideal_sensors(IRIS))
     simulation.step(5)
     simulation._bodies.turn(0, 0.5)
     simulation.step(1)
-    assert 0 < simulation.feedback(0).angular_velocity_rad_s[2] < 0.5  # what it stands on brakes it again
+    assert 0 < simulation.feedback(0).angular_velocity_rad_s[2] < 0.5  # the surface slows it down again
 
 
-def test_it_can_be_put_elsewhere() -> None:
+def test_it_can_be_moved() -> None:
     simulation = flying(parameters=with_ideal_sensors(RACER))
     simulation.put(0, (3.0, -2.0, 1.5), 1.0)
     truth = simulation.truth(0)
@@ -184,7 +184,7 @@ def test_its_battery_sags_under_load_and_recovers() -> None:
     assert simulation.truth(0).battery < 1.0
 
 
-def test_with_an_empty_battery_nothing_turns() -> None:
+def test_with_an_empty_battery_the_rotors_stop() -> None:
     simulation = flying(parameters=with_ideal_sensors(CRAZYFLIE))
     simulation.set_charge(0, 0.0)
     simulation.step(steps(3))
@@ -193,14 +193,14 @@ def test_with_an_empty_battery_nothing_turns() -> None:
     assert truth.position_m[2] == pytest.approx(CRAZYFLIE.half_height_m, abs=1e-3)
 
 
-def test_wind_pushes_it_and_the_autopilot_holds_against() -> None:
+def test_wind_pushes_it_and_the_autopilot_compensates() -> None:
     simulation = flying(parameters=with_ideal_sensors(IRIS), wind=Wind((3.0, 0.0, 0.0)), seconds=12.0)
     truth = simulation.truth(0)
     assert truth.velocity_m_s == pytest.approx((0, 0, 0), abs=0.05)
     assert truth.pitch_rad < -0.02  # leans into it, and it faces east
 
 
-def test_upside_down_angles_and_sensors_make_sense_and_it_rights_itself() -> None:
+def test_upside_down_its_angles_and_sensors_are_right_and_it_rights_itself() -> None:
     simulation = flying(parameters=with_ideal_sensors(RACER), seconds=8.0)
     bodies = simulation._rotors
     assert bodies is not None
@@ -228,7 +228,7 @@ Flight = tuple[list[VehicleTruth], list[VehicleFeedback], list[Occurrence]]
 
 
 def fly(commands: list[AnyAction], world: str, seed: int, one_by_one: bool) -> Flight:
-    """Three different vehicles near one another and to walls, in gusts; a fourth way to fly: by firmware."""
+    """Fly three different vehicles close to one another and to walls, in gusts; a fourth is flown by firmware."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(columns, "FEW", 3 if one_by_one else 0)
         simulation = Simulation(
@@ -259,7 +259,7 @@ def test_numbers_and_arrays_give_the_same_bits(commands: list[AnyAction], world:
     assert fly(commands, world, seed, True) == fly(commands, world, seed, False)
 
 
-def test_the_same_seed_gives_the_same_flight_and_another_one_another() -> None:
+def test_only_the_same_seed_gives_the_same_flight() -> None:
     commands: list[AnyAction] = [Velocity(1.0, 0.5, 0.2, 0.3), Attitude(0.2, 0.1)]
     assert fly(commands, "hall", 3, True) == fly(commands, "hall", 3, True)
     assert fly(commands, "hall", 3, True) != fly(commands, "hall", 4, True)
@@ -280,5 +280,5 @@ def test_an_address_names_the_vehicle(name: str, vehicle: VehicleParameters) -> 
 
 
 def test_vehicles_with_and_without_rotors_do_not_mix() -> None:
-    with pytest.raises(UsageError, match="simulations of their own"):
+    with pytest.raises(UsageError, match="need separate simulations"):
         Simulation(HALL, 2, parameters=[RACER, VehicleParameters()])

@@ -41,7 +41,7 @@ def track(path: Path, yaw: Yaw = FixedYaw(0.0), seed: int = 1) -> TargetTrack:  
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_motion_is_continuous_and_no_faster_than_stated(path: Path) -> None:
+def test_motion_is_continuous_and_within_its_speed(path: Path) -> None:
     moving = track(path)
     points = np.array([moving.at(0.01 * k).position_m for k in range(5000)])
     speeds = np.linalg.norm(np.diff(points, axis=0), axis=1) / 0.01
@@ -50,7 +50,7 @@ def test_motion_is_continuous_and_no_faster_than_stated(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_the_velocity_is_that_of_the_motion(path: Path) -> None:
+def test_the_velocity_matches_the_motion(path: Path) -> None:
     moving = track(path)
     for time in (1.0, 4.3, 7.77):
         before, after = moving.at(time - 0.02), moving.at(time + 0.02)
@@ -71,7 +71,7 @@ def test_an_oval_has_two_straights_and_two_half_circles(clockwise: bool, side: f
     assert oval.at(2 * (4.0 + math.pi)).position_m == pytest.approx(oval.at(0.0).position_m, abs=1e-3)
 
 
-def test_where_a_target_is_depends_on_the_time_and_the_seed_alone() -> None:
+def test_a_targets_position_depends_only_on_time_and_seed() -> None:
     walk = PATHS[4]
     late, early = track(walk), track(walk)
     late.at(50.0)
@@ -80,7 +80,7 @@ def test_where_a_target_is_depends_on_the_time_and_the_seed_alone() -> None:
     assert track(walk, seed=2).at(20.5) != early.at(20.5)
 
 
-def test_walks_stay_where_they_belong() -> None:
+def test_walks_stay_within_their_area() -> None:
     walk, ring = track(PATHS[4]), track(PATHS[5])
     for k in range(2000):
         x, y, z = walk.at(k * 0.05).position_m
@@ -92,7 +92,7 @@ def test_walks_stay_where_they_belong() -> None:
         assert 1.1 <= z <= 1.7
 
 
-def test_an_open_way_is_gone_there_and_back() -> None:
+def test_an_open_path_is_followed_back_and_forth() -> None:
     moving = track(WaypointPath(((0, 0, 1), (1, 0, 1)), 0.5, closed=False))
     assert moving.at(1.0).position_m == pytest.approx((0.5, 0, 1))
     assert moving.at(2.0).position_m == pytest.approx((1, 0, 1))
@@ -114,7 +114,7 @@ def test_yaw_follows_its_mode_no_faster_than_its_limit() -> None:
 
 
 @pytest.mark.parametrize("time", [-1.0, math.nan, math.inf])
-def test_a_time_that_is_none_is_refused(time: float) -> None:
+def test_an_invalid_time_is_refused(time: float) -> None:
     with pytest.raises(UsageError, match="time"):
         track(PATHS[0]).at(time)
 

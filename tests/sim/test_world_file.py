@@ -22,7 +22,7 @@ BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 @pytest.mark.parametrize(
     "name", ["empty", "gates", "park", "pillars", "platform", "platform_fast", "room", "street", "windy", "yard"]
 )
-def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
+def test_drones_can_fly_in_shipped_worlds(name: str) -> None:
     assert name in shipped_worlds()
     world = load_world(name, seed=3)
     assert (world.name, world.seed) == (name, 3)
@@ -31,7 +31,7 @@ def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
     assert len(simulation.target_states()) == len(world.targets)
 
 
-def test_the_shipped_room_has_what_the_demo_needs() -> None:
+def test_the_shipped_room_suits_the_demo() -> None:
     world = load_world("room")
     (board,) = world.targets
     assert isinstance(board, BoardTarget)
@@ -41,7 +41,7 @@ def test_the_shipped_room_has_what_the_demo_needs() -> None:
     assert len(load_world("gates").gates) == 5
 
 
-def test_an_unknown_world_is_told_with_the_nearest_name() -> None:
+def test_an_unknown_world_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'room'"):
         load_world("roam")
 
@@ -64,7 +64,7 @@ def test_files_load_by_path(tmp_path: Path) -> None:
         load_world(path)
 
 
-# What is wrong with the text, and what the message has to say about it.
+# Invalid text, and the expected message.
 BAD = [
     (
         ROOM + '[[target]]\nmarker_size = 0.2\nid = 1\n[target.path]\nkind = "waypoints"\nspeed = 1\n'
@@ -90,7 +90,7 @@ BAD = [
     (ROOM + BOX + "name = ''\n", "'name': '' .a text. given, but it must be a text that is not empty"),
     (ROOM + BOX + "name = 'a'\n" + BOX + "name = 'a'\n", r"\[box 'a'\], key 'name': 'a' is used twice"),
     (ROOM + BOX + "colour = 'red'\n", "'red' is not a colour"),
-    (ROOM + "[[box]]\nstands_at = [5, 1]\nsize = [1, 1, 1]\n", "x = 5 is outside of the room"),
+    (ROOM + "[[box]]\nstands_at = [5, 1]\nsize = [1, 1, 1]\n", "x = 5 is outside the room"),
     (ROOM + "[[box]]\nstands_at = [1, 1]\nsize = [1, 0, 1]\n", "'size': 0 .*from 0.01"),
     (ROOM + "[[gate]]\nposition = [0, 0, 0.3]\ninner_size = [1, 1]\n", "reaches below the floor"),
     (ROOM + "[[panel]]\non = 'north'\nat = [0, 1]\nsize = [1, 1]\n", "'texture': missing; it must be one of"),
@@ -114,9 +114,9 @@ BAD = [
     ),
     (ROOM + BOARD + "path = { kind = 'circle', centre = [0, 0, 1], radius = 1, speed = 0 }\n", "'speed': 0"),
     (ROOM + BOARD + "path = { kind = 'waypoints', points = [[0, 0, 1]], speed = 1 }\n", "at least 2 lists"),
-    (ROOM + BOARD + "path = { kind = 'waypoints', points = [[0,0,1],[0,0,1]], speed = 1 }\n", "stands twice"),
+    (ROOM + BOARD + "path = { kind = 'waypoints', points = [[0,0,1],[0,0,1]], speed = 1 }\n", "listed twice"),
     (ROOM + BOARD + "path = { kind = 'walk', low = [1, 0, 1], high = [0, 1, 1], speed = [1, 2] }\n", "'high'"),
-    (ROOM + BOARD + "path = { kind = 'ring_walk', radius = [2, 1], height = [1, 2], speed = [1, 2] }\n", "upside down"),
+    (ROOM + BOARD + "path = { kind = 'ring_walk', radius = [2, 1], height = [1, 2], speed = [1, 2] }\n", "reversed"),
     (ROOM + BOARD + "path = { kind = 'ring_walk', radius = [1, 3.5], height = [1, 2], speed = [1, 2] }\n", "y = -3.5"),
     (
         ROOM + BOARD + "kind = 'platform'\nsize = [0.1, 1, 0.1]\n"
@@ -129,12 +129,12 @@ BAD = [
     ),
     ("box = [3]\n" + ROOM, r"key 'box': 3 .a whole number. given, but it must be tables written \[\[box\]\]"),
     (ROOM + "[[box]]\nsize = [1, 1, 1]\n", "'position': missing; .* or 'stands_at' a list of 2"),
-    (ROOM + BOX + "position = [1, 1, 1]\n", "'position': give it or 'stands_at', and not both"),
+    (ROOM + BOX + "position = [1, 1, 1]\n", "'position': give either this or 'stands_at', not both"),
     (ROOM + "[[box]]\nstands_at = [1, {}]\nsize = [1, 1, 1]\n", r"\[box #1\], key 'stands_at': {} .a table. given"),
     (ROOM + FACE + "on = 'north'\n", "'at': missing; it must be a list of 2 numbers"),
-    (ROOM + FACE + "on = 'north'\nat = [0, 1]\nyaw_deg = 3\n", "'yaw_deg': unknown beside 'on'"),
+    (ROOM + FACE + "on = 'north'\nat = [0, 1]\nyaw_deg = 3\n", "'yaw_deg': unknown together with 'on'"),
     (ROOM + FACE + "at = [0, 1]\n", "'at': unknown without 'on'"),
-    (ROOM + FACE, "'position': missing; .* or 'on' and 'at' given"),
+    (ROOM + FACE, "'position': missing; .* or 'on' and 'at'"),
     (ROOM + "[[spawn]]\nposition = [0, 0, 0]\nyaw_deg = 400\n", "'yaw_deg': 400 .* a number from -360 to 360"),
     (ROOM + BOARD + "path = { speed = 1, radius = 1 }\n", "'kind': missing; it must be one of waypoints, circle"),
     (ROOM + BOARD + "path = { knd = 'circle' }\n", "there is 'knd'; did you mean 'kind'"),
@@ -148,7 +148,7 @@ BAD = [
 ]
 
 
-def test_an_error_that_can_not_be_explained_is_passed_on() -> None:
+def test_an_unexplained_error_is_passed_on() -> None:
     found = _explained("Something else", {"room": 1}, "mine.toml", Untold)
     assert str(found) == "mine.toml: Something else"
 
@@ -158,7 +158,7 @@ class Untold(msgspec.Struct):
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)
-def test_a_bad_world_is_refused_with_the_place_and_what_would_be_right(text: str, message: str) -> None:
+def test_a_bad_world_is_refused_with_the_place_and_the_remedy(text: str, message: str) -> None:
     with pytest.raises(FileFormatError, match=message) as caught:
         parse_world(text, "mine")
     assert str(caught.value).startswith("mine.toml")
@@ -183,7 +183,7 @@ def test_degrees_become_radians_and_colours_numbers() -> None:
         ("ceiling", "[1, 1.5]", (1, 1.5, 3), (0, 0, -1), (1, 0, 0)),
     ],
 )
-def test_what_hangs_on_a_wall_looks_into_the_room(
+def test_objects_on_a_wall_face_the_room(
     mount: str, at: str, position: tuple[float, ...], normal: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
     world = parse_world(ROOM + f"[[marker]]\non = '{mount}'\nat = {at}\nid = 1\nmarker_size = 0.2\n")
@@ -196,12 +196,12 @@ def test_what_hangs_on_a_wall_looks_into_the_room(
 
 
 def test_a_turned_picture_turns_counter_clockwise_for_the_viewer() -> None:
-    # The viewer of a face that looks west stands west of it; a quarter turn brings the picture's right side up.
+    # The viewer of a face to the west stands west of it; a quarter turn moves the picture's right side to the top.
     turned = FacePose((0, 0, 0), yaw_rad=math.pi, turn_rad=math.pi / 2).rotation()
     assert turned[:, 0] == pytest.approx((0, 0, 1), abs=1e-12)
 
 
-def test_a_platform_shows_its_marker_upwards_with_its_up_ahead() -> None:
+def test_a_platforms_marker_faces_up_with_its_top_ahead() -> None:
     world = load_world("windy")
     (platform,) = world.targets
     assert isinstance(platform, PlatformTarget)
@@ -224,7 +224,7 @@ def test_the_bars_of_a_gate_leave_the_opening_free() -> None:
         assert bar.corners()[:, 2].min() >= -1e-9
 
 
-# What the seed places ------------------------------------------------------------------------------------------------
+# Placement by the seed ------------------------------------------------------------------------------------------------
 
 VARIED = """
 [room]
@@ -250,7 +250,7 @@ position = [9, 9, 0]
 """
 
 
-def test_the_seed_places_what_varies_within_its_ranges_and_apart(tmp_path: Path) -> None:
+def test_the_seed_places_varied_objects_within_their_ranges_and_apart(tmp_path: Path) -> None:
     path = tmp_path / "varied.toml"
     path.write_text(VARIED)
     worlds = [load_world(path, seed) for seed in range(20)]
@@ -267,7 +267,7 @@ def test_the_seed_places_what_varies_within_its_ranges_and_apart(tmp_path: Path)
         assert world.spawns[0].position_m == (9.0, 9.0, 0.0)
 
 
-def test_what_finds_no_room_is_told() -> None:
+def test_objects_without_room_are_reported() -> None:
     with pytest.raises(FileFormatError, match=r"\[vary\], key 'apart': no room was found for 3 things at 15 m"):
         parse_world(VARIED.replace("apart = 2.0", "apart = 15.0"))
     with pytest.raises(FileFormatError, match=r"position.*missing"):

@@ -1,4 +1,4 @@
-"""The transport of replays in step: everything on one thread, in order, each end told once."""
+"""The transport of stepped replays: everything on one thread, in order, each end notified once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PIXELS = np.arange(12, dtype=np.uint8)
 
 
 class ServerSide:
-    """A proxy that notes what it hears, and answers each packet."""
+    """A proxy that records its packets, and answers each one."""
 
     def __init__(self, server: SteppedServer) -> None:
         self.server = server
@@ -44,7 +44,7 @@ class ServerSide:
 
 
 class ClientSide:
-    """An application that notes what it hears."""
+    """An application that records its packets."""
 
     def __init__(self) -> None:
         self.heard: list[object] = []
@@ -80,7 +80,7 @@ def proxy(server: SteppedServer) -> ServerSide:
 
 
 def settle(executor: StepExecutor) -> None:
-    """Wait until all that was sent, and all that follows, is done."""
+    """Wait until all sent packets and their consequences are processed."""
     executor.call(executor.run_pending, lambda: None)
 
 
@@ -104,7 +104,7 @@ def test_packets_and_answers_in_order_on_one_thread(
 
 def test_topics_and_frames(executor: StepExecutor, server: SteppedServer, proxy: ServerSide) -> None:
     application = ClientSide()
-    assert server.publish("feedback", b"x") == 0  # nobody is there
+    assert server.publish("feedback", b"x") == 0  # no subscriber
     end = server.dial(application)
     server.publish("feedback", b"unwanted")
     server.publish_frame(frame(1), PIXELS)
@@ -114,7 +114,7 @@ def test_topics_and_frames(executor: StepExecutor, server: SteppedServer, proxy:
     pixels = PIXELS.copy()
     server.publish("feedback", b"wanted")
     server.publish_frame(frame(2), pixels)
-    pixels[:] = 0  # they may be used again at once
+    pixels[:] = 0  # they may be reused at once
     end.subscribe("feedback", False)
     server.publish("feedback", b"no longer")
     settle(executor)
@@ -125,7 +125,7 @@ def test_topics_and_frames(executor: StepExecutor, server: SteppedServer, proxy:
         server.publish_frame(frame(3), PIXELS[:5])
 
 
-def test_each_end_is_told_once_when_the_application_leaves(
+def test_each_end_is_notified_once_when_the_application_leaves(
     executor: StepExecutor, server: SteppedServer, proxy: ServerSide
 ) -> None:
     application = ClientSide()
@@ -140,7 +140,7 @@ def test_each_end_is_told_once_when_the_application_leaves(
     assert proxy.heard[1:] == [b"last", ("left", "closed by the application")]
     assert application.heard == [("closed", "closed by the application")]
     assert not server.send(Peer(1, ""), b"gone")
-    server.dial(ClientSide()).close()  # the next one may come
+    server.dial(ClientSide()).close()  # the next one may connect
 
 
 def test_the_proxy_ends_a_connection_and_itself(
@@ -164,7 +164,7 @@ def test_the_proxy_ends_a_connection_and_itself(
 
 
 def test_started_twice(server: SteppedServer, proxy: ServerSide) -> None:
-    with pytest.raises(UsageError, match="served already"):
+    with pytest.raises(UsageError, match="already being served"):
         server.start(proxy)
 
 
@@ -179,7 +179,7 @@ def test_a_handler_that_raises_does_not_end_the_world(
     def wrong() -> None:
         raise ZeroDivisionError("another one")
 
-    with pytest.raises(ZeroDivisionError, match="another one"):  # but who waits for it gets to know it
+    with pytest.raises(ZeroDivisionError, match="another one"):  # but the waiting caller gets the error
         executor.call(wrong, lambda: None)
     settle(executor)
     assert application.heard == [b"re go on"]

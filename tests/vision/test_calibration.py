@@ -1,4 +1,4 @@
-"""Calibration of cameras that are known exactly, from pictures of boards with noise."""
+"""Calibration of exactly known cameras, from images of boards with noise."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def views(board: Board, lens: Intrinsics, count: int, near: float, far: float, w
 
 
 def angle_errors(found: Intrinsics, true: Intrinsics, margin: float) -> np.ndarray:
-    """Between the directions of pixels by one and by the other [deg], away from the picture's edge."""
+    """Return angles between two models' directions of pixels [deg], away from the image's edge."""
     width, height = SIZE
     x, y = np.meshgrid(
         np.linspace(margin * width, (1 - margin) * width, 12), np.linspace(margin * height, (1 - margin) * height, 9)
@@ -68,7 +68,7 @@ def test_a_known_camera_is_found_again(
     assert 10 <= found.views <= 14
 
 
-def test_views_that_do_not_go_with_the_others_are_taken_out() -> None:
+def test_views_that_do_not_fit_the_others_are_removed() -> None:
     good = list(views(CHARUCO, PINHOLE, 14, 0.3, 0.6, 0.35))
     wrong = BoardView(
         good[0].points, good[0].pixels + np.random.default_rng(2).normal(0, 6, good[0].pixels.shape), "wrong"
@@ -79,7 +79,7 @@ def test_views_that_do_not_go_with_the_others_are_taken_out() -> None:
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.005)
 
 
-def test_too_little_is_said() -> None:
+def test_too_few_views_are_reported() -> None:
     some = views(CHARUCO, PINHOLE, 14, 0.3, 0.6, 0.35)
     with pytest.raises(UsageError, match="too few"):
         calibrate(some[:4], *SIZE)
@@ -91,7 +91,7 @@ def test_too_little_is_said() -> None:
         calibrate(nowhere, *SIZE, model="fisheye")
 
 
-def test_a_collector_takes_what_is_new() -> None:
+def test_a_collector_takes_new_views() -> None:
     some = views(CHARUCO, PINHOLE, 14, 0.3, 0.6, 0.35)
     collector = Collector(*SIZE)
     assert collector.coverage == 0.0
@@ -104,7 +104,7 @@ def test_a_collector_takes_what_is_new() -> None:
     assert 0.3 < collector.coverage < 1.0
 
 
-def test_a_board_that_is_not_there_is_not_found() -> None:
+def test_an_absent_board_is_not_found() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), dtype=np.uint8)
     assert BoardFinder(CHARUCO).find(noise) is None
     assert BoardFinder(CHESSBOARD).find(noise) is None
@@ -116,7 +116,7 @@ def test_a_board_that_is_not_there_is_not_found() -> None:
     "wrong",
     [{"columns": 2}, {"rows": True}, {"square_m": 0.0}, {"kind": "dots"}],
 )
-def test_boards_that_make_no_sense(wrong: dict[str, object]) -> None:
+def test_invalid_boards(wrong: dict[str, object]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
         Board(**wrong)  # type: ignore[arg-type]
 
@@ -129,7 +129,7 @@ def test_a_board_needs_enough_markers() -> None:
         BoardFinder(Board(dictionary="4x4_5"))
 
 
-def test_boards_are_written_at_their_size(tmp_path: Path) -> None:
+def test_boards_are_written_at_their_true_size(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image", reason="boards are written with Pillow")
     CHARUCO.save(tmp_path / "board.png", dpi=150)
     with image.open(tmp_path / "board.png") as written:
@@ -150,7 +150,7 @@ def test_boards_are_written_at_their_size(tmp_path: Path) -> None:
             CHARUCO.save(tmp_path / name, dpi=dpi)
 
 
-def test_files_there_and_back(tmp_path: Path) -> None:
+def test_files_round_trip(tmp_path: Path) -> None:
     FILE.save(tmp_path / "front.json")
     assert load_calibration(tmp_path / "front.json") == FILE
     half = FILE.intrinsics_for(320, 240)
@@ -165,7 +165,7 @@ def test_files_there_and_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("", "not a calibration"),
+        ("", "not a camera calibration"),
         ("{}", "missing required field"),
         ('{"width": 0, "height": 480, "model": "pinhole", "fx": 1, "fy": 1, "cx": 0, "cy": 0}', "width"),
         ('{"width": 640, "height": 480, "model": "mirror", "fx": 1, "fy": 1, "cx": 0, "cy": 0}', "mirror"),
@@ -180,14 +180,14 @@ def test_files_there_and_back(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_files_that_are_no_calibration(tmp_path: Path, text: str, why: str) -> None:
+def test_invalid_calibration_files(tmp_path: Path, text: str, why: str) -> None:
     file = tmp_path / "front.json"
     file.write_text(text)
     with pytest.raises(FileFormatError, match=why):
         load_calibration(file)
 
 
-def test_an_address_may_name_a_calibration(tmp_path: Path) -> None:
+def test_an_address_can_name_a_calibration(tmp_path: Path) -> None:
     file = tmp_path / "front.json"
     FILE.save(file)
     uri = parse_uri(f"video://0?calibration={file}")

@@ -12,8 +12,8 @@ from skyloop.messages import CameraInfo, Feedback, FlightState, Intrinsics
 from skyloop.vision.flow import GroundTracker
 
 
-def test_another_size_of_the_frames_begins_anew() -> None:
-    """A camera that changes its resolution in flight ended what held the place by it."""
+def test_a_new_frame_size_restarts_the_tracking() -> None:
+    """A camera that changed its resolution in flight ended the position hold."""
     noise = np.random.default_rng(1).integers(0, 255, (60, 80), np.uint8)
     camera = CameraInfo("bottom", 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0))
     tracker = GroundTracker(camera)
@@ -25,13 +25,13 @@ def test_another_size_of_the_frames_begins_anew() -> None:
         lens = Intrinsics(60.0 * scale, 60.0 * scale, 40.0 * scale, 30.0 * scale)
         found = tracker.see(image, level, lens)
     assert found is not None
-    assert np.abs(found[0]).max() < 0.01, "it has not moved"
+    assert np.abs(found[0]).max() < 0.01, "the vehicle has not moved"
 
 
 @pytest.mark.parametrize("name", ["altitude_m", "roll_rad", "yaw_rad"])
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 def test_a_number_that_is_not_finite_ends_the_tracking_for_one_frame_only(name: str, wrong: float) -> None:
-    """After one such sample no position was known again, and the vehicle drifted."""
+    """After one such sample the position stayed unknown, and the vehicle drifted."""
     image = np.random.default_rng(1).integers(0, 255, (60, 80), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
     lens = Intrinsics(240.0, 240.0, 160.0, 120.0)
     camera = CameraInfo("bottom", 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0))

@@ -1,4 +1,4 @@
-"""Gates in pictures of a simulated hall: found, placed, and not found where there are none."""
+"""Gates in images of a simulated hall: found, placed, and not found where there are none."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def test_gates_are_found_and_placed(renderer: PlanarRenderer) -> None:
         turned.append(abs(wrap_angle(math.atan2(-normal[1], -normal[0]) - gate.yaw_rad)))
         assert len(seen[0].outline) == 4
     assert found >= 55
-    # The picture shows the side of the frame, half its thickness of 8 cm before the middle.
+    # The image shows the side of the frame, half its thickness of 8 cm in front of the middle.
     assert np.median(away) < 0.07
     assert max(away) < 0.2
     assert np.median(turned) < 0.05
 
 
-def test_nothing_is_found_where_nothing_is(renderer: PlanarRenderer) -> None:
+def test_nothing_is_found_without_gates(renderer: PlanarRenderer) -> None:
     picture, _ = taken(renderer, FRONT_CAMERA, np.array([-5.5, -3.5, 1.0]), (0.0, 0.0, math.pi))
     for gate in WORLD.gates:
         assert GateDetector(gate.colour).detect(picture, FRONT_CAMERA.intrinsics()) == []
@@ -107,13 +107,13 @@ def test_only_openings_of_four_straight_sides_are_gates(picture: Picture, found:
         assert gate.corners == pytest.approx(np.array(SQUARE), abs=1.5)
 
 
-def test_a_gate_that_is_too_far_away_is_left_out() -> None:
+def test_a_gate_too_far_away_is_ignored() -> None:
     picture = hole(*SQUARE)
     assert len(GateDetector((255, 0, 0)).detect(picture, FRONT_CAMERA.intrinsics())) == 1
     assert GateDetector((255, 0, 0), (40.0, 40.0)).detect(picture, FRONT_CAMERA.intrinsics()) == []
 
 
-def test_what_makes_no_sense_is_refused() -> None:
+def test_invalid_arguments_are_refused() -> None:
     with pytest.raises(UsageError, match="too grey"):
         GateDetector((90, 90, 90))
     with pytest.raises(UsageError, match="from 0 to 255"):
@@ -126,7 +126,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         GateDetector((255, 0, 0)).detect(GREY)
 
 
-def test_blobs_tell_bearing_and_width() -> None:
+def test_blobs_give_bearing_and_width() -> None:
     picture = GREY.copy()
     picture[50:200, 100:130] = (20, 110, 235)
     picture[50:60, 200:204] = (20, 110, 235)  # too narrow
@@ -137,7 +137,7 @@ def test_blobs_tell_bearing_and_width() -> None:
     assert blob.outline[0] == pytest.approx((100, 50), abs=1)
 
 
-def test_ground_tells_the_way_in_spite_of_tilt_and_turn(renderer: PlanarRenderer) -> None:
+def test_the_ground_gives_the_path_in_spite_of_tilt_and_rotation(renderer: PlanarRenderer) -> None:
     tracker = GroundTracker(BOTTOM_CAMERA.info())
     begin = np.array([-4.0, -1.0, 1.2])
     errors, picture = [], GREY
@@ -163,7 +163,7 @@ def test_ground_tells_the_way_in_spite_of_tilt_and_turn(renderer: PlanarRenderer
     assert tracker.points == ()
 
 
-def test_ground_without_texture_is_no_ground() -> None:
+def test_ground_without_texture_is_not_tracked() -> None:
     tracker = GroundTracker(BOTTOM_CAMERA.info())
     state = Feedback(captured_ns=0, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.0)
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""Learned trackers: the errors where weights or OpenCV's part are missing, and how its results are passed on."""
+"""Learned trackers: errors without weights or OpenCV's tracker, and the results passed on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IMAGE = np.zeros((120, 160, 3), np.uint8)
 
 
 class Network:
-    """What OpenCV makes of weights."""
+    """Stands in for OpenCV's tracker."""
 
     def __init__(self, settings: Any) -> None:
         self.settings = settings
@@ -93,13 +93,13 @@ def test_grey_images_are_coloured(made: list[Network], weights: Path) -> None:
 def test_weights_of_another_network(made: list[Network], weights: Path) -> None:
     tracker = LearnedTracker(weights)
     made[0].broken = True
-    with pytest.raises(FileFormatError, match=r"weights\.onnx does not work as the weights of TrackerVit: .*layer"):
+    with pytest.raises(FileFormatError, match=r"weights\.onnx does not work as weights of TrackerVit: .*layer"):
         tracker.start(IMAGE, (10, 20, 30, 40))
     with pytest.raises(UsageError, match="was not started"):
         tracker.update(IMAGE)
 
 
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+def test_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"there is no file .*none\.onnx"):
         LearnedTracker(tmp_path / "none.onnx")
 

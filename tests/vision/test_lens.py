@@ -1,4 +1,4 @@
-"""Lenses: there and back, against formulas written down here, and pictures without distortion."""
+"""Lenses: round trips, against formulas written down here, and images without distortion."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pixels = st.lists(st.tuples(st.floats(0, 639), st.floats(0, 479)), min_size=1, m
 
 @given(pixels, st.floats(0.1, 30.0))
 @pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
-def test_there_and_back(lens: Intrinsics, seen: list[tuple[float, float]], distance: float) -> None:
+def test_round_trip(lens: Intrinsics, seen: list[tuple[float, float]], distance: float) -> None:
     given_pixels = np.array(seen)
     rays = unproject(given_pixels, lens)
     assert np.linalg.norm(rays, axis=1) == pytest.approx(1.0)
@@ -45,11 +45,11 @@ def test_fisheye_is_opencv_s() -> None:
     assert centre == pytest.approx(np.array([[0.0, 0.0, 1.0]]))
 
 
-def test_what_a_lens_cannot_show() -> None:
+def test_directions_that_a_lens_cannot_show() -> None:
     assert np.isnan(project([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]], PINHOLE)).all()
     beside = project([[1.0, 0.0, -0.05]], FISHEYE)
-    assert np.isfinite(beside).all(), "a fisheye sees a little behind itself"
-    assert np.isnan(normalised(beside, FISHEYE)).all(), "but a plane before it does not"
+    assert np.isfinite(beside).all(), "a fisheye also sees a little behind itself"
+    assert np.isnan(normalised(beside, FISHEYE)).all(), "a plane in front of it does not"
     folded = Intrinsics(250.0, 250.0, 320.0, 240.0, (-0.3, 0.0, 0.0, 0.0), "fisheye")
     assert np.isnan(project([[1.0, 0.0, 0.1]], folded)).all()
     assert np.isnan(unproject([[620.0, 240.0]], folded)).all()
@@ -62,7 +62,7 @@ def test_what_a_lens_cannot_show() -> None:
 
 @pytest.mark.parametrize("lens", [PINHOLE, FISHEYE], ids=["pinhole", "fisheye"])
 def test_straight_lines_are_straight_without_distortion(lens: Intrinsics) -> None:
-    """A picture of a line in space, taken by the lens: bent before, straight after, and where the new camera says."""
+    """The image of a line in space: bent before, straight after, and where the new camera predicts it."""
     line = np.column_stack([np.linspace(-0.5, 0.5, 400), np.full(400, -0.3), np.full(400, 1.0)])
     bent = np.zeros((480, 640), np.uint8)
     for x, y in project(line, lens):
@@ -83,7 +83,7 @@ def test_straight_lines_are_straight_without_distortion(lens: Intrinsics) -> Non
     assert (again == straight).all()
 
 
-def test_pictures_that_cannot_be_straightened() -> None:
+def test_images_that_cannot_be_undistorted() -> None:
     with pytest.raises(UsageError, match="intrinsics"):
         undistort(np.zeros((4, 4), np.uint8))
     with pytest.raises(UsageError, match="uint8"):
@@ -92,9 +92,9 @@ def test_pictures_that_cannot_be_straightened() -> None:
         undistort(np.zeros((4, 4), np.uint8), PINHOLE, balance=2.0)
 
 
-def test_beyond_the_fold_of_a_pinhole_s_distortion_nothing_is_seen() -> None:
+def test_pixels_beyond_the_fold_of_a_pinholes_distortion_have_no_direction() -> None:
     """The directions to such pixels were finite, and wrong by tens of degrees."""
-    lens = Intrinsics(250.0, 250.0, 320.0, 240.0, (-0.3, 0.0, 0.0, 0.0))  # 0.703 f from the axis is the farthest
+    lens = Intrinsics(250.0, 250.0, 320.0, 240.0, (-0.3, 0.0, 0.0, 0.0))  # 0.703 f from the axis is the maximum
     pixels = [[320.0 + 250.0 * 0.69, 240.0], [320.0 + 250.0 * 0.72, 240.0], [320.0, 240.0 - 250.0 * 2.0]]
     rays = unproject(pixels, lens)
     assert np.isfinite(rays[0]).all()
@@ -103,6 +103,6 @@ def test_beyond_the_fold_of_a_pinhole_s_distortion_nothing_is_seen() -> None:
     assert np.isnan(normalised(pixels[1:], lens)).all()
     shown = project([[1.0, 0.0, 1.0], [1.2, 0.0, 1.0], [5.0, 0.0, 1.0]], lens)
     assert np.isfinite(shown[0]).all()
-    assert np.isnan(shown[1:]).all(), "it would come back into the picture"
+    assert np.isnan(shown[1:]).all(), "it would fold back into the image"
     wide = Intrinsics(250.0, 250.0, 320.0, 240.0, (0.3, 0.1, 0.0, 0.0))
     assert np.isfinite(project([[5.0, 0.0, 1.0]], wide)).all(), "this one has no fold"

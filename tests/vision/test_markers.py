@@ -1,4 +1,4 @@
-"""Markers drawn by a homography are found where they were put."""
+"""Markers drawn by a homography are found at their places."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_pose_of_a_marker(turn: float, nod: float, position: list[float]) -> Non
     assert np.abs(sighting.corners - expected).max() < 0.7
     assert sighting.distance_m == pytest.approx(np.linalg.norm(position), rel=0.02)
     assert np.linalg.norm(sighting.position_m - position) < 0.03 * sighting.distance_m
-    # Seen nearly from the front, turning either way looks the same: only what is plainly turned must come out so.
+    # Nearly from the front, both directions of rotation look the same: only clear rotations must be recovered.
     angle = np.arccos(np.clip(sighting.normal @ rotation[:, 2], -1, 1))
     assert angle < (0.15 if sighting.ambiguity < 0.3 else 0.9)
 
@@ -44,7 +44,7 @@ def test_far_marker_is_still_found() -> None:
     assert see(facing(), [0.5, 0.2, 5.0]).distance_m == pytest.approx(5.03, rel=0.05)
 
 
-def test_nothing_to_see() -> None:
+def test_without_markers() -> None:
     empty = np.full((240, 320, 3), 90, np.uint8)
     noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), dtype=np.uint8)
     detector = MarkerDetector()
@@ -104,7 +104,7 @@ def test_grey_pictures_and_frames_with_intrinsics() -> None:
     assert len(MarkerDetector().detect(frame)) == 1
 
 
-def test_bad_input_is_told() -> None:
+def test_bad_input_is_reported() -> None:
     good = np.zeros((4, 4), np.uint8)
     with pytest.raises(UsageError, match="edge in metres"):
         MarkerDetector(size_m=-1)
@@ -143,7 +143,7 @@ def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_detector_of_the_wrong_dictionary_says_which_tags_it_saw() -> None:
-    """A beginner's valid but wrong dictionary: the flight ended well, and nobody said a word."""
+    """A beginner's valid but wrong dictionary: the flight ended well, without any hint."""
     image = np.full((240, 320, 3), 255, np.uint8)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
     for at, number in ((40, 7), (200, 60)):
@@ -153,7 +153,7 @@ def test_a_detector_of_the_wrong_dictionary_says_which_tags_it_saw() -> None:
         assert detector.detect(image, INTRINSICS) == []
     others = "7 of 6x6_50, 60 of 6x6_100"
     nothing = "no marker of 4x4_50 was found in 80 images"
-    assert detector.why_nothing() == f"{nothing}, but others were, of other dictionaries: {others}"
+    assert detector.why_nothing() == f"{nothing}, but markers of other dictionaries were: {others}"
     right = MarkerDetector("6x6_250")
     right.detect(image, INTRINSICS)
     assert right.why_nothing() == ""
@@ -164,4 +164,4 @@ def test_a_detector_that_sees_nothing_says_so_after_some_images() -> None:
     assert detector.why_nothing() == ""
     for _ in range(100):
         detector.detect(empty, INTRINSICS)
-    assert detector.why_nothing().startswith("no marker of 4x4_50 was found in 100 images, nor one of another")
+    assert detector.why_nothing().startswith("no marker of 4x4_50 was found in 100 images, nor of another")

@@ -1,4 +1,4 @@
-"""Objects keep their numbers: crossings, occlusions, low scores, and what may not start an object."""
+"""Objects keep their numbers: crossings, occlusions, low scores, and detections that must not start an object."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_two_that_cross_keep_their_numbers() -> None:
         assert places[2] == pytest.approx(399.5 - 6 * k, abs=1.0)
 
 
-def test_one_hidden_for_a_second_is_expected_where_it_comes_out() -> None:
+def test_an_object_hidden_for_a_second_is_predicted_where_it_reappears() -> None:
     tracks = ObjectTracks()
     history = run(tracks, lambda k: [] if 20 <= k < 40 else [at(100 + 5 * k)], 60)
     hidden = history[39][0]
@@ -57,19 +57,19 @@ def test_one_hidden_for_a_second_is_expected_where_it_comes_out() -> None:
     assert [(each.id, each.seen) for each in history[-1]] == [(1, True)]
 
 
-def test_one_hidden_for_too_long_is_forgotten_and_its_number_not_given_again() -> None:
+def test_an_object_hidden_for_too_long_is_forgotten_and_its_number_not_reused() -> None:
     history = run(ObjectTracks(keep_s=0.5), lambda k: [] if 10 <= k < 30 else [at(100)], 40)
     assert history[25] == []
     assert [each.id for each in history[-1]] == [2]
 
 
-def test_unsure_detections_continue_an_object_and_start_none() -> None:
+def test_uncertain_detections_continue_an_object_but_start_none() -> None:
     history = run(ObjectTracks(), lambda k: [at(100 + k, score=0.9 if k < 10 else 0.15), at(400, score=0.2)], 60)
     assert [(each.id, each.seen) for each in history[-1]] == [(1, True)]
     assert history[-1][0].detection.score == 0.15
 
 
-def test_a_single_stray_detection_is_no_object() -> None:
+def test_a_single_stray_detection_is_not_an_object() -> None:
     history = run(ObjectTracks(confirm=3), lambda k: [at(100)] + ([at(300)] if k % 4 == 0 else []), 20)
     assert {each.id for objects in history for each in objects} == {1}
 
@@ -81,14 +81,14 @@ def test_another_class_in_the_same_place_is_another_object() -> None:
     assert {(each.id, each.detection.class_id) for each in history[-1] if each.seen} == {(2, 1)}
 
 
-def test_frames_that_are_missing_do_no_harm() -> None:
+def test_missing_frames_do_no_harm() -> None:
     tracks = ObjectTracks()
     run(tracks, lambda k: [at(100 + 5 * k)], 20)
     (later,) = tracks.update([at(100 + 5 * 30)], 30 * STEP_S)
     assert (later.id, later.seen) == (1, True)
 
 
-def test_detections_that_are_not_finite_or_empty_are_left_out() -> None:
+def test_detections_that_are_not_finite_or_empty_are_skipped() -> None:
     tracks = ObjectTracks(confirm=1)
     bad = [at(math.nan), at(100, math.inf), at(100, score=math.nan), at(100, size=0.0), at(1e9)]
     assert tracks.update(bad, 0.0) == []
@@ -111,7 +111,7 @@ def test_times_are_finite_and_in_order(time_s: Any) -> None:
         tracks.update([], time_s)
 
 
-def test_scipy_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_scipy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
     with pytest.raises(MissingExtraError, match="skyloop install detect"):
         ObjectTracks()
@@ -123,7 +123,7 @@ DETECTIONS = st.builds(
 
 
 @given(st.lists(st.lists(DETECTIONS, max_size=5), max_size=8), st.floats(0.0, 3.0))
-def test_numbers_are_unique_and_boxes_finite_whatever_is_detected(scenes: Any, step: float) -> None:
+def test_numbers_are_unique_and_boxes_finite_for_any_detections(scenes: Any, step: float) -> None:
     tracks, taken = ObjectTracks(confirm=1), 0
     for k, scene in enumerate(scenes):
         objects = tracks.update(scene, k * step)

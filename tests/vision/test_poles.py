@@ -1,4 +1,4 @@
-"""Poles in pictures of a race track by the racer's camera, which is tilted up."""
+"""Poles in images of a race track by the racer's camera, which is tilted up."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skyloop.sim.world_file import load_world
 from skyloop.vision import GateDetector, PoleDetector
 
 
-def test_tops_of_poles_and_gates_are_found_where_they_are_whatever_the_tilt() -> None:
+def test_tops_of_poles_and_gates_are_found_at_any_tilt() -> None:
     world = load_world("race0")
     renderer, effects = PlanarRenderer(Scene(world, drones=1)), SensorEffects(FPV_CAMERA, 3)
     camera, rng = FPV_CAMERA.info(), np.random.default_rng(2)
@@ -51,12 +51,12 @@ def _angles(ray: np.ndarray) -> tuple[float, float]:
     return wrap_angle(math.atan2(ray[1], ray[0])), math.atan2(ray[2], math.hypot(ray[0], ray[1]))
 
 
-def test_what_is_no_pole_is_none() -> None:
+def test_other_things_are_not_poles() -> None:
     picture = np.full((240, 320, 3), 90, np.uint8)
     picture[100:160, 100:180] = RACE_POLES[::-1]  # too wide
     picture[100:110, 200:203] = RACE_POLES[::-1]  # too low
-    picture[0:120, 250:255] = RACE_POLES[::-1]  # its top is not seen
-    picture[20:200, 315:320] = RACE_POLES[::-1]  # not the whole of it
+    picture[0:120, 250:255] = RACE_POLES[::-1]  # its top is out of view
+    picture[20:200, 315:320] = RACE_POLES[::-1]  # not entirely visible
     assert PoleDetector(RACE_POLES).detect(picture, FPV_CAMERA.intrinsics()) == []
 
 

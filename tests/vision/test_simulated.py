@@ -1,4 +1,4 @@
-"""The detector that is part of Skyloop: what it finds in pictures that it was not trained with."""
+"""Skyloop's own detector: its findings in images outside its training set."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def seen(world: str, count: int) -> list[Picture]:
     return [Picture(image, boxes) for image, boxes in pictures(load_world(world, SEED), SEED, count)]
 
 
-def test_the_file_is_small_and_tells_its_layout_and_classes(detector: OnnxDetector) -> None:
+def test_the_file_is_small_and_names_its_layout_and_classes(detector: OnnxDetector) -> None:
     assert SIMULATED_WEIGHTS.stat().st_size <= 2_000_000
     assert detector.names == dict(enumerate(CLASS_NAMES))
     assert detector.layout is Layout.YOLO8
@@ -46,7 +46,7 @@ def test_people_and_cars_are_found(detector: OnnxDetector) -> None:
 
 
 @pytest.mark.parametrize("world", ["empty", "pillars"])
-def test_nothing_is_found_where_nothing_is(detector: OnnxDetector, world: str) -> None:
+def test_nothing_is_found_in_empty_worlds(detector: OnnxDetector, world: str) -> None:
     known = seen(world, 8)
     found: list[list[Detection]] = [detector.detect(picture.image) for picture in known]
     assert sum(false_alarms(matches(found, known, name), 0.0) for name in CLASS_NAMES) <= 2

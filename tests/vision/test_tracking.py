@@ -1,4 +1,4 @@
-"""Trackers of a box: on drawn sequences with known boxes, and on what is not an image or a box."""
+"""Trackers of a box: on rendered sequences with known boxes, and with invalid images and boxes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def picture(channels: int = 3) -> Image:
 def run(
     tracker: Tracker, sequence: Sequence, *, most: int | None = None, grey: bool = False
 ) -> list[tuple[TrackResult, Truth]]:
-    """Each result and the true box, after the first image, of those that count."""
+    """Return the results and true boxes of the counted images after the first."""
     found: list[tuple[TrackResult, Truth]] = []
     for n, (image, truth, counts) in enumerate(islice(sequence.frames(), most)):
         seen = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if grey else image
@@ -58,7 +58,7 @@ def test_a_target_that_moves_and_grows_is_tracked(make: Make, grey: bool) -> Non
     assert min(agreement(*one) for one in found) > 0.6
 
 
-def test_light_that_changes_does_not_matter() -> None:
+def test_changing_light_does_not_matter() -> None:
     assert min(agreement(*one) for one in run(LongTermTracker(), scene("light", 3, 60))) > 0.7
 
 
@@ -71,7 +71,7 @@ def test_a_target_out_of_view_is_lost_and_found_again(kind: str) -> None:
     assert not any(result.lost for result, _ in found[-10:])
 
 
-def test_median_flow_stays_lost_until_it_is_started_again() -> None:
+def test_median_flow_stays_lost_until_restarted() -> None:
     steps = list(islice(scene("hidden", 4, 60).frames(), 24, None))
     tracker = MedianFlowTracker()
     found = run(tracker, Sequence("hidden", lambda: iter(steps)))
@@ -83,7 +83,7 @@ def test_median_flow_stays_lost_until_it_is_started_again() -> None:
 
 
 def twins(count: int, *, hidden: range, target_after: bool) -> Sequence:
-    """A target and its exact twin beside it, where a plain wall hides the target, and only the twin may come back."""
+    """A target and its exact twin; a plain wall hides the target, and perhaps only the twin comes back."""
     rng = np.random.default_rng(8)
     background, what = texture(rng, 320, 240), texture(rng, 40, 40, (60, 120, 180))
 
@@ -107,19 +107,19 @@ def test_an_exact_twin_is_not_adopted() -> None:
     assert all(result.lost for result, _ in found[25:])
 
 
-def test_a_target_with_an_exact_twin_stays_lost_after_it_was_hidden_for_long() -> None:
+def test_a_target_with_an_exact_twin_stays_lost_after_a_long_occlusion() -> None:
     found = run(LongTermTracker(), twins(65, hidden=range(25, 42), target_after=True))
     assert all(result.lost for result, _ in found[42:])
 
 
-def test_the_long_term_tracker_takes_any_tracker() -> None:
+def test_the_long_term_tracker_accepts_any_tracker() -> None:
     found = run(LongTermTracker(MedianFlowTracker), scene("hidden", 4, 80))
     assert all(result.lost for result, truth in found if truth is None)
     assert not any(result.lost for result, _ in found[-10:])
 
 
 def changing(roll_deg: float, narrowed: float, faded: float) -> Sequence:
-    """A target that rolls to and fro, is narrowed as if it turned its side, and fades into other texture."""
+    """A target that rolls back and forth, narrows as if turning sideways, and fades into other texture."""
     rng = np.random.default_rng(2)
     background, one, other = texture(rng, 320, 240), texture(rng, 60, 60), texture(rng, 60, 60)
 
@@ -162,7 +162,7 @@ def test_a_target_too_small_to_start_with_is_not_found_again() -> None:
 
 
 class Scripted(Tracker):
-    """Returns the boxes that it is given."""
+    """Returns given boxes."""
 
     def __init__(self, boxes: list[Box]) -> None:
         self._boxes = boxes
@@ -175,7 +175,7 @@ class Scripted(Tracker):
         return TrackResult(self._boxes.pop(0), 1.0)
 
 
-def test_a_box_that_looks_like_something_else_is_not_returned() -> None:
+def test_a_box_with_other_content_is_not_returned() -> None:
     aside = (20.0, 70.0, 30.0, 40.0)
     right = tuple(map(float, BOX))
     inner = Scripted([right, aside, right, *[aside] * 10, right, right, right, right])  # type: ignore[list-item]
@@ -183,12 +183,12 @@ def test_a_box_that_looks_like_something_else_is_not_returned() -> None:
     tracker.start(picture(), BOX)
     lost = [tracker.update(picture()).lost for _ in range(18)]
     assert lost == [False, True, False, *[True] * 10, True, True, True, False, False]
-    assert len(inner.started) == 2  # it was searched for once, in the image after the tenth without verification
+    assert len(inner.started) == 2  # one search, in the image after the tenth without verification
     assert overlap(inner.started[1], right) > 0.8  # type: ignore[arg-type]
 
 
 @EACH
-def test_a_score_says_that_nothing_is_there(make: Make) -> None:
+def test_a_low_score_means_that_the_target_is_absent(make: Make) -> None:
     tracker = make()
     tracker.start(picture(), BOX)
     blank = np.full((120, 160, 3), 127, np.uint8)
@@ -210,7 +210,7 @@ def test_a_score_says_that_nothing_is_there(make: Make) -> None:
         (None, "x, y, width and height"),
     ],
 )
-def test_a_box_that_is_none_is_refused(make: Make, box: Any, why: str) -> None:
+def test_an_invalid_box_is_refused(make: Make, box: Any, why: str) -> None:
     tracker = make()
     with pytest.raises(UsageError, match=why):
         tracker.start(picture(), box)
@@ -219,7 +219,7 @@ def test_a_box_that_is_none_is_refused(make: Make, box: Any, why: str) -> None:
 
 
 @EACH
-def test_an_image_that_is_none_is_refused(make: Make) -> None:
+def test_an_invalid_image_is_refused(make: Make) -> None:
     tracker = make()
     wrong: Any
     for wrong in (
@@ -263,7 +263,7 @@ def test_things_on_a_recorded_film_keep_their_boxes() -> None:
         assert min(agreement(*one) for one in found) > 0.8, name
 
 
-def test_a_thing_on_a_recorded_film_is_tracked_by_a_camera_that_moves() -> None:
+def test_a_thing_on_a_recorded_film_is_tracked_by_a_moving_camera() -> None:
     labels = read_labels()
     boxes = labels.objects["upper label"]
     found = run(LongTermTracker(), moved("upper label", read_film(recorded(labels.film), 80), boxes, 80, 0))
@@ -277,11 +277,11 @@ def test_every_tenth_frame_of_the_film_is_labelled() -> None:
     assert labels.how
 
 
-# What something else knows of the target ---------------------------------------------------------------------------
+# External knowledge of the target ---------------------------------------------------------------------------------
 
 
 def at(x: int, y: int, what: int | None = 5) -> Image:
-    """A picture of a textured thing of 30×40 pixels at a place; None: without it."""
+    """Draw a textured thing of 30×40 pixels at a place; None: without it."""
     image = texture(np.random.default_rng(8), 320, 240)
     if what is not None:
         image[y : y + 40, x : x + 30] = texture(np.random.default_rng(what), 30, 40, (60, 120, 180))
@@ -289,7 +289,7 @@ def at(x: int, y: int, what: int | None = 5) -> Image:
 
 
 @pytest.mark.parametrize("make", [CorrelationTracker, LongTermTracker])
-def test_a_target_that_jumps_with_the_camera_is_found_if_the_tracker_is_told(make: Make) -> None:
+def test_a_target_that_jumps_with_the_camera_is_found_after_a_shift(make: Make) -> None:
     told, untold = make(), make()
     for tracker in (told, untold):
         tracker.start(at(60, 40), BOX)
@@ -299,14 +299,14 @@ def test_a_target_that_jumps_with_the_camera_is_found_if_the_tracker_is_told(mak
     assert agreement(untold.update(at(182, 108)), moved) == 0.0
 
 
-def test_a_tracker_that_looks_by_the_images_own_motion_ignores_shifts() -> None:
+def test_a_tracker_by_the_images_own_motion_ignores_shifts() -> None:
     tracker = MedianFlowTracker()
     tracker.start(at(60, 40), BOX)
     tracker.shift(120.0, 70.0)
     assert agreement(tracker.update(at(62, 41)), (62.0, 41.0, 30.0, 40.0)) > 0.7
 
 
-def test_the_similarity_is_that_of_looks() -> None:
+def test_the_similarity_measures_appearance() -> None:
     tracker = LongTermTracker()
     tracker.start(at(60, 40), BOX)
     assert tracker.similarity(at(150, 100), (150, 100, 30, 40)) > 0.8
@@ -314,7 +314,7 @@ def test_the_similarity_is_that_of_looks() -> None:
     assert tracker.similarity(at(0, 0, None), (150, 100, 30, 40)) < 0.45
 
 
-def test_what_looks_more_like_a_known_look_alike_has_no_similarity() -> None:
+def test_a_better_match_of_a_known_look_alike_has_no_similarity() -> None:
     mixed = np.asarray(cv2.addWeighted(at(60, 40, 5), 0.6, at(60, 40, 6), 0.4, 0), np.uint8)
     tracker = LongTermTracker()
     tracker.start(at(60, 40), BOX)
@@ -324,27 +324,27 @@ def test_what_looks_more_like_a_known_look_alike_has_no_similarity() -> None:
     assert tracker.similarity(at(60, 40), BOX) > 0.9
 
 
-def test_it_goes_on_from_where_something_else_found_the_target() -> None:
+def test_it_continues_from_a_box_found_elsewhere() -> None:
     tracker = LongTermTracker()
     tracker.start(at(60, 40), BOX)
     assert all(tracker.update(at(0, 0, None)).lost for _ in range(15))
     tracker.resume(at(200, 120), (200, 120, 30, 40))
     result = tracker.update(at(203, 121))
     assert agreement(result, (203.0, 121.0, 30.0, 40.0)) > 0.7, "at once, without a trial"
-    assert tracker.similarity(at(60, 40), BOX) > 0.9, "its looks are remembered"
+    assert tracker.similarity(at(60, 40), BOX) > 0.9, "its appearance is remembered"
 
 
-def test_what_was_refused_is_lost_until_it_is_found_again() -> None:
+def test_a_refused_target_is_lost_until_found_again() -> None:
     tracker = LongTermTracker()
     tracker.start(at(60, 40), BOX)
     assert not tracker.update(at(60, 40)).lost
     tracker.refuse()
-    tracker.shift(500.0, 500.0)  # what is lost is looked for everywhere
+    tracker.shift(500.0, 500.0)  # a lost target is searched for everywhere
     assert tracker.update(at(60, 40)).lost
     assert not all(tracker.update(at(60, 40)).lost for _ in range(12))
 
 
-def test_a_tracker_that_was_not_started_can_not_go_on() -> None:
+def test_a_tracker_not_started_can_not_continue() -> None:
     tracker = LongTermTracker()
     tracker.shift(3.0, 4.0)
     for call in (tracker.refuse, lambda: tracker.resume(picture(), BOX), lambda: tracker.similarity(picture(), BOX)):
@@ -356,7 +356,7 @@ def test_a_tracker_that_was_not_started_can_not_go_on() -> None:
             tracker.resume(picture(), wrong)  # type: ignore[arg-type]
         with pytest.raises(UsageError, match="the box is"):
             tracker.similarity(picture(), wrong)  # type: ignore[arg-type]
-    assert not tracker.update(picture()).lost, "it goes on as before"
+    assert not tracker.update(picture()).lost, "it continues as before"
 
 
 # Colours -----------------------------------------------------------------------------------------------------------
@@ -378,10 +378,8 @@ def dressed(shirt: tuple[int, int, int], trousers: tuple[int, int, int]) -> Imag
     ],
     ids=["white", "black", "red", "blue"],
 )
-def test_the_colours_are_those_of_the_upper_and_the_lower_half(
-    colour: tuple[int, int, int], lab: tuple[int, int, int]
-) -> None:
-    """Values of CIELAB by the standard's formulas, for D65."""
+def test_the_colours_are_of_the_upper_and_lower_half(colour: tuple[int, int, int], lab: tuple[int, int, int]) -> None:
+    """CIELAB values from the standard's formulas, for D65."""
     for image, half in ((dressed(colour, (90, 90, 90)), slice(0, 3)), (dressed((90, 90, 90), colour), slice(3, 6))):
         found = colours(image, (60.0, 20.0, 30.0, 80.0))
         assert found.shape == (5, 6)
@@ -403,7 +401,7 @@ def test_colours_of_any_box_are_finite(box: Box) -> None:
         assert np.isfinite(colours(image, box)).all()
 
 
-def test_a_grey_image_has_no_colours_but_light() -> None:
+def test_a_grey_image_has_only_lightness() -> None:
     found = colours(picture(channels=1), tuple(map(float, BOX)))  # type: ignore[arg-type]
     assert found[:, [1, 2, 4, 5]] == pytest.approx(0.0, abs=0.1)
     assert found[2, 0] > 10.0

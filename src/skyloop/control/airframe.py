@@ -1,14 +1,14 @@
-"""The vehicle's motion, how old it is and what of it is missing, and the base of the laws that fly by it. Pure.
+"""Track a vehicle's motion, its age and its gaps; base classes of the laws that fly by it. Pure.
 
-Motion is in *odometry axes*: levelled, x along yaw 0, z up, origin where it was at its first sample. The origin
-drifts with the error of the vehicle's velocity. That does no harm here, because only differences over about a second
-are used; after a gap it may have jumped (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
+Motion is in *odometry axes*: levelled, x along yaw 0, z up, origin at the first sample. The origin drifts with the
+error of the reported velocity. That does no harm here, because the laws use only differences over about a second. After
+a gap it may have jumped (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
 
-A vehicle that reports no velocity, but keeps its height, accelerates by gravity times the tangent of its tilt, less the
-drag of the air. So the attitude, integrated, gives the velocity through the air; drag makes it forget its errors after
-two seconds. The wind and a drag other than the assumed one remain as an error, but one that changes slowly:
-differences, such as how much faster than a target the vehicle moves, are right. To fly at a speed against its own drag
-estimate also holds a vehicle against the wind, as an integral would: the estimate is the tilt, averaged.
+A vehicle that holds its height but reports no velocity accelerates by gravity times the tangent of its tilt, minus air
+drag. Integrating the attitude therefore gives its velocity through the air, and drag makes old errors fade within about
+two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences, such as how much faster
+than its target the vehicle is, are right. Flying at a speed against the vehicle's own drag estimate also holds it
+against the wind, as an integral term would: that estimate is the averaged tilt.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 Array = NDArray[np.float64]
 
-STALE_S: Final = 0.5  #: what was not reported for longer is not known, and a gap in which a vehicle may do anything
-#: Of a small quadrotor, at a few metres a second [1/s]: 0.58 was identified for an AR.Drone 2 (J. Engel, J. Sturm, D.
+STALE_S: Final = 0.5  #: older values count as unknown; after a longer gap the odometry may have jumped
+#: Drag of a small quadrotor at a few metres a second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
 #: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
-_HISTORY_S: Final = 3.0
-_SHORTEST_STEP_S: Final = 0.02  # between samples that came later than they were sent, yaw says little about its rate
-_EXTRAPOLATE_S: Final = 0.3
-_TILTING_S: Final = 0.3
-_STEEPEST: Final = 0.5  # cosine of the tilt, beyond which the vehicle does not keep its height
+_HISTORY_S: Final = 3.0  # how much motion to keep
+_SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples, whose yaw differences say little
+_EXTRAPOLATE_S: Final = 0.3  # longest extrapolation of a motion
+_TILTING_S: Final = 0.3  # time over which the tilt rate is measured
+_STEEPEST: Final = 0.5  # cosine of the tilt; a vehicle tilted further does not hold its height
 
 
 def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
-    """Return when something was seen; None if that was stamped ahead, and would count as new until then."""
+    """Return the time of a sighting; None if it lies ahead of now, because it would count as fresh until then."""
     return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
 
 
 class Part(StrEnum):
-    """What a law may need to know of the vehicle."""
+    """A part of the vehicle's state that a law may need."""
 
     ATTITUDE = "attitude"
     YAW = "yaw"
@@ -85,46 +85,46 @@ class Motion:
         return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
-        """Add a share of the present velocity error to a wanted velocity.
+        """Add a share of the current velocity error to a wanted velocity.
 
         Args:
             wanted: Shape (3,) in odometry axes [m/s].
-            share: Of the difference between wanted and present velocity; 0 or more.
+            share: Fraction of the difference between wanted and current velocity; 0 or more.
         """
         return wanted + share * (wanted - self.velocity)
 
 
 class Airframe:
-    """What is known of a vehicle: its motion in the last three seconds, and the age of each part of it.
+    """A vehicle's motion over the last three seconds, and the age of each part of its state.
 
     Attributes:
-        feedback: The newest sample, without what was not finite; None before the first.
-        by_tilt: The vehicle reports no velocity: it is taken from the attitude (:class:`TiltVelocity`).
-        interruptions: How often the motion was not known for longer than :data:`STALE_S`: what was noted in odometry
-            axes before is off by as much as the vehicle moved meanwhile.
+        feedback: The newest sample, without values that were not finite; None before the first.
+        by_tilt: The vehicle reports no velocity; :class:`TiltVelocity` estimates it from the attitude.
+        interruptions: How often the motion was unknown for longer than :data:`STALE_S`. Positions noted in odometry
+            axes before such a gap are off by the distance flown during it.
     """
 
     def __init__(self, *needs: Part) -> None:
         """Initialise the airframe.
 
         Args:
-            *needs: What its user can't fly without; see :meth:`missing`.
+            *needs: Parts that the caller can't fly without; see :meth:`missing`.
         """
         self.feedback: Feedback | None = None
         self.by_tilt = False
         self.interruptions = 0
         self._needs = needs
-        self._known: dict[Part, tuple[int, Any]] = {}  # when, and what
+        self._known: dict[Part, tuple[int, Any]] = {}  # time and value
         self._history: deque[Motion] = deque()
         self._reckoning = TiltVelocity()
         self._tilts: deque[tuple[int, float, float]] = deque()
 
     def add(self, feedback: Feedback) -> None:
-        """Update with the next sample; one that is not newer than the last is ignored.
+        """Update with the next sample; ignore one that is not newer than the last.
 
         Args:
-            feedback: Numbers in it that are not finite count as missing. One that is older by seconds begins anew: the
-                one before was stamped ahead, or the proxy's clock was set back.
+            feedback: Values that are not finite count as missing. A sample older by seconds restarts the history: the
+                one before it was stamped ahead, or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
@@ -151,37 +151,37 @@ class Airframe:
             self._known[Part.POSITION] = at_ns, feedback.position_m
 
     def age_s(self, part: Part, now_ns: int) -> float:
-        """Return how long ago a part of the motion was reported [s]; infinite if it never was."""
+        """Return the age of a part of the state [s]; infinite if it never was."""
         known = self._known.get(part)
         return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
-        """Return what of the needed parts is not known now, as a sentence; empty if nothing is missing."""
+        """Return a sentence that names the needed parts that are unknown now; empty if none is."""
         old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
     def altitude_m(self, now_ns: int) -> float | None:
-        """Return the newest height above the ground [m]; None while it is not known."""
+        """Return the newest height above the ground [m]; None while unknown."""
         altitude: float | None = self._newest(Part.HEIGHT, now_ns)
         return altitude
 
     def yaw_rad(self, now_ns: int) -> float | None:
-        """Return the newest yaw [rad]; None while it is not known."""
+        """Return the newest yaw [rad]; None while unknown."""
         yaw: float | None = self._newest(Part.YAW, now_ns)
         return yaw
 
     def position_m(self, now_ns: int, *, longest_s: float = STALE_S) -> Vector | None:
-        """Return the newest position in world axes [m]; None if it was not reported for longer than ``longest_s``."""
+        """Return the newest position in world axes [m]; None if it is older than ``longest_s``."""
         position: Vector | None = self._newest(Part.POSITION, now_ns, longest_s)
         return position
 
     @property
     def newest(self) -> Motion | None:
-        """The motion as of the last sample that told it, whatever its age; None before the first."""
+        """The motion of the last sample that reported it, whatever its age; None before the first."""
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """Return the motion at a time [ns], extrapolated from the nearest sample; None while it is not known."""
+        """Return the motion at a time [ns], extrapolated from the nearest sample; None while unknown."""
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -197,10 +197,10 @@ class Airframe:
         Args:
             frame: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
-            *seen: What was measured in it.
+            *seen: Measurements made in the frame.
 
         Returns:
-            None while motion or attitude are not known, and where something that was measured is not finite.
+            None while motion or attitude is unknown, and if a measurement is not finite.
         """
         motion, frame = self.at(captured_ns), _finite(frame)
         if motion is None or frame.roll_rad is None or frame.pitch_rad is None or frame.yaw_rad is None:
@@ -209,9 +209,9 @@ class Airframe:
 
     @property
     def tilt_rate_rad_s(self) -> float:
-        """How fast it tilted lately, by differences, for one whose feedback has no gyroscope.
+        """The recent tilt rate by differences, for vehicles whose feedback has no gyroscope.
 
-        The farthest that roll and pitch are apart within the last 0.3 s, per 0.15 s [rad/s].
+        The largest difference of roll and pitch within the last 0.3 s, per 0.15 s [rad/s].
         """
         if not self._tilts:
             return 0.0
@@ -222,7 +222,7 @@ class Airframe:
         return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
 
     def _begin_anew(self, at_ns: int) -> None:
-        """Keep nothing but where it was last: in odometry axes it is somewhere near that."""
+        """Restart the history at the last known position: the vehicle is still somewhere near it."""
         self._known.clear()
         self._tilts.clear()
         self._reckoning = TiltVelocity()
@@ -245,13 +245,13 @@ class Airframe:
 
 
 class TiltVelocity:
-    """Integrates attitude to the velocity through the air."""
+    """Velocity through the air, integrated from the attitude."""
 
     def __init__(self, drag_per_s: float = DRAG_PER_S) -> None:
-        """Initialise the estimate: at rest.
+        """Initialise the estimate at rest.
 
         Args:
-            drag_per_s: Deceleration per speed [1/s].
+            drag_per_s: Deceleration per unit of speed [1/s].
         """
         self.drag_per_s = drag_per_s
         self._velocity = np.zeros(2)  # horizontal, along yaw 0 and to its left
@@ -261,11 +261,11 @@ class TiltVelocity:
         """Integrate the next sample.
 
         Args:
-            feedback: The vehicle's newest state; landed, it is at rest.
+            feedback: The vehicle's newest state; a landed vehicle is at rest.
 
         Returns:
-            The velocity forward, left and up (which is 0), in the levelled body's axes [m/s]; None while the attitude
-            is not known.
+            The velocity forward, left and up (always 0), in the levelled body's axes [m/s]; None while the attitude is
+            unknown.
         """
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
         if roll is None or pitch is None or yaw is None:
@@ -284,10 +284,10 @@ class TiltVelocity:
 
 
 class AirframeLaw:
-    """The base of laws that fly by the vehicle's motion: they hold it while what they need of it is not known.
+    """The base of laws that fly by the vehicle's motion and hold the vehicle while a part that they need is unknown.
 
     Attributes:
-        airframe: What is known of the vehicle.
+        airframe: The vehicle's known motion.
         problem: Why the law holds the vehicle, as of the last step; empty while it flies.
     """
 
@@ -295,12 +295,12 @@ class AirframeLaw:
         """Initialise the law.
 
         Args:
-            *needs: What it can't fly without.
+            *needs: Parts that the law can't fly without.
         """
         self.airframe = Airframe(*needs)
         self.problem = ""
-        self._altitude: float | None = None  # as of the last step; None: not known
-        self._last_ns: int | None = None  # the last step
+        self._altitude: float | None = None  # as of the last step; None: unknown
+        self._last_ns: int | None = None  # time of the last step
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
@@ -310,14 +310,14 @@ class AirframeLaw:
             self.forget()
 
     def pause(self) -> None:
-        """Restart from rest, because others flew the vehicle, or nothing was known of it."""
+        """Restart from rest, because another client flew the vehicle or its motion was unknown."""
         self._last_ns = None
 
     def forget(self) -> None:
-        """Forget what was noted in odometry axes, because the motion was interrupted."""
+        """Forget everything noted in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Whether all is known that the law needs. Else it pauses, and where its last set-point was long ago."""
+        """Return whether all needed parts are known; pause if not, or if the last set-point is old."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
         if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
@@ -330,7 +330,7 @@ class AirframeLaw:
         return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the motion at a time at which it is known."""
+        """Return the motion at a time; the caller has checked that it is known."""
         motion = self.airframe.at(at_ns)
         assert motion is not None, "a law without its motion is not ready"
         return motion
@@ -343,14 +343,14 @@ class VelocityLaw(AirframeLaw):
         """Initialise the law.
 
         Args:
-            limits: Of the set-points.
-            *needs: What it can't fly without.
+            limits: Limits of the set-points.
+            *needs: Parts that the law can't fly without.
         """
         super().__init__(*needs)
         self._limiter = SetpointLimiter(limits)
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero while what the law needs to know is not known."""
+        """Compute the set-point for now. All zero while a part that the law needs is unknown."""
         if not self._ready(now_ns):
             return Velocity()
         return self._limiter.step(self._setpoint(now_ns), self._since_s(now_ns))
@@ -366,7 +366,7 @@ class VelocityLaw(AirframeLaw):
 
 
 def _yaw_rate(feedback: Feedback, yaw: float, last: Motion | None) -> float:
-    """Return the yaw rate that is reported, or else that since the last sample: a Tello reports none."""
+    """Return the reported yaw rate, or else the one since the last sample (a Tello reports none)."""
     if feedback.angular_velocity_rad_s is not None:
         return feedback.angular_velocity_rad_s[2]
     if last is None:
@@ -382,14 +382,14 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "position_m")
 
 
 def _finite(feedback: Feedback) -> Feedback:
-    """Return feedback without what is not finite: a driver or a source of positions may be at fault."""
+    """Return feedback without values that are not finite: a driver or a position source may be faulty."""
     wrong = [name for name in _NUMBERS if not math.isfinite(getattr(feedback, name) or 0.0)]
     wrong += [name for name in _VECTORS if not all(map(math.isfinite, getattr(feedback, name) or ()))]
     return msgspec.structs.replace(feedback, **dict.fromkeys(wrong)) if wrong else feedback
 
 
 class TurningSearch:
-    """Search with a camera that looks forward: turn on the spot, and after each full turn go to the next height."""
+    """A search with a forward camera: turn on the spot and change height after each full turn."""
 
     def __init__(
         self,
@@ -402,7 +402,7 @@ class TurningSearch:
 
         Args:
             turn_rad_s: Yaw rate.
-            heights_m: One for each full turn, above the height at the start.
+            heights_m: Height of each full turn, relative to the height at the start.
             lowest_m: Least height above the ground.
             highest_m: Greatest height above the ground.
         """
@@ -428,7 +428,7 @@ class TurningSearch:
         """Compute the set-point.
 
         Args:
-            yaw: Of the vehicle [rad].
+            yaw: Yaw of the vehicle [rad].
             altitude: Above the ground [m]; None keeps the height.
 
         Returns:

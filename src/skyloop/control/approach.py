@@ -1,4 +1,4 @@
-"""Fly up to a marker and stop before it; swing round it; circle round a position; land on a marker, moving or not."""
+"""Approach a marker and stop in front of it; swing around it; circle a position; land on a still or moving marker."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
-_LONGEST_STEP_S = 0.2
+_LONGEST_STEP_S = 0.2  # a longer gap between frames moves the station along the arc by no more
 _LOOKING: Colour = (120, 190, 255)
 _SEEN: Colour = (64, 220, 100)
 
 
 class ApproachMarker(FollowMarker):
-    """Finds a marker, flies straight before its face, and hovers there; then :meth:`run` returns.
+    """Finds a marker, flies to a point squarely in front of it and hovers there; then :meth:`run` returns.
 
-    The goal counts as reached when distance and height were within ``near_m``, and the angle to the marker's face
-    within ``near_rad``, for ``hold_s``.
+    The goal counts as reached once distance and height have stayed within ``near_m``, and the angle to the marker's
+    normal within ``near_rad``, for ``hold_s``.
     """
 
     name = "approach"
@@ -59,15 +59,15 @@ class ApproachMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
-            distance_m: Where to stop before it; replaces that of ``settings``.
+            marker_id: Id of the marker.
+            distance_m: Distance at which to stop; replaces that of ``settings``.
             near_m: Acceptance radius of distance and height together.
-            near_rad: Acceptance angle to each side of straight before the face.
+            near_rad: Acceptance angle to each side of the marker's normal.
             hold_s: How long the vehicle must stay within both.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults, with ``aside_rad`` 0.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.
 
         Raises:
             UsageError: A number is not finite and above 0.
@@ -100,12 +100,12 @@ class ApproachMarker(FollowMarker):
 
 
 class OrbitMarker(FollowMarker):
-    """Swings to and fro round a marker on an arc, looking at it: a flat marker can't be seen from behind.
+    """Swings back and forth on an arc in front of a marker, facing it (a flat marker can't be seen from behind).
 
-    Starts on the side from which it sees the marker, and runs until it is stopped.
+    Starts on the side from which it sees the marker and runs until stopped.
 
     Attributes:
-        turns: How often the end of the arc was reached.
+        turns: Number of times that it reached an end of the arc.
     """
 
     name = "orbit"
@@ -127,14 +127,14 @@ class OrbitMarker(FollowMarker):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             radius_m: Distance from it; replaces that of ``settings``.
-            reach_rad: How far to each side of straight before the marker's face, at most 1.1.
-            rate_rad_s: Angular rate round the marker.
+            reach_rad: Half angle of the arc to each side of the marker's normal, at most 1.1.
+            rate_rad_s: Angular rate around the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults, with ``aside_rad`` 0.05.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.05.
 
         Raises:
             UsageError: A number is out of its range.
@@ -143,7 +143,7 @@ class OrbitMarker(FollowMarker):
         """
         _require_above_0(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
         if reach_rad > 1.1:
-            raise UsageError(f"reach_rad is {reach_rad!r}: from farther aside than 1.1 the marker is not seen any more")
+            raise UsageError(f"reach_rad is {reach_rad!r} and must be at most 1.1: further aside, the marker is hidden")
         wanted = replace(settings or FollowSettings(aside_rad=0.05), distance_m=radius_m)
         super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
         self.turns = 0
@@ -158,7 +158,7 @@ class OrbitMarker(FollowMarker):
         going = self.mode is Mode.FOLLOWING and law.aside_rad is not None
         law.station_rate_rad_s = self._rate if going else 0.0
         if law.aside_rad is not None and not going:
-            law.station_rad = law.aside_rad  # from where it is found again
+            law.station_rad = law.aside_rad  # from where the marker was found again
         if abs(law.station_rad) >= self._reach and law.station_rad * self._rate > 0.0:
             self._rate = -self._rate
             self.turns += 1
@@ -167,7 +167,7 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Flies round a position on a circle, facing it or away from it; then hovers, and :meth:`run` returns.
+    """Circles a position, facing it or away from it; then hovers, and :meth:`run` returns.
 
     Needs the vehicle's position: see :class:`FollowPath`.
     """
@@ -189,12 +189,12 @@ class OrbitPlace(FollowPath):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             centre: x, y and the height to fly at [m], world axes.
-            radius_m: Of the circle.
-            look: Whether the front points ``"in"`` to the centre or ``"out"``.
-            speed_m_s: Along the circle.
-            laps: How often round; counter-clockwise.
-            settings: Of the path law; None are the defaults.
-            source: Of positions; None is the vehicle's own feedback.
+            radius_m: Radius of the circle.
+            look: Whether the vehicle faces ``"in"``, to the centre, or ``"out"``.
+            speed_m_s: Speed along the circle.
+            laps: Number of laps, counter-clockwise.
+            settings: Settings of the path law; None are the defaults.
+            source: Position source; None is the vehicle's own feedback.
 
         Raises:
             UsageError: An argument is out of its range.
@@ -213,16 +213,16 @@ def _require_above_0(**values: float) -> None:
 
 
 class LandOnMarker(Behaviour):
-    """Searches the marker on a spiral, flies over it, descends with it, and stops the motors when it has landed.
+    """Searches for a marker on a spiral, flies over it, descends with it and stops the motors after landing.
 
-    A marker that is lost on the way makes the vehicle climb where the marker must be, then search. Low over the marker,
-    where it no longer fits into the image, the vehicle descends by the marker's predicted motion; it aborts and tries
-    again where it would miss. After too many aborted attempts, or too long a time, it climbs to a safe height, hovers
-    there, and :meth:`run` returns with :attr:`landed` false; so it does where others land the vehicle. The vehicle must
-    be airborne when :meth:`run` is called; a :meth:`run` that ends earlier leaves it hovering where it is.
+    If the marker is lost on the way, the vehicle climbs where the marker should be, then searches. Low over the marker,
+    where it no longer fits into the image, the vehicle descends by the marker's predicted motion; if it would miss, it
+    aborts and tries again. After too many aborted attempts, or too long a time, it climbs to a safe height, hovers
+    there, and :meth:`run` returns with :attr:`landed` false; the same holds if another client lands the vehicle. The
+    vehicle must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
 
     Attributes:
-        marker_id: Which marker.
+        marker_id: Id of the marker.
     """
 
     name = "landing"
@@ -242,19 +242,19 @@ class LandOnMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: One that looks down.
-            settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.
+            camera: A camera that looks down.
+            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
-            UsageError: The vehicle can't land by itself.
+            UsageError: The vehicle does not support landing.
             MissingExtraError: OpenCV is not installed.
         """
         if "land" not in drone.capabilities.actions:
-            raise UsageError("this vehicle can't land by itself")
+            raise UsageError("this vehicle does not support landing")
         limits = {parameter.name: parameter.value for parameter in drone.config.parameters()}
         self._landing_law = LandingLaw((settings or LandingSettings()).within(limits))
         self._detector = MarkerDetector(dictionary, size_m)
@@ -264,7 +264,7 @@ class LandOnMarker(Behaviour):
 
     @property
     def phase(self) -> LandingPhase:
-        """What the behaviour is doing."""
+        """The current phase."""
         return self._landing_law.phase
 
     @property
@@ -273,23 +273,23 @@ class LandOnMarker(Behaviour):
         return self.done and self.phase is LandingPhase.DOWN
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the law and send its set-point; once it is down, wait until the vehicle reports that it has landed."""
+        """Update the law and send its set-point; after touch-down wait until the vehicle reports that it has landed."""
         self._flew = self._flew or feedback.state.airborne
         down = self.phase is LandingPhase.DOWN
         if self._flew and feedback.state is FlightState.LANDED and not self.done:
             self.done = True
-            text = "standing on the marker" if down else "the vehicle was landed, and not by this behaviour"
+            text = "standing on the marker" if down else "another client landed the vehicle"
             self.emit(text, Severity.INFO if down else Severity.WARNING)
             self._end()
         if down or self.done:
-            self._landing_law.feedback(feedback)  # others may take over and fly it from here
+            self._landing_law.feedback(feedback)  # another client may take over and fly it from here
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:
-            self.fly(self.drone.now_ns)  # by each sample, and not by frames alone: gusts are answered sooner
+            self.fly(self.drone.now_ns)  # on every sample, not only on frames, to answer gusts sooner
 
     def on_frame(self, frame: Frame) -> None:
-        """Search the frame; end the behaviour where the law has given up."""
+        """Search the frame; end the behaviour if the law has given up."""
         super().on_frame(frame)
         if not self.done and self._landing_law.safe(frame.captured_ns):
             self.finish("gave up: hovering at a safe height", Severity.WARNING)
@@ -313,7 +313,7 @@ class LandOnMarker(Behaviour):
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
-            # Each step anew: a link that is down for a moment ends no landing.
-            let_go(self.drone, "it is down on its marker", land=True)
+            # Requested at every step, so that a short loss of the link does not end the landing.
+            let_go(self.drone, "it has touched down on its marker", land=True)
         else:
             super().steer(wanted)

@@ -17,7 +17,7 @@ from skyloop.messages.relayed import Shape
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-BLIND_S = 0.5  #: without a frame for longer than this, the vehicle hovers
+BLIND_S = 0.5  #: the vehicle hovers after this long without a frame
 
 
 class Law(Protocol):
@@ -33,22 +33,22 @@ class Law(Protocol):
 class Behaviour(Controller):
     """A controller that detects something in the camera's frames and flies by it.
 
-    Each frame is searched (:meth:`look`), the law computes a set-point, :meth:`steer` sends it, and what was found is
-    drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne when
-    :meth:`run` is called; when frames stop for more than :data:`BLIND_S`, or the law does not know what it needs of
-    the vehicle's motion, it hovers, and an event says so.
+    For each frame, :meth:`look` searches the image, the law computes a set-point, :meth:`steer` sends it, and the
+    detections are drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne
+    when :meth:`run` is called. When frames stop for more than :data:`BLIND_S`, or when a part of the vehicle's motion
+    that the law needs is unknown, the vehicle hovers and an event reports it.
 
     Subclasses define :meth:`look`, :attr:`phase`, and in :attr:`losses` the phases without sight of the target.
 
     Attributes:
         name: Source of the annotations, and prefix of the events' text.
         done: Whether the behaviour reached its end.
-        blind: Whether no frames arrive, and the vehicle hovers for that reason.
-        problem: What the law has to know and does not, so that the vehicle hovers; empty for nothing.
+        blind: Whether the vehicle hovers because no frames arrive.
+        problem: The missing part of the vehicle's state for which it hovers; empty if there is none.
     """
 
-    name = "behaviour"  #: source of its annotations, and prefix of its events' text
-    losses: frozenset[StrEnum] = frozenset()  #: phases in which the target is not seen; entering one is a warning
+    name = "behaviour"  #: source of the annotations, and prefix of the events' text
+    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target; entering one is a warning
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.
@@ -56,7 +56,7 @@ class Behaviour(Controller):
         Args:
             drone: The drone to fly.
             law: Computes the set-points.
-            camera: Whose frames to use; None is the vehicle's first camera.
+            camera: Camera to use; None is the vehicle's first camera.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -64,8 +64,8 @@ class Behaviour(Controller):
         super().__init__(drone)
         self.camera = camera
         self.done = False  #: the behaviour reached its end
-        self.blind = False  #: no frames arrive, and the vehicle hovers
-        self.problem = ""  #: what the law has to know and does not, and the vehicle hovers
+        self.blind = False  #: the vehicle hovers because no frames arrive
+        self.problem = ""  #: missing part of the vehicle's state for which it hovers
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture of the newest frame
@@ -73,7 +73,7 @@ class Behaviour(Controller):
 
     @property
     def phase(self) -> StrEnum:
-        """The present phase."""
+        """The current phase."""
         raise NotImplementedError
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -89,7 +89,7 @@ class Behaviour(Controller):
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        # A frame that was stamped ahead would else hide for as long that none come any more.
+        # abs(): a frame stamped ahead would otherwise hide that the frames have stopped.
         if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
@@ -97,7 +97,7 @@ class Behaviour(Controller):
             let_go(self.drone, "no frames arrive")
 
     def on_frame(self, frame: Frame) -> None:
-        """Search the frame, send the law's set-point, and draw what was found."""
+        """Search the frame, send the law's set-point and draw the detections."""
         if self.done:
             return
         self._frame_ns = frame.captured_ns
@@ -126,7 +126,7 @@ class Behaviour(Controller):
         problem = law.problem if isinstance(law, AirframeLaw) and known is not None else ""
         if problem != self.problem:
             self.problem = problem
-            text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: flying on"
+            text = f"{problem}: hovering" if problem else "the vehicle's motion is known again: continuing"
             self.emit(text, Severity.WARNING if problem else Severity.INFO)
         if problem:
             let_go(self.drone, problem)
@@ -148,8 +148,8 @@ class Behaviour(Controller):
         """End the behaviour for good: publish an event, hover, and let :meth:`run` return.
 
         Args:
-            text: What was achieved; the event's text after the name.
-            severity: How important it is.
+            text: The result; follows the behaviour's name in the event's text.
+            severity: Severity of the event.
         """
         self.done = True
         self.emit(text, severity)
@@ -161,7 +161,7 @@ class Behaviour(Controller):
 
         Args:
             text: Follows the behaviour's name and a colon.
-            severity: How important it is.
+            severity: Severity of the event.
         """
         self.drone.emit(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
 
@@ -174,10 +174,10 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """Return a camera of the vehicle's capabilities.
+    """Look up a camera in the vehicle's capabilities.
 
     Args:
-        drone: The drone that is asked for its capabilities.
+        drone: The drone whose capabilities to read.
         camera: The camera's name; None is the vehicle's first.
 
     Raises:

@@ -1,11 +1,10 @@
-"""The law that keeps a target in view, at a distance, or circles it. Pure: times are on the proxy's clock.
+"""Keep a target in view at a distance, or circle it. Pure: times are on the proxy's clock.
 
-Yaw keeps the target in the middle of the image, the distance is kept along the line of sight, height and side are
-controlled apart from both: the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
-object tracking and following for unmanned aerial vehicles", SSRR 2013), here on estimated metres, so that gains do not
-depend on the lens or the size, with the target's velocity fed forward. A vehicle that does not report its own velocity
-is flown by its attitude, to the same velocity, against one that comes by dead reckoning
-(:class:`.airframe.TiltVelocity`).
+Yaw keeps the target in the middle of the image, distance is controlled along the line of sight, height and side
+separately. That is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied object
+tracking and following for unmanned aerial vehicles", SSRR 2013), applied to estimated metres, so that gains depend on
+neither lens nor target size, and with the target's velocity fed forward. A vehicle that reports no velocity is flown by
+attitude to the same velocity, which then comes from dead reckoning (:class:`.airframe.TiltVelocity`).
 """
 
 from __future__ import annotations
@@ -30,24 +29,24 @@ from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
 
-_SMOOTHING_S = 0.4  # of the target's acceleration
-_SETPOINT_OVER = 1.5  # times the greatest speed: against its drag a vehicle reaches less than it is asked for
-_SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
-_COMING_S = 3.0  # a target that comes by sooner is made way for
-_SURE_M = 0.35  # a deviation of a place up to which it counts as certain
-_UNCERTAIN_M = 1.0  # most by which it stays farther off from somebody whose place is not certain
-_GIVING_WAY_S = 1.0  # who has begun to make way to one side goes on to that side
-_EITHER_SIDE = 0.2  # of the clearance: it may pass on either side of somebody who comes so near to its middle
-_SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
-_THERE_M = 0.1  # from a height that it flies to for the parallax: on to the other
-_ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
+_SMOOTHING_S = 0.4  # time constant of the target's acceleration
+_SETPOINT_OVER = 1.5  # set-point limit, times the top speed: drag keeps a vehicle below its set-point
+_SETPOINT_AHEAD = 4.0  # limit of the set-point's change, times the vehicle's: a set-point must lead to have an effect
+_APPROACH_HORIZON_S = 3.0  # give way to a target that will pass sooner than this
+_CONFIDENT_SIGMA_M = 0.35  # a position with at most this deviation counts as certain
+_UNCERTAIN_M = 1.0  # largest extra clearance from a person whose position is uncertain
+_KEEP_SIDE_S = 1.0  # after giving way to one side, stay on that side for this long
+_HEAD_ON_SHARE = 0.2  # share of the clearance: within it a pass is head-on, and either side will do
+_SWEEP_BACK_SHARE = 0.4  # share of the sweep that goes away from the target's motion
+_HEIGHT_REACHED_M = 0.1  # this close to a parallax height, head for the other one
+_ALONG_M_S = 0.4  # a slower target has no direction of motion to be behind or beside of
 
 
 class _Now(NamedTuple):
-    """What a set-point is computed from."""
+    """The inputs of a set-point."""
 
     own: Motion
-    ahead: Motion  #: when the set-point takes hold
+    ahead: Motion  #: when the set-point takes effect
     predicted: Predicted | None  #: None: by attitude, or before the first feedback
     altitude_m: float | None
     dt_s: float  #: since the last step
@@ -58,11 +57,11 @@ class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state.
 
     Attributes:
-        settings: May be replaced in flight.
-        mode: May be changed in flight.
+        settings: Can be replaced in flight.
+        mode: Can be changed in flight.
         phase: As of the last step.
         off_m: Estimated minus wanted distance, as of the last step; None while the target is not seen.
-        held_by: What keeps it from flying to where it is wanted: "leash"; empty for nothing.
+        held_by: The constraint that keeps the vehicle from its goal: "leash"; empty if there is none.
     """
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
@@ -72,21 +71,21 @@ class ChaseLaw:
         self.phase = TargetPhase.LOOKING
         self.off_m: float | None = None
         self.held_by = ""
-        self._heading: float | None = None  # in which the target moved when it last did
-        self._out = np.zeros(2)  # where it is, from where it began
-        self._was_at: Array | None = None  # in odometry axes, at the last step
-        self._begin: Array | None = None  # in world axes; None: its position was not known yet
+        self._heading: float | None = None  # heading of the target's last motion
+        self._out = np.zeros(2)  # the vehicle's position relative to its start
+        self._previous_position: Array | None = None  # in odometry axes, at the last step
+        self._begin: Array | None = None  # start, in world axes; None until the position is known
         self._height: float | None = None
-        self._away = False  # while the range is not known: whether it is on its way to the other height
-        self._since_ns: int | None = None  # when the search began
+        self._away = False  # while the range is unknown: whether the vehicle is flying to the other height
+        self._since_ns: int | None = None  # start of the search
         self._direction = 1.0
-        self._sweep_first = 0.0  # side to look to first, 1 is left; 0: not chosen yet
-        self._was: tuple[int, Array] | None = None  # the target's velocity, and when
+        self._sweep_first = 0.0  # side of the first sweep, 1 is left; 0: not chosen yet
+        self._previous_velocity: tuple[int, Array] | None = None  # time and the target's velocity
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
         self._response = VelocityResponse(_response(self.settings))
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
-        self._made_way: tuple[int | None, Array] = (None, np.zeros(2))  # when, and to which side
+        self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and side
 
     def step(
         self,
@@ -106,14 +105,14 @@ class ChaseLaw:
         Args:
             now_ns: On the proxy's clock.
             motion: The vehicle's newest motion; with ``relative`` by dead reckoning.
-            altitude_m: Height above the ground; None: the height is left as it is.
-            target: Its filter; None before it was seen.
-            seen_ns: When it was last in view for certain, or perhaps; None: never.
-            others: Who else was seen lately, and is kept clear of.
-            candidate: Somebody who may be the lost target, and is looked at.
-            relative: The vehicle does not report its velocity (see :class:`.airframe.TiltVelocity`): the set-point is
-                an attitude.
-            position: Where it is now, world axes [m]; None: not known, and the leash is by the velocity, added up.
+            altitude_m: Height above the ground; None leaves the height alone.
+            target: The target's filter; None before the first sighting.
+            seen_ns: The target's last certain or possible sighting; None: never.
+            others: Recently seen objects to keep clear of.
+            candidate: A possible match for the lost target; the vehicle turns to it.
+            relative: The vehicle reports no velocity (see :class:`.airframe.TiltVelocity`), so the set-point is an
+                attitude.
+            position: The vehicle's position in world axes [m]; None if unknown: the leash integrates velocity.
         """
         s = self.settings
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
@@ -143,11 +142,11 @@ class ChaseLaw:
         turn = self._turn(ahead, state, aside, sweeping)
         if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
             return self._steer(still, turn, state, now)
-        # As fast as before for half of the time, then ever slower.
+        # Full speed for half of ``predict_s``, then slower and slower.
         fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
         if state.range_known:
             horizontal = self._horizontal(ahead, state) * max(0.0, fade)
-        else:  # it may be far nearer than it seems
+        else:  # the target may be much nearer than it seems
             horizontal = still
             self.phase = self.phase if self.phase in LOSSES else TargetPhase.RANGING
         if self.phase is TargetPhase.PREDICTING:
@@ -158,16 +157,16 @@ class ChaseLaw:
         return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
-        """Update the model of the vehicle's response with its newest state; a vehicle without velocity has none."""
+        """Update the model of the vehicle's response ; vehicles that report no velocity have none."""
         self._response.add(feedback)
 
     def pause(self) -> None:
-        """Restart from the vehicle's own velocity, because others flew it, or its motion was not known."""
+        """Restart from the vehicle's own velocity, because another client flew it or its motion was unknown."""
         self._limiter, self._last_ns = None, None
         self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
-        """Return the motion at which a set-point that is sent now finds the vehicle, with all that is under way."""
+        """Return the vehicle's motion when a set-point sent now takes effect, given the set-points already sent."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
         if predicted is None:
@@ -181,14 +180,14 @@ class ChaseLaw:
         )
 
     def _steer(self, velocity: Array, turn: float, state: TargetState | None, now: _Now) -> Velocity | Attitude:
-        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, at the height that is wanted."""
+        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, at the wanted height."""
         up = self._up(now.altitude_m, state)
         if now.relative:
             return self._by_attitude(now.ahead, velocity, up, turn)
         return self._by_velocity(velocity, up, turn, now)
 
     def _by_velocity(self, velocity: Array, up: float, turn: float, now: _Now) -> Velocity:
-        """Return the set-point that brings the vehicle to a velocity, whatever pushes it."""
+        """Return the set-point that brings the vehicle to a velocity in spite of drag and wind."""
         s, own = self.settings, now.own
         assert self._limiter is not None
         if now.predicted is not None:
@@ -219,9 +218,9 @@ class ChaseLaw:
         }[self.mode]
 
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
-        """Return how far to the left of where the target should be to look [rad], and how fast that changes [rad/s].
+        """Return how far to the left of the target's expected position to look [rad], and that angle's rate [rad/s].
 
-        To and fro while it hovers, at first and farthest to where the target was going: 0 in all other phases.
+        While hovering, sweep to both sides, first and furthest towards the target's last motion; 0 in other phases.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -230,14 +229,14 @@ class ChaseLaw:
         if self._sweep_first == 0.0:
             x, y = state.foot[:2] - own.position[:2]
             self._sweep_first = math.copysign(1.0, x * state.velocity[1] - y * state.velocity[0])
-        back = _SWEEP_BACK * s.sweep_rad
+        back = _SWEEP_BACK_SHARE * s.sweep_rad
         whole = s.sweep_rad + back
         swept = (s.search_rad_s * (unseen_s - s.seen_s - s.predict_s) + back) % (2.0 * whole)
         aside = self._sweep_first * (whole - abs(swept - whole) - back)  # a triangular wave
         return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
 
     def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
-        """Return the yaw rate that turns it to the target, or ``aside`` to its left [rad], and keeps it there."""
+        """Return the yaw rate that points the vehicle at the target, or ``aside`` [rad] to the target's left."""
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
@@ -257,14 +256,14 @@ class ChaseLaw:
         aside = np.array([-sight[1], sight[0]])
         near = max(0.3, across - state.margin_m)
         self.off_m = near - s.distance_m
-        # Towards it no faster than it can stop again; away from it as the gain says.
+        # Approach no faster than the vehicle can stop; back off at the speed that the gain gives.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
         moving = self._soon(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
-            wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above: the target on the left
+            wanted = wanted - aside * s.orbit_m_s  # counter-clockwise from above, with the target on the left
         elif s.bearing_rad is None:
-            # No side was asked for: what the target does across the line of sight is left to yaw.
+            # No side is wanted: yaw alone follows the target's motion across the line of sight.
             wanted = wanted - aside * float(moving @ aside)
         else:
             wanted = wanted + aside * self._round(state, sight, across)
@@ -272,15 +271,15 @@ class ChaseLaw:
         return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
-        """Return the target's velocity as it will be when the vehicle has taken it up, (2,) [m/s]."""
+        """Return the target's velocity, (2,) [m/s], predicted to when the vehicle has matched it."""
         s, velocity = self.settings, state.velocity
-        if self._was is not None and at_ns > self._was[0]:
-            dt_s = seconds(at_ns - self._was[0])
+        if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
+            dt_s = seconds(at_ns - self._previous_velocity[0])
             if dt_s > 0.5:
                 self._acceleration = LowPass(_SMOOTHING_S)
-            change = shortened((velocity - self._was[1]) / dt_s, s.acceleration_m_s2)
+            change = shortened((velocity - self._previous_velocity[1]) / dt_s, s.acceleration_m_s2)
             self._acceleration.step(change, min(dt_s, 0.5))
-        self._was = (at_ns, velocity)
+        self._previous_velocity = (at_ns, velocity)
         change = np.zeros(2) if self._acceleration.value is None else self._acceleration.value
         return velocity + s.response_s * change
 
@@ -296,7 +295,7 @@ class ChaseLaw:
         return -clamped(s.round_gain * off * across, 0.6 * s.speed_m_s)
 
     def _evading(self, own: Motion, state: TargetState) -> Array:
-        """Return the velocity that leaves the way of a target that comes by nearer than allowed, (2,) [m/s]."""
+        """Return the velocity, (2,) [m/s], that makes way for a target about to pass nearer than allowed."""
         s, velocity = self.settings, state.velocity
         speed = float(np.hypot(*velocity))
         if speed < _ALONG_M_S:
@@ -304,53 +303,53 @@ class ChaseLaw:
         here = own.position[:2] - state.foot[:2]
         left = np.array([-velocity[1], velocity[0]]) / speed
         in_s, aside = float(here @ velocity) / speed**2, float(here @ left)
-        if not 0.0 < in_s < _COMING_S or abs(aside) >= s.nearest_m:
+        if not 0.0 < in_s < _APPROACH_HORIZON_S or abs(aside) >= s.nearest_m:
             return np.zeros(2)
         needed = (s.nearest_m - abs(aside)) / max(0.5, in_s)
         return left * math.copysign(min(needed, 0.7 * s.speed_m_s), aside)
 
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
-        """Return the velocity that keeps clear of somebody else, (2,) [m/s].
+        """Return the velocity, (2,) [m/s], that keeps clear of another object.
 
-        The nearest pass counts, by the velocity that it has or that it is about to take up. The less certain it is
-        where the other is, who is out of view perhaps, the farther off it stays, and reckons with a stop.
+        Take the closest pass at the vehicle's current velocity and at the one it is about to take up. If the other's
+        position is uncertain, for example out of view, stay further off and allow for it to stop.
         """
-        uncertain_m = within(other.place_m - _SURE_M, 0.0, _UNCERTAIN_M)
+        uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
         here = own.position[:2] - other.foot[:2]
         moves = (other.velocity, np.zeros(2)) if uncertain_m > 0.0 else (other.velocity,)
         passes = [_pass(here, velocity - theirs) for velocity in (wanted, own.velocity[:2]) for theirs in moves]
-        away, in_s, side = min(passes, key=lambda one: (one[1] >= _COMING_S, one[0]))
-        if in_s >= _COMING_S or away >= clear_m:
+        away, in_s, side = min(passes, key=lambda one: (one[1] >= _APPROACH_HORIZON_S, one[0]))
+        if in_s >= _APPROACH_HORIZON_S or away >= clear_m:
             return np.zeros(2)
         gap = clear_m - away
-        # Of somebody who comes straight towards it, noise would make it take now one side, now the other.
-        made_way_ns, before = self._made_way
-        lately = made_way_ns is not None and seconds(own.at_ns - made_way_ns) < _GIVING_WAY_S
-        if lately and float(side @ before) < 0.0 and away < _EITHER_SIDE * clear_m:
+        # With a head-on approach, noise alone would make the vehicle switch sides.
+        gave_way_ns, before = self._gave_way
+        lately = gave_way_ns is not None and seconds(own.at_ns - gave_way_ns) < _KEEP_SIDE_S
+        if lately and float(side @ before) < 0.0 and away < _HEAD_ON_SHARE * clear_m:
             side, gap = -side, clear_m + away
-        self._made_way = own.at_ns, side
+        self._gave_way = own.at_ns, side
         return side * min(gap / max(0.5, in_s), 0.7 * self.settings.speed_m_s)
 
     def _kept_off(self, wanted: Array, state: TargetState, sight: Array, across: float) -> Array:
-        """Take away what would bring it so near, and so fast, that it could not stop before the nearest distance."""
+        """Limit the closing speed so that the vehicle can stop before the nearest distance."""
         closing = float((wanted - state.velocity) @ sight)
         gap = across - self.settings.nearest_m
         allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
     def _note_way(self, own: Motion, position: Vector | None) -> None:
-        """Note how far it is from where it began: the velocity drifts, the position does not."""
+        """Track the offset from the start, by position if known: the velocity's integral drifts."""
         here = own.position[:2]
-        self._out = self._out + (np.zeros(2) if self._was_at is None else here - self._was_at)
-        self._was_at = here
+        self._out = self._out + (np.zeros(2) if self._previous_position is None else here - self._previous_position)
+        self._previous_position = here
         if position is not None:
             known = np.array(position[:2])
             self._begin = known - self._out if self._begin is None else self._begin
             self._out = known - self._begin
 
     def _leashed(self, out: Array, wanted: Array) -> Array:
-        """Take away what would lead farther out than the leash; ``out``, (2,) [m]: where it is from where it began."""
+        """Limit the velocity to stay within the leash; ``out``, (2,) [m], is the offset from the start."""
         leash = self.settings.leash_m
         if leash is None:
             return wanted
@@ -366,7 +365,7 @@ class ChaseLaw:
         return wanted - direction * (outwards - allowed)
 
     def _up(self, altitude_m: float | None, state: TargetState | None) -> float:
-        """Return the climb that keeps the height, or brings the target's middle back into the image's middle part."""
+        """Return the climb that keeps the height, or brings the target back towards the image's centre."""
         s = self.settings
         if altitude_m is None:
             return 0.0
@@ -381,19 +380,19 @@ class ChaseLaw:
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _for_parallax(self, height: float, altitude_m: float) -> float:
-        """Return the next of the two heights that a range is learnt by: rather above, as somebody may stand below."""
+        """Return the next of the two heights that reveal the range; prefer to rise, as people may be below."""
         s = self.settings
         other = height = within(height, s.lowest_m, s.highest_m)
         if s.parallax_m is not None:
             above, below = height + s.parallax_m, height - s.parallax_m
             other = above if above <= s.highest_m else max(below, s.lowest_m)
         goal = other if self._away else height
-        if abs(goal - altitude_m) < _THERE_M:
+        if abs(goal - altitude_m) < _HEIGHT_REACHED_M:
             self._away = not self._away
         return other if self._away else height
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
-        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s]; against drag as well."""
+        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s], and makes up for drag."""
         s = self.settings
         push = s.tilt_gain * (wanted - own.velocity[:2]) + DRAG_PER_S * own.velocity[:2]
         forward, left = own.to_body(shortened(push, GRAVITY_M_S2 * math.tan(s.tilt_rad)))
@@ -402,9 +401,9 @@ class ChaseLaw:
         )
 
     def _limits(self, own: Motion) -> None:
-        """Take over the limits; the first set-point, too, is limited: by the vehicle's own velocity."""
+        """Apply the settings' limits; start the first set-point from the vehicle's own velocity."""
         s = self.settings
-        # A set-point leads the velocity by what accelerates the vehicle: it may change faster than that does.
+        # A set-point leads the velocity that it causes, so it may change faster than the vehicle does.
         limits = SetpointLimits(
             _SETPOINT_OVER * s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2
         )
@@ -420,14 +419,14 @@ def _response(settings: ChaseSettings) -> ResponseSettings:
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
-    """Return how near two come to each other [m], in how many seconds, and the unit vector to where one passes, (2,).
+    """Return the distance of the closest pass [m], the time to it [s] and the unit vector to the side to pass on, (2,).
 
     Args:
-        here: From the other to the one, (2,) [m].
-        moving: The one's velocity against the other's, (2,) [m/s].
+        here: Offset from the other to the vehicle, (2,) [m].
+        moving: The vehicle's velocity relative to the other's, (2,) [m/s].
     """
     square = float(moving @ moving)
-    in_s = clamped(-float(here @ moving) / square, _COMING_S) if square > 0.01 else 0.0
+    in_s = clamped(-float(here @ moving) / square, _APPROACH_HORIZON_S) if square > 0.01 else 0.0
     nearest = here + moving * max(0.0, in_s)
     away = float(np.hypot(*nearest))
     aside = np.array([-moving[1], moving[0]]) / max(0.1, math.sqrt(square))
@@ -435,12 +434,12 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
-    """Return the speed from which it stops within a gap, after a moment of reaction [m/s]; 0 for none."""
+    """Return the speed [m/s] from which the vehicle, after its reaction time, stops within a gap; 0 if none."""
     react_s, brake = settings.react_s, settings.brake_m_s2
     return brake * (math.sqrt(react_s**2 + 2.0 * max(0.0, gap_m) / brake) - react_s)
 
 
 def _not_towards(velocity: Array, sight: Array) -> Array:
-    """Take away what leads towards a target that is hidden: what hides it may be in the way."""
+    """Remove the component towards a hidden target: the obstacle that hides it may be in the way."""
     direction = sight / max(1e-6, float(np.hypot(*sight)))
     return velocity - direction * max(0.0, float(velocity @ direction))

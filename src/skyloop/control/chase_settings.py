@@ -1,4 +1,4 @@
-"""What :class:`skyloop.control.chase_law.ChaseLaw` is to do, its gains and limits, and the phases in which it is."""
+"""Goals, gains and limits of :class:`skyloop.control.chase_law.ChaseLaw`, and its phases."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from skyloop.messages import Value
 
 
 class FollowMode(StrEnum):
-    """What to do about a target."""
+    """How to follow a target."""
 
-    FOLLOW = "follow"  #: keep a distance, and a side if one was given
-    ORBIT = "orbit"  #: circle it, also while it moves
-    LOOK = "look"  #: turn to it, and stay
+    FOLLOW = "follow"  #: keep a distance, and a side if one is given
+    ORBIT = "orbit"  #: circle it, even while it moves
+    LOOK = "look"  #: stay in place and turn to it
 
 
 class TargetPhase(StrEnum):
-    """What becomes of it."""
+    """The phases of a pursuit."""
 
-    LOOKING = "looking for the target"  #: it was not seen yet: turning on the spot
-    RANGING = "range not yet known: turns only"  #: seen, but perhaps far nearer than it seems
+    LOOKING = "looking for the target"  #: not seen yet: turning on the spot
+    RANGING = "range not yet known: turns only"  #: seen, but perhaps much nearer than it seems
     FOLLOWING = "following"
     ORBITING = "orbiting"
     WATCHING = "looking at it"
-    PREDICTING = "hidden: on by its last motion"
+    PREDICTING = "hidden: following its predicted motion"
     HOVERING = "lost: hovering where it went out of sight"
     SEARCHING = "lost: looking around"
     GIVEN_UP = "lost for too long: given up"
@@ -43,44 +43,44 @@ class ChaseSettings:
 
     Attributes:
         distance_m: Horizontal, from the vehicle's centre to the target's.
-        nearest_m: It never flies nearer, and backs off from a target that comes nearer.
+        nearest_m: Never fly nearer, and back off from a target that comes nearer.
         clear_m: The same for others that the detector sees.
-        bearing_rad: Where to be as seen from the target, counter-clockwise from the direction in which it moves: 0 is
-            ahead of it, π behind, π/2 on its left. None: on whichever side it is.
-        orbit_m_s: Speed round the target, counter-clockwise from above if above 0.
-        leash_m: Farthest horizontal distance from where it began; it stays there, turning, whoever comes near. None: no
-            leash. By the vehicle's position; while that is not known, by its velocity, whose error adds up.
+        bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion: 0
+            is ahead of it, π behind, π/2 on its left. None: whichever side the vehicle is on.
+        orbit_m_s: Speed around the target, counter-clockwise from above if positive.
+        leash_m: Farthest horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
+            None: no leash. Uses the vehicle's position, or, while unknown, its integrated velocity, which drifts.
         height_m: Above the ground; None: the height at the start.
         lowest_m: Above the ground.
         highest_m: Above the ground.
-        parallax_m: How far it rises, or sinks where it may not, and comes back, to learn the range of what may not
-            stand on the ground. None: it only waits, for what else moves it.
-        steep_rad: Farthest elevation of the target's middle, up or down, at which the height is kept.
-        lead_s: From a command's decision to its taking hold: delays of commands and feedback together.
-        response_s: From a velocity's set-point to that velocity: the target's acceleration is fed forward by as much.
+        parallax_m: How far to rise (or sink, if rising is not possible) and come back in order to learn the range of a
+            target that may not stand on the ground. None: wait for the range without such moves.
+        steep_rad: Largest elevation of the target's middle, up or down, at which the vehicle keeps its height.
+        lead_s: Delay from deciding a command until it takes effect: delays of commands and feedback together.
+        response_s: Time to reach a commanded velocity; the target's velocity is predicted this far ahead.
         range_gain: [1/s]
-        velocity_gain: How hard it takes up a velocity [1/s].
+        velocity_gain: Acceleration per unit of velocity error [1/s].
         yaw_gain: [1/s]
         height_gain: [1/s]
-        round_gain: How fast to come round to the side [1/s].
-        speed_m_s: Greatest, horizontally. The proxy's ``limits.speed`` holds as well.
-        climb_m_s: Greatest, up and down.
-        turn_rad_s: Greatest.
-        acceleration_m_s2: Of the set-point, horizontally: a harder one tilts the camera off the target.
-        react_s: How late the vehicle answers, at worst: it flies no faster towards the target than it can stop.
-        brake_m_s2: How hard it brakes then.
-        tilt_rad: Greatest, of a vehicle that is flown by attitude.
-        tilt_gain: Acceleration per velocity's error of such a vehicle [1/s].
-        lean_rad: Greatest lean of a vehicle that is flown by velocity: what it is counted on for.
-        seen_s: Since last seen, up to which the target counts as seen.
-        predict_s: How long it flies on by the target's last motion, ever slower.
-        hover_s: How long it hovers after that, looking to both sides of where the target should be.
-        give_up_s: Since last seen, after which it gives up.
+        round_gain: How fast to move around to ``bearing_rad`` [1/s].
+        speed_m_s: Greatest horizontal speed. The proxy's ``limits.speed`` applies as well.
+        climb_m_s: Greatest vertical speed.
+        turn_rad_s: Greatest yaw rate.
+        acceleration_m_s2: Horizontal limit of the set-point; harder acceleration tilts the camera off the target.
+        react_s: The vehicle's worst-case reaction time; limits the speed towards the target to one it can stop from.
+        brake_m_s2: Deceleration assumed for that stop.
+        tilt_rad: Greatest tilt of a vehicle flown by attitude.
+        tilt_gain: Acceleration per unit of velocity error of such a vehicle [1/s].
+        lean_rad: Greatest lean that the model expects of a vehicle flown by velocity.
+        seen_s: How long after the last sighting the target counts as seen.
+        predict_s: How long to follow the hidden target's predicted motion, slowing down.
+        hover_s: How long to hover after that, looking to both sides of the target's predicted position.
+        give_up_s: How long after the last sighting to give up.
         search_rad_s: Yaw rate of the search.
-        sweep_rad: How far past where the target should be it looks while it hovers.
+        sweep_rad: How far to look past the target's predicted position while hovering.
 
     Raises:
-        UsageError: A number is out of its range, or the distance is not beyond the nearest one.
+        UsageError: A number is out of its range, or ``distance_m`` is not above ``nearest_m``.
     """
 
     distance_m: float = 4.0
@@ -135,11 +135,11 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
     def within(self, limits: Mapping[str, Value]) -> ChaseSettings:
-        """Return these settings within the limits of a drone, so that nothing is counted on that it will not do.
+        """Return these settings within the limits of a drone, so that the law expects nothing beyond them.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
-                in ``drone.config``; one that is missing limits nothing.
+                in ``drone.config``; a missing one limits nothing.
         """
         highest = lowered(self.highest_m, limits, "limits.altitude")
         return replace(

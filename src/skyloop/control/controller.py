@@ -29,7 +29,7 @@ _CALLBACKS: Final = (*_SAMPLES, "on_authority", "on_reload")
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What :meth:`Controller.run` counted, and why it ended."""
+    """Counts of one :meth:`Controller.run`, and why it ended."""
 
     frames: int  #: calls of ``on_frame``
     feedback: int  #: calls of ``on_feedback``
@@ -40,8 +40,8 @@ class RunSummary:
     reason: Reason  #: why the run ended
     results: int = 0  #: calls of ``on_result``
     results_dropped: int = 0  #: results that newer ones replaced
-    results_expired: int = 0  #: results that were older than ``result_max_age_s`` when they were taken from the queue
-    notes: tuple[str, ...] = ()  #: what looks like a mistake, in words: a take-off forgotten, a callback misspelt, …
+    results_expired: int = 0  #: results older than ``result_max_age_s`` when taken from the queue
+    notes: tuple[str, ...] = ()  #: likely mistakes, in words: a forgotten take-off, a misspelt callback, …
 
     def __str__(self) -> str:
         return "\n".join((self._counts(), *(f"note: {note}" for note in self.notes)))
@@ -63,14 +63,14 @@ class Controller:
     """The base class of an application's control loop.
 
     Override one or several of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`. Each
-    callback gets the newest sample, one call at a time, on the thread that called :meth:`run`; samples that arrive
-    while a callback runs replace the older ones that are waiting.
+    callback gets the newest sample, one call at a time, on the thread that called :meth:`run`; a sample that arrives
+    while a callback runs replaces the one that is waiting.
 
     Attributes:
-        camera: Whose frames :meth:`on_frame` gets; None is the vehicle's first camera.
-        processors: Whose results :meth:`on_result` gets; None is all processors.
-        result_max_age_s: Results older than this are left out; None leaves out none.
-        drone: The drone that is flown.
+        camera: Camera of :meth:`on_frame`; None is the vehicle's first camera.
+        processors: Processors of :meth:`on_result`; None is all.
+        result_max_age_s: Results older than this are skipped; None skips none.
+        drone: The drone to fly.
     """
 
     camera: str | None = None
@@ -78,14 +78,14 @@ class Controller:
     result_max_age_s: float | None = 1.0
 
     def __init__(self, drone: Drone) -> None:
-        """Store the drone; no callback is called before :meth:`run`."""
+        """Store the drone; callbacks start with :meth:`run`."""
         self.drone = drone
         self._stopped = threading.Event()
         self._ended = False  # for good
         self._inbox: Mailboxes | None = None
-        self._checks: _Checks | None = None  # of the newest run
+        self._checks: _Checks | None = None  # checks of the newest run
 
-    # To be overridden ------------------------------------------------------------------------------------------
+    # Callbacks to override ------------------------------------------------------------------------------------------
 
     def on_feedback(self, feedback: Feedback) -> None:
         """Handle the newest feedback."""
@@ -101,37 +101,37 @@ class Controller:
         """Handle the newest result of a processor.
 
         Args:
-            result: ``result.age_s`` is the time since the capture of the frame that it was computed from.
+            result: ``result.age_s`` is the time since the capture of its frame.
         """
 
     def on_authority(self, status: AuthorityStatus) -> None:
-        """Handle the loss or the return of authority.
+        """Handle the loss or return of authority.
 
-        Called once when a command fails because another client took over, and once, before the next callback, when
-        authority is held again.
+        Called once when a command fails because another client took over, and once more, before the next callback, when
+        this client holds authority again.
         """
 
     def on_reload(self, before: Controller) -> None:
         """Take over the state of the controller that this one replaces in flight.
 
-        Called once before the first sample, when ``skyloop fly --reload`` loads a saved file again. Copy here what the
-        older controller knows, for example ``self.target = before.target``.
+        Called once before the first sample when ``skyloop fly --reload`` loads a saved file again. Copy the older
+        controller's state here, for example ``self.target = before.target``.
 
         Args:
             before: The controller that ran until now.
         """
 
-    # To be called ----------------------------------------------------------------------------------------------
+    # Methods to call ----------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """End :meth:`run` after the callback that is running. May be called from any thread."""
+        """End :meth:`run` after the current callback. Can be called from any thread."""
         self._stopped.set()
         inbox = self._inbox
         if inbox is not None:
             inbox.notifier.notify()
 
     def _is_overruled(self, feedback: Feedback) -> bool:
-        """Whether set-points have no effect: another client, another controller or a failsafe has the vehicle."""
+        """Return whether set-points have no effect: another client, controller or failsafe has the vehicle."""
         return self.drone.authority.state != "held" or bool(feedback.others) or feedback.failsafe is not Failsafe.NONE
 
     def _end(self) -> None:
@@ -140,19 +140,19 @@ class Controller:
         self.stop()
 
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
-        """Call the callbacks until the time is over, ``until()`` is true, :meth:`stop` is called or the drone closes.
+        """Call the callbacks until the time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
-        An exception in a callback, Ctrl-C and ``sys.exit()`` make an airborne vehicle hover, if this client flies it,
-        and are raised from here. An :class:`AuthorityError` because another client took over does not end the run:
-        :meth:`on_authority` is called instead. A ready-made controller that has reached its end flies no second time:
-        its next run returns at once.
+        An exception in a callback, Ctrl-C or ``sys.exit()`` makes an airborne vehicle hover, if this client flies it,
+        and propagates. An :class:`AuthorityError` because another client took over does not end the run:
+        :meth:`on_authority` is called instead. A ready-made controller that has reached its end does not fly again: its
+        next run returns at once.
 
         Args:
             seconds: How long to run, 0 or more; None sets no limit.
             until: Evaluated before each round of callbacks, and every 0.1 s while no sample arrives.
 
         Returns:
-            What was called and dropped, why the run ended, and what looks like a mistake.
+            Counts of calls and drops, why the run ended, and likely mistakes.
 
         Raises:
             UsageError: ``seconds`` is negative or NaN.
@@ -187,7 +187,7 @@ class Controller:
 
 
 def misspelt(own: type[Controller]) -> Iterator[str]:
-    """Yield, in words, which methods of a controller look like a callback and are none, or that it has no callback.
+    """Describe methods whose names look like misspelt callbacks, and controllers without any callback.
 
     Args:
         own: The controller's class.
@@ -205,13 +205,13 @@ def misspelt(own: type[Controller]) -> Iterator[str]:
                 continue
             for match in get_close_matches(name.lower().replace("_", ""), missing, 1, 0.85):
                 similar = True
-                yield f"{own.__name__}.{name} is called by nobody: is {missing[match]} meant?"
+                yield f"{own.__name__}.{name} is never called: did you mean {missing[match]}?"
     if not similar and all(getattr(own, name) is getattr(Controller, name) for name in _SAMPLES):
         yield f"{own.__name__} has none of {', '.join(_SAMPLES)}: nothing was called"
 
 
 class _Checks:
-    """What in a run looks like a beginner's mistake."""
+    """Checks a run for beginners' mistakes."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -221,17 +221,17 @@ class _Checks:
         self._flew = self._steered = False
 
     def look(self) -> None:
-        """Note whether the vehicle is in the air, and is sent set-points; called all the time."""
+        """Note whether the vehicle is airborne and gets set-points; called throughout the run."""
         newest = self.known.newest
         self._flew = self._flew or (newest is not None and newest.state.airborne)
         if not self._steered and self._commands.intent > self._first_intent:
             self._steered = isinstance(self._commands.newest, SET_POINTS)
 
     def notes(self) -> Iterator[str]:
-        """Yield what should be told, in words."""
+        """Yield the mistakes found, in words."""
         yield from misspelt(type(self._controller))
         if self._steered and not self._flew:
-            yield "it never took off: set-points went to a drone on the ground; call drone.takeoff() before"
+            yield "the drone never took off, so its set-points had no effect: call drone.takeoff() first"
         for found in self._detectors():
             if note := found():
                 yield note
@@ -244,7 +244,7 @@ class _Checks:
                 yield f"{limit} limited set-points{often}: {applied:.3g} instead of {asked:.3g}"
 
     def _detectors(self) -> Iterator[Callable[[], str]]:
-        """Yield what the controller's detectors say about having found nothing: its own, its class's, its file's."""
+        """Yield the functions that explain why a detector of the controller, its class or its file found nothing."""
         own = type(self._controller)
         places = [vars(self._controller), *map(vars, own.__mro__), getattr(own.on_frame, "__globals__", {})]
         found = {id(value): value for place in places for value in list(place.values()) if not isinstance(value, type)}
@@ -253,7 +253,7 @@ class _Checks:
                 yield why.__get__(value)
 
     def _events(self) -> list[Event]:
-        """Return the events since the begin that concern this application."""
+        """Return the events since the run's start that concern this application."""
         events = self._controller.drone.recent_events()
         if self._last_event in events:
             del events[: events.index(self._last_event) + 1]
@@ -312,11 +312,11 @@ class _Run:
         return "until" if until is not None and until() else None
 
     def _ended(self) -> bool:
-        """Whether the vehicle closed its link on purpose, as a replay does, and all samples were handled."""
+        """Return whether the vehicle closed its link on purpose, as a replay does, and all samples are handled."""
         return self._drone.link.vehicle is LinkState.CLOSED and not self._inbox.waiting
 
     def _serve(self) -> None:
-        """Call one callback per kind of sample that waits; feedback first, so that frames meet the newer state."""
+        """Call one callback per kind of waiting sample; feedback first, so that frames meet the newer state."""
         feedback = self._inbox.feedback.take()
         if feedback is not None:
             self._feedback += 1
@@ -351,7 +351,7 @@ class _Run:
         except AuthorityError:
             status = self._drone.authority
             if status.state == "none":
-                raise  # nobody took over: this application never acquired authority, or released it
+                raise  # no takeover: this application never acquired authority, or released it
             if not self._lost and status.state != "held":
                 self._lost = True
                 self._controller.on_authority(status)

@@ -1,8 +1,8 @@
-"""The law that flies a course whose map is known, and corrected by what the camera sees. Pure: no clock, no thread.
+"""Fly a course with a known map, corrected by the camera's sightings. Pure: no clock, no thread.
 
-Gates and poles have places on a map. The vehicle knows its own place by odometry only, from where it starts; each gate
-that it sees says how far the map and the odometry are off, and each pole is put where it is seen. The way to the next
-gate leads round poles and other gates, to a place before the opening; the rest is flown along the gate's axis.
+The map gives the places of gates and poles. The vehicle knows its own position by odometry only, from its start. Each
+gate that it sees corrects the offset between map and odometry; each pole moves to where it is seen. The route to the
+next gate leads around poles and other gates to a point in front of the opening; from there it follows the gate's axis.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
 Array = NDArray[np.float64]
-_SURE = 3.0  # standard deviations within which a sighting is of that pole
-_TILT_RAD = 0.012  # standard deviation of an elevation: of the attitude, and of where a pole ends in the image
-_REPEATED = 3.0  # what is wrong with one sighting is wrong with the next ones too: each counts as so much worse
-_SIDES = 3  # from straight before a gate, and from both sides of that
+_SURE = 3.0  # standard deviations within which a sighting belongs to a pole
+_TILT_RAD = 0.012  # standard deviation of an elevation: errors of the attitude and of a pole's top in the image
+_REPEATED = 3.0  # inflates the noise: errors repeat from one sighting to the next
+_SIDES = 3  # viewing directions: along a gate's axis and from both sides of it
 
 
 class GatePlace(NamedTuple):
@@ -41,7 +41,7 @@ class GatePlace(NamedTuple):
 
 
 class Pole(NamedTuple):
-    """An upright post on the map."""
+    """A vertical post on the map."""
 
     x_m: float
     y_m: float
@@ -53,11 +53,11 @@ class Pole(NamedTuple):
 class CourseSettings:
     """Gains, limits and distances of :class:`CourseLaw`.
 
-    The defaults suit a vehicle of half a metre and openings of 1.2 m.
+    The defaults suit a vehicle half a metre across and openings of 1.2 m.
     """
 
-    lead_s: float = 0.12  #: from a command's decision to its taking hold
-    velocity_gain: float = 1.0  #: share of the velocity's error that is asked for on top
+    lead_s: float = 0.12  #: from deciding a command until it takes effect
+    velocity_gain: float = 1.0  #: share of the velocity error added to the set-point
     cruise_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.4
@@ -66,18 +66,18 @@ class CourseSettings:
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
     body_m: float = 0.27  #: the vehicle's radius
-    clearance_m: float = 0.2  #: kept beyond it
+    clearance_m: float = 0.2  #: kept beyond the radius
     frame_m: float = 0.12  #: thickness of a gate's bars, ahead and across
-    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: places before the opening: the first one that is free
-    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: from so far a gate that was not seen yet is looked at
+    before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening; the first free one is used
+    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances of a gate not seen yet
     beyond_m: float = 0.45  #: distance behind the gate at which it counts as passed
-    aligned_m: float = 0.12  #: off the axis, across and in height
-    map_m: float = 0.05  #: standard deviation of what the map says, horizontally and in height
-    start_m: float = 0.2  #: standard deviation of the start
-    sightings: int = 3  #: of a gate, before it is flown through
-    waiting_s: float = 2.5  #: at each place that it is looked at from; after waiting in vain at all nothing is flown
-    braking_per_s: float = 1.3  #: speed towards what stands about, for each metre of room beyond half the clearance
-    plan_s: float = 0.4  #: between two plans of the way
+    aligned_m: float = 0.12  #: largest offset from the axis, sideways and in height
+    map_m: float = 0.05  #: standard deviation of the map, horizontally and in height
+    start_m: float = 0.2  #: standard deviation of the start position
+    sightings: int = 3  #: sightings of a gate needed before flying through it
+    waiting_s: float = 2.5  #: at each viewpoint; if the gate is seen from none, the law is stuck
+    braking_per_s: float = 1.3  #: speed towards an obstacle per metre of room beyond half the clearance
+    plan_s: float = 0.4  #: interval between route plans
 
 
 class CourseLaw(VelocityLaw):
@@ -85,9 +85,9 @@ class CourseLaw(VelocityLaw):
 
     Attributes:
         phase: As of the last step.
-        axis: Where the vehicle is, in the gate's axes, as of the last step.
-        way: The points that it flies to, in odometry axes.
-        stuck: Why it can't go on; None while it can.
+        axis: The vehicle's position in the gate's axes, as of the last step.
+        way: The points of the route, in odometry axes.
+        stuck: Why the vehicle can't continue; None while it can.
     """
 
     def __init__(
@@ -101,10 +101,10 @@ class CourseLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            gates: In order.
-            widths_m: Of their openings.
-            poles: What else stands about.
-            start: Where the vehicle is at the first feedback, on the map; its yaw is the map's.
+            gates: Gates in order.
+            widths_m: Widths of their openings.
+            poles: Other obstacles.
+            start: The vehicle's map position at the first feedback; its yaw is the map's.
             settings: None are the defaults.
         """
         self.settings = s = settings or CourseSettings()
@@ -117,23 +117,23 @@ class CourseLaw(VelocityLaw):
         self.way: list[Point] = []
         self.stuck: str | None = None
         self._gates, self._widths = tuple(gates), tuple(widths_m)
-        self._shift = np.array([-start[0], -start[1], 0.0])  # odometry axes from the map's
+        self._shift = np.array([-start[0], -start[1], 0.0])  # from map axes to odometry axes
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
         self._number = 0
-        self._lift: float | None = None  # of the ground's altitude over the odometry's
+        self._lift: float | None = None  # altitude above the ground minus the odometry's
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
-        self._view = 0  # from which place the gate is looked at
+        self._view = 0  # index of the current viewpoint
         self._begin_gate(0)
 
     @property
     def number(self) -> int:
-        """The number of the gate that is next, from 0."""
+        """The number of the next gate, from 0."""
         return self._number
 
     def next_gate(self) -> None:
-        """Go on to the next gate: what was learnt about the last one's place corrects the others'."""
+        """Advance to the next gate; the last one's measured place corrects the others."""
         if self._seen >= self.settings.sightings:
             learnt = self._gate_at(self._number) - self._nominal(self._number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
@@ -153,7 +153,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Count on the map no more than at the start, and look at the gate again."""
+        """Trust the map no more than at the start, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self._number)
@@ -168,14 +168,14 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the gate that is next; ignored where that gate can't be.
+        """Update with a sighting of the next gate; ignore it if that gate can't be there.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the side that is seen, in body axes, (3,).
+            normal: Normal of the visible side, in body axes, (3,).
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
-            trust: How sure the normal is, 0 to 1.
+            trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None or self._lift is None or self._number >= len(self._gates):
@@ -184,9 +184,9 @@ class CourseLaw(VelocityLaw):
         distance = float(np.linalg.norm(position))
         across = (to_level @ normal)[:2]
         across = across / max(1e-6, float(np.linalg.norm(across)))
-        if float(across @ self._heading) < 0.0:  # from behind it looks the same
+        if float(across @ self._heading) < 0.0:  # a gate looks the same from behind
             across = -across
-        # What is seen through the opening ends at the far edges of the bars: half their thickness behind the middle.
+        # The visible opening ends at the far edges of the bars, half their thickness behind the middle.
         seen = to_level @ position
         off = float(across @ seen[:2]) / max(distance, 1e-6) * self.settings.frame_m / 2
         middle = motion.position + seen - np.array([*(off * across), 0.0])
@@ -201,10 +201,10 @@ class CourseLaw(VelocityLaw):
         self._seen += 1
 
     def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting of a pole; ignored where none can be.
+        """Update with a sighting of a pole; ignore one where no pole can be.
 
         Args:
-            top: Where its top is seen, in body axes, (3,), of any length.
+            top: Direction of its top in body axes, (3,), of any length.
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
         """
@@ -222,7 +222,7 @@ class CourseLaw(VelocityLaw):
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the vehicle's motion, its height above the ground."""
+        """Return the vehicle's motion, with its height above the ground."""
         motion = super()._motion(at_ns)
         return replace(motion, position=motion.position + np.array([0.0, 0.0, self._lift or 0.0]))
 
@@ -251,7 +251,7 @@ class CourseLaw(VelocityLaw):
             if self._passing_ns is None:
                 self._passing_ns = now_ns
             elif seconds(now_ns - self._passing_ns) > 3.0 * (s.before_m[0] + s.beyond_m) / s.cruise_m_s:
-                self.stuck = "it does not get through"
+                self.stuck = "the vehicle does not get through the gate"
             heading = math.atan2(ahead[1], ahead[0])
             return self._to_velocity(
                 own, s.cruise_m_s * ahead - s.aside_gain * axis.aside_m * left, -axis.above_m, heading
@@ -285,7 +285,7 @@ class CourseLaw(VelocityLaw):
                 self.stuck = "the gate is not seen where it should be"
 
     def _kept_off(self, velocity: Array, place: Array, walls: Sequence[Wall]) -> Array:
-        """Take out of a horizontal velocity what leads too fast to what stands about."""
+        """Limit a horizontal velocity's components towards obstacles."""
         s = self.settings
         for wall in walls:
             away = place - np.array(_nearest(place, wall))
@@ -312,12 +312,12 @@ class CourseLaw(VelocityLaw):
         far = float(np.linalg.norm(aim))
         rest = far + sum(math.dist(a, b) for a, b in zip(self.way[:-1], self.way[1:], strict=True))
         speed = min(self.settings.cruise_m_s, 1.0 * rest)
-        if len(self.way) > 1:  # slower round a corner
+        if len(self.way) > 1:  # slower around a corner
             speed = min(speed, 0.35 + 0.8 * far)
         return aim * (speed / max(far, 1e-6))
 
     def _plan(self, own: Motion, walls: Sequence[Wall], now_ns: int) -> None:
-        """Find the way to before the gate anew, now and then."""
+        """Plan the route to the point in front of the gate, at most every ``plan_s``."""
         s = self.settings
         if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
             return
@@ -330,7 +330,7 @@ class CourseLaw(VelocityLaw):
             x, y = ahead.tolist()
             ways = [np.asarray(turned(x, y, side)) for side in (0.0, 0.5, -0.5)]
             goals = [gate - way * far for far in s.views_m for way in ways]
-            goals = sorted(goals, key=lambda goal: self._hides(goal, gate, ahead))  # (keeps the order of equals)
+            goals = sorted(goals, key=lambda goal: self._hides(goal, gate, ahead))  # (a stable sort)
             goals = goals[self._view :] + goals[: self._view]
         free = [goal for goal in goals if _room(goal, walls) >= 0.0]
         for goal in free or sorted(goals, key=lambda goal: -_room(goal, walls)):
@@ -385,13 +385,13 @@ class CourseLaw(VelocityLaw):
 
 
 class _Sighting(NamedTuple):
-    miss: Array  #: of where a pole is believed, (2,) [m]
+    miss: Array  #: offset from the pole's estimated place, (2,) [m]
     noise: Array  #: covariance of the sighting, (2, 2) [m²]
-    deviations: float  #: how far off that is
+    deviations: float  #: that offset in standard deviations
 
 
 class _Spot:
-    """A pole's place and how sure it is: a Kalman filter of a point that stands still, in two dimensions."""
+    """A pole's estimated place and its covariance: a Kalman filter of a fixed point in two dimensions."""
 
     def __init__(self, place: Array, pole: Pole, settings: CourseSettings) -> None:
         self.place, self.radius_m, self._height = place, pole.radius_m, pole.height_m
@@ -399,14 +399,14 @@ class _Spot:
 
     @property
     def spread_m(self) -> float:
-        """The standard deviation along its worst direction."""
+        """The standard deviation in the least certain direction."""
         return float(math.sqrt(np.linalg.eigvalsh(self._covariance)[-1]))
 
     def move(self, by: Array) -> None:
         self.place = self.place + by
 
     def sighting(self, own: Array, ahead: Array, rise: float) -> _Sighting:
-        """Compare a bearing and the slope up to a top with where this pole is believed: higher tops are nearer."""
+        """Compare the bearing and slope of a top with this pole's estimate: a higher top is nearer."""
         height = self._height - float(own[2])
         if rise * height <= 0.01 or abs(height) < 0.2:
             return _Sighting(np.zeros(2), np.eye(2), math.inf)
@@ -420,17 +420,17 @@ class _Spot:
 
     def update(self, sighting: _Sighting) -> None:
         self.place, known = corrected(self.place, self._covariance, sighting.miss, np.eye(2), sighting.noise)
-        # The odometry drifts: nothing is known better than to some centimetres.
+        # The odometry drifts, so keep the variance from vanishing.
         self._covariance = known + np.eye(2) * 1e-5
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:
-    """Return how much farther than it must be a place is from the nearest wall [m]; below 0 if it is too near."""
+    """Return a place's distance from the nearest wall beyond the required one [m]; negative if too near."""
     return min((math.dist(place, _nearest(place, wall)) - wall.reach_m for wall in walls), default=math.inf)
 
 
 def _nearest(place: Array, wall: Wall) -> Point:
-    """Return the wall's point that is nearest to a place."""
+    """Return the point of a wall nearest to a place."""
     (x, y), (u, v) = wall.begin, wall.end
     along, aside = u - x, v - y
     share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)

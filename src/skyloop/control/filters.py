@@ -16,14 +16,14 @@ Signal = TypeVar("Signal", float, NDArray[np.float64])
 
 
 class LowPass(Generic[Signal]):
-    """First-order low pass of a number or an array, exact for a signal that is held between two samples.
+    """First-order low pass of a number or an array, exact for a signal held constant between samples.
 
     From ``T·y' + y = x`` with ``x`` constant over a step ``dt``: ``y ← y + (1 − exp(−dt/T))·(x − y)`` (zero-order
     hold; Åström and Wittenmark, "Computer-Controlled Systems", 1997, section 2.3).
 
     Attributes:
-        time_constant_s: May be changed at any time; 0 passes every sample unchanged.
-        value: The filtered value; None before the first sample, which is taken as it is.
+        time_constant_s: Can be changed at any time; 0 passes every sample unchanged.
+        value: The filtered value; None before the first sample, which passes unchanged.
     """
 
     def __init__(self, time_constant_s: float, value: Signal | None = None) -> None:
@@ -31,17 +31,17 @@ class LowPass(Generic[Signal]):
 
         Args:
             time_constant_s: 0 or more.
-            value: To start from; None starts from the first sample.
+            value: Initial value; None starts from the first sample.
 
         Raises:
             UsageError: The time constant is negative or not finite.
         """
         self.time_constant_s = _time_constant(time_constant_s)
-        self.value: Signal | None = value  #: None before the first sample, which is taken as it is
+        self.value: Signal | None = value  #: None before the first sample, which passes unchanged
 
     @classmethod
     def from_cutoff(cls, frequency_hz: float) -> LowPass[Signal]:
-        """Create a low pass with a cutoff frequency, at which a sine loses 3 dB: ``T = 1 / (2π·f)``.
+        """Create a low pass from its cutoff (−3 dB) frequency: ``T = 1 / (2π·f)``.
 
         Raises:
             UsageError: The frequency is not above 0.
@@ -54,7 +54,7 @@ class LowPass(Generic[Signal]):
         """Update with the next sample.
 
         Args:
-            sample: A number, or an array of always the same shape.
+            sample: A number, or an array whose shape stays the same.
             dt_s: Time since the last sample.
 
         Returns:
@@ -72,11 +72,11 @@ class LowPass(Generic[Signal]):
 
 
 class Complementary:
-    """An angle from its rate, which is right at once but drifts, and its measurement, which is right in the long run.
+    """Fuses an angle's rate, which responds at once but drifts, with its measurement, which is right in the long run.
 
-    The rate passes a high pass and the angle a low pass with the same time constant, which add up to one (Higgins, "A
+    The rate passes a high pass and the angle a low pass with the same time constant; the two add up to one (Higgins, "A
     Comparison of Complementary and Kalman Filtering", IEEE Trans. AES 11(3), 1975). Angles [rad] are wrapped, so that
-    a turn through ±π is a small one.
+    crossing ±π is a small step.
 
     Attributes:
         angle: Within [-π, π); None before the first measurement.
@@ -86,8 +86,8 @@ class Complementary:
         """Initialise the filter.
 
         Args:
-            time_constant_s: Up to about this time the rate counts more than the measured angle.
-            angle: To start from; None starts from the first measurement.
+            time_constant_s: Over times shorter than this the rate dominates, over longer ones the measured angle.
+            angle: Initial angle; None starts from the first measurement.
 
         Raises:
             UsageError: The time constant is negative or not finite.
@@ -100,7 +100,7 @@ class Complementary:
 
         Args:
             rate: Over the last ``dt_s`` [rad/s].
-            measured: The angle at the end of that time [rad]; None if it was not measured.
+            measured: The angle at the end of ``dt_s`` [rad]; None if not measured.
             dt_s: Time since the last sample.
 
         Returns:
@@ -119,14 +119,14 @@ class Complementary:
 class Median:
     """The median of the last samples of a number: removes single outliers and keeps edges sharp.
 
-    Of an even number of samples it is the lower one of the two in the middle, so that it is always a sample.
+    For an even number of samples it is the lower of the two in the middle, so the result is always a sample.
     """
 
     def __init__(self, length: int = 5) -> None:
         """Initialise the filter.
 
         Args:
-            length: How many samples to keep; 1 or more.
+            length: Number of samples to keep; 1 or more.
 
         Raises:
             UsageError: The length is not a whole number of at least 1.
@@ -142,7 +142,7 @@ class Median:
 
 
 def gain(time_constant_s: float, dt_s: float) -> float:
-    """Return the share of a difference that a first-order filter takes up within ``dt_s``: ``1 − exp(−dt/T)``."""
+    """Return the share of a step that a first-order filter follows within ``dt_s``: ``1 − exp(−dt/T)``."""
     if dt_s <= 0.0:
         return 0.0
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0.0 else 1.0

@@ -1,10 +1,10 @@
-"""Follow a marker by the camera at a distance and straight before its face; search for it when it is not seen.
+"""Follow a marker at a distance, squarely in front of it, by camera; search for it while it is out of view.
 
 The law is pure: sightings and feedback in, velocities out. Position-based visual servoing (Chaumette and Hutchinson,
 "Visual servo control, part I", IEEE RAM 13(4), 2006): the marker's pose is levelled by the attitude at the image's
-capture and placed where the vehicle was then; a filter predicts where it is when the command takes effect. The vehicle
-keeps its distance along the line of sight and its height, and comes round when the marker is seen too much from the
-side.
+capture and placed by the vehicle's position at that time; a filter predicts it to when the command takes effect.
+The vehicle keeps its height and its distance along the line of sight, and moves around the marker when it sees it too
+much from the side.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ Array = NDArray[np.float64]
 
 
 class Mode(StrEnum):
-    """What :class:`FollowLaw` is doing."""
+    """The phases of :class:`FollowLaw`."""
 
-    SEARCHING = "searching"  #: turning on the spot, at one height after the other
-    FOLLOWING = "following"  #: seen a moment ago
-    RECOVERING = "recovering"  #: lost: turning to where it must be now
+    SEARCHING = "searching"  #: turning on the spot at a series of heights
+    FOLLOWING = "following"  #: the marker was seen a moment ago
+    RECOVERING = "recovering"  #: lost: turning to the marker's predicted position
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,22 +46,22 @@ class FollowSettings:
     """Goal, gains and limits of :class:`FollowLaw`. The defaults suit a small indoor vehicle with velocity control."""
 
     distance_m: float = 1.5
-    lead_s: float = 0.12  #: from a command's decision to its taking hold
+    lead_s: float = 0.12  #: from deciding a command until it takes effect
     range_gain: float = 1.1  #: [1/s]
     height_gain: float = 1.2  #: [1/s]
     yaw_gain: float = 2.2  #: [1/s]
-    #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
+    #: Share of the velocity error added to the set-point: stiffens a soft velocity loop against gusts.
     velocity_gain: float = 0.7
-    aside_gain: float = 1.2  #: how fast to come round to the marker's front [1/s]
-    aside_rad: float = 0.3  #: nearer than this to its station it stays where it is
-    speed_m_s: float = 1.2  #: greatest, horizontally
+    aside_gain: float = 1.2  #: how fast to move around to the marker's front [1/s]
+    aside_rad: float = 0.3  #: closer to its station than this, the vehicle stays
+    speed_m_s: float = 1.2  #: greatest horizontal speed
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
-    acceleration_m_s2: float = 2.0  #: of the set-point: a harder one tilts the camera off the marker
-    following_s: float = 0.35  #: since last seen
+    acceleration_m_s2: float = 2.0  #: limit of the set-point; harder acceleration tilts the camera off the marker
+    following_s: float = 0.35  #: counts as following for this long after the last sighting
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
-    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: above the first, one a full turn
+    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: relative to the first, one per full turn
     lowest_m: float = 0.6
     highest_m: float = 2.2
 
@@ -71,10 +71,10 @@ class FollowLaw(VelocityLaw):
 
     Attributes:
         mode: As of the last step.
-        station_rad: Where to be around the marker: angle from straight before its face, counter-clockwise from above.
-        station_rate_rad_s: How fast that changes.
+        station_rad: Wanted angle around the marker, from its normal, counter-clockwise from above.
+        station_rate_rad_s: Rate of that angle.
         off_m: Error of distance and height together, as of the last step; None while searching.
-        aside_rad: Where the vehicle is, as ``station_rad``; None while the marker's face is not known.
+        aside_rad: The vehicle's actual angle, as ``station_rad``; None while the marker's normal is unknown.
     """
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
@@ -83,14 +83,13 @@ class FollowLaw(VelocityLaw):
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
         self.mode = Mode.SEARCHING
-        #: Where to be around the marker: angle from straight before its face, counter-clockwise from above [rad];
-        #: and how fast that changes [rad/s].
+        #: Wanted angle around the marker, from its normal, counter-clockwise from above [rad], and its rate [rad/s].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0
-        self.off_m: float | None = None  #: of distance and height together, as of the last step; None while searching
-        self.aside_rad: float | None = None  #: where it is, the same way; None while the face is not known
+        self.off_m: float | None = None  #: error of distance and height, as of the last step; None while searching
+        self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
         self._target = TargetFilter()
-        self._face: Array | None = None  # which way the marker looks, horizontal part, odometry axes
+        self._face: Array | None = None  # the marker's normal, horizontal part, odometry axes
         self._seen_ns: int | None = None
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
 
@@ -99,21 +98,21 @@ class FollowLaw(VelocityLaw):
         self._target, self._seen_ns = TargetFilter(), None
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
+        """Update with a sighting; ignore it while the vehicle's attitude or motion is unknown.
 
         Args:
             position: The marker's centre in body axes at the capture, (3,) [m].
             normal: Normal of its face in the same axes, (3,).
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
-            trust: How sure the normal is, 0 to 1.
+            trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        # A corner's error of a fixed fraction of a pixel moves the range by a share that grows with its square.
+        # A corner error of a fixed fraction of a pixel causes a range error that grows with the range squared.
         self._target.see(motion.position + to_level @ position, 0.015 + 0.01 * distance**2, captured_ns)
         face = (to_level @ normal)[:2]
         weight = 0.25 * trust
@@ -135,7 +134,7 @@ class FollowLaw(VelocityLaw):
     def _follow(self, own: Motion, unseen_s: float) -> Array:
         """Return wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
-        # Translation fades out within a second after the marker is lost; turning goes on.
+        # Translation fades out within a second after the marker is lost; turning continues.
         fade = within(1.0 - (unseen_s - s.following_s), 0.0, 1.0)
         place, speed = self._target.at(own.at_ns)
         speed = speed * fade
@@ -156,12 +155,12 @@ class FollowLaw(VelocityLaw):
         return np.array([*own.to_body(velocity[:2]), up, clamped(turn, s.turn_rad_s)])
 
     def _come_round(self, sight: Array, across: float) -> float:
-        """Return the speed to the left of the line of sight [m/s] that brings the vehicle to its station."""
+        """Return the speed [m/s] left of the line of sight that brings the vehicle to its station."""
         s = self.settings
-        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # looks up or down, or every way in turn
+        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # faces up or down, or its estimate averaged out
             self.aside_rad = None
             return 0.0
-        # From the direction marker-to-vehicle round to where the marker looks, counter-clockwise.
+        # From the direction marker-to-vehicle to the marker's normal, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)
@@ -177,21 +176,21 @@ class FollowLaw(VelocityLaw):
 
 
 class TargetFilter:
-    """Position and velocity of a point that is seen now and then: a filter that restarts after a jump."""
+    """Filter of the position and velocity of a point seen intermittently; restarts after a jump."""
 
     def __init__(self) -> None:
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        """Update with a measured position. One that is older than the last is ignored.
+        """Update with a measured position; ignore one older than the last.
 
-        After two seconds unseen, or when the target is more than a metre (and five deviations) off, the filter
-        restarts.
+        The filter restarts after two seconds without a sighting, or when the target is more than a metre (and five
+        deviations) off.
 
         Args:
             position: Shape (3,) [m].
             deviation_m: Standard deviation of each component.
-            at_ns: When it was measured.
+            at_ns: Time of the measurement.
         """
         newest = self._filter.newest
         if newest is None or self._jumped(position, deviation_m, at_ns):
@@ -204,7 +203,7 @@ class TargetFilter:
 
         Args:
             at_ns: The time to predict for.
-            longest_s: How far the last estimate is extrapolated at most.
+            longest_s: Longest extrapolation of the last estimate.
 
         Returns:
             Position (3,) [m] and velocity (3,) [m/s].
@@ -233,13 +232,13 @@ _OTHER: Colour = (150, 150, 150)
 
 @dataclass(slots=True)
 class FollowScore:
-    """How well it went, counted from the first sighting on. Ranges are estimates, from the vehicle's centre."""
+    """Quality of a pursuit, counted from the first sighting. Ranges are estimates, from the vehicle's centre."""
 
-    frames: int = 0  #: since the first sighting, that one included
-    in_view: int = 0  #: of those, how many showed the marker
+    frames: int = 0  #: since the first sighting, inclusive
+    in_view: int = 0  #: those that showed the marker
     frames_before: int = 0  #: before the first sighting
     first_seen_ns: int | None = None  #: capture of the first frame that showed it
-    ranges: list[tuple[int, float]] = field(default_factory=list)  #: one a sighting: capture [ns], error [m]
+    ranges: list[tuple[int, float]] = field(default_factory=list)  #: one per sighting: capture [ns], error [m]
 
     @property
     def share_in_view(self) -> float | None:
@@ -247,7 +246,7 @@ class FollowScore:
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Return estimated minus wanted distance of each sighting from ``after_s`` after the first one on."""
+        """Return estimated minus wanted distance of each sighting, starting ``after_s`` after the first."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
@@ -255,7 +254,7 @@ class FollowScore:
         """Count a frame.
 
         Args:
-            captured_ns: Its capture.
+            captured_ns: Capture of the frame.
             range_error_m: Estimated minus wanted distance; None if the marker was not in the frame.
         """
         if range_error_m is not None:
@@ -272,11 +271,11 @@ class FollowScore:
 class FollowMarker(Behaviour):
     """Finds a marker and follows it. The vehicle must be airborne when :meth:`run` is called.
 
-    Every frame is annotated with what was seen.
+    Annotates every frame with the markers seen.
 
     Attributes:
-        marker_id: Which marker is followed.
-        score: How well it went.
+        marker_id: Id of the followed marker.
+        score: Quality of the pursuit.
     """
 
     name = "follow"
@@ -296,11 +295,11 @@ class FollowMarker(Behaviour):
 
         Args:
             drone: The drone to fly.
-            marker_id: Which marker.
+            marker_id: Id of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -314,12 +313,12 @@ class FollowMarker(Behaviour):
 
     @property
     def mode(self) -> Mode:
-        """What the behaviour is doing: searching, following or recovering."""
+        """The current phase: searching, following or recovering."""
         return self._follow_law.mode
 
     @property
     def phase(self) -> Mode:
-        """The same as :attr:`mode`, by the name that all behaviours have for it."""
+        """The same as :attr:`mode`, under the name that all behaviours use."""
         return self.mode
 
     @property
@@ -328,7 +327,7 @@ class FollowMarker(Behaviour):
         return self._follow_law.settings.distance_m
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the marker, update the law, and count the frame."""
+        """Detect the marker, update the law and count the frame."""
         seen = self._detector.detect(frame)
         mine = next((one for one in seen if one.id == self.marker_id), None)
         self.score.count(frame.captured_ns, None if mine is None else self._use(mine, frame))

@@ -1,6 +1,6 @@
-"""Shapes for several drones, the assignment of drones to positions, and whether their flights keep apart. Pure.
+"""Formation shapes, the assignment of drones to positions, and a check of how far their flights stay apart. Pure.
 
-A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on its own middle.
+A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on their mean.
 :func:`placed` puts it into world axes (ROS REP 103).
 """
 
@@ -20,19 +20,19 @@ from skyloop.messages.geometry import rotation_from_euler
 #: Positions of n drones, shape (n, 3), float64 [m].
 Places = NDArray[np.float64]
 
-MOST: Final = 200  #: greatest number of places for :func:`assign`
+MOST: Final = 200  #: largest number of positions for :func:`assign`
 
 
 class Approach(NamedTuple):
     """The closest approach of several drones.
 
     Attributes:
-        distance_m: Between the two that come closest; infinite for fewer than two drones.
+        distance_m: Distance of the two closest drones; infinite for fewer than two drones.
         first: Index of one of them.
         second: Index of the other.
     """
 
-    distance_m: float  #: infinite for less than two drones
+    distance_m: float  #: infinite for fewer than two drones
     first: int
     second: int
 
@@ -41,8 +41,8 @@ def line(n: int, spacing_m: float) -> Places:
     """Return a line abreast, the first drone at the left end.
 
     Args:
-        n: How many drones.
-        spacing_m: Between neighbours.
+        n: Number of drones.
+        spacing_m: Distance between neighbours.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -55,8 +55,8 @@ def column(n: int, spacing_m: float) -> Places:
     """Return a column, one drone behind the other, the first ahead.
 
     Args:
-        n: How many drones.
-        spacing_m: Between neighbours.
+        n: Number of drones.
+        spacing_m: Distance between neighbours.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -69,8 +69,8 @@ def circle(n: int, spacing_m: float) -> Places:
     """Return a circle, the first drone ahead and the others counter-clockwise after it.
 
     Args:
-        n: How many drones.
-        spacing_m: Between neighbours, along the chord.
+        n: Number of drones.
+        spacing_m: Distance between neighbours, along the chord.
 
     Raises:
         UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
@@ -85,9 +85,9 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
     """Return a V like that of geese: the first drone ahead, the others behind it, alternately left and right.
 
     Args:
-        n: How many drones.
-        spacing_m: Between neighbours on one leg.
-        angle: Between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
+        n: Number of drones.
+        spacing_m: Distance between neighbours on one leg.
+        angle: Angle between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
 
     Raises:
         UsageError: An argument is out of its range.
@@ -104,8 +104,8 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
     """Return a grid of rows, the first drone ahead and left.
 
     Args:
-        n: How many drones.
-        spacing_m: Between neighbours in a row and between rows.
+        n: Number of drones.
+        spacing_m: Distance between neighbours in a row and between rows.
         columns: Drones in a row; None makes the grid as square as possible.
 
     Raises:
@@ -123,15 +123,15 @@ def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
 
     Args:
         shape: Shape (n, 3) [m].
-        at: Where its middle is to be, (3,) in world axes [m].
+        at: Position of its middle, (3,) in world axes [m].
         yaw: Counter-clockwise about z [rad].
 
     Raises:
-        UsageError: The shape, the place or the yaw is not finite, or of another shape.
+        UsageError: The shape, the position or the yaw is not finite or has a wrong shape.
     """
     middle = np.asarray(at, dtype=np.float64)
     if middle.shape != (3,) or not np.isfinite(middle).all() or not math.isfinite(yaw):
-        raise UsageError(f"a formation is placed at three finite coordinates with a finite yaw, not {at!r}, {yaw!r}")
+        raise UsageError(f"a formation needs three finite coordinates and a finite yaw, got {at!r}, {yaw!r}")
     turned: Places = places(shape) @ rotation_from_euler(0.0, 0.0, yaw).T
     return turned + middle
 
@@ -145,17 +145,17 @@ def places(values: ArrayLike) -> Places:
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise UsageError(f"{values!r:.80} is no array of places") from None
+        raise UsageError(f"{values!r:.80} is not an array of positions") from None
     if array.ndim != 2 or array.shape[1] != 3 or not np.isfinite(array).all():
-        raise UsageError(f"places have the shape (n, 3) and finite coordinates, not {array.shape}")
+        raise UsageError(f"positions need shape (n, 3) and finite coordinates, got shape {array.shape}")
     return array
 
 
 def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
-    """Return for each start the index of its slot, so that the sum of the squared distances is least.
+    """Return the slot index of each start that minimises the sum of the squared distances.
 
-    With that sum, the straight paths of drones that leave and arrive together do not cross. They keep apart by 1/√2 of
-    the least distance of starts from one another and of slots from one another (Turpin, Michael and Kumar, "CAPT",
+    With that assignment, the straight paths of drones that leave and arrive together do not cross. The drones stay
+    apart by at least 1/√2 of the smallest distance between two starts or two slots (Turpin, Michael and Kumar, "CAPT",
     International Journal of Robotics Research 33, 2014).
 
     Args:
@@ -170,14 +170,14 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
     if len(a) > len(b):
         raise UsageError(f"{len(a)} drones have only {len(b)} places to fly to")
     if len(b) > MOST:
-        raise UsageError(f"{len(b)} places are more than the {MOST} that can be assigned")
+        raise UsageError(f"at most {MOST} places can be assigned, got {len(b)}")
     costs = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)
     _, columns = assignment("a formation", "control")(costs)
     return [int(column) for column in columns]
 
 
 def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
-    """Return how close two drones come when each flies straight from its start to its goal, all in the same time.
+    """Return the closest approach of drones that all fly straight from start to goal in the same time.
 
     Args:
         starts: Shape (n, 3) [m].
@@ -202,18 +202,18 @@ def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
 def kept_apart(
     velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain: float = 1.0, *, fixed: int = 0
 ) -> Places:
-    """Change velocities so that drones closer than ``apart_m`` part.
+    """Change velocities so that drones closer than ``apart_m`` separate.
 
-    Along the line between two of them the velocities become such that the distance grows by ``gain`` times what is
-    missing; both give way by half. Who meets one that does not give way gives way alone, and comes no faster than
-    ``gain`` times what is left up to ``apart_m``. The components across that line stay.
+    Along the line between two drones the distance is made to grow by ``gain`` times what is missing; each drone yields
+    half. A drone that meets one that does not yield makes the whole change, and approaches no faster than ``gain``
+    times the distance beyond ``apart_m``. Components across that line stay unchanged.
 
     Args:
         velocities: Shape (n, 3), world axes [m/s].
         positions: Shape (n, 3), world axes [m].
-        apart_m: The least distance.
+        apart_m: The smallest allowed distance.
         gain: [1/s]
-        fixed: How many, the last ones, fly as they do: others fly them.
+        fixed: Number of drones at the end of the list that do not yield, because others fly them.
 
     Returns:
         The changed velocities, shape (n, 3).
@@ -223,7 +223,7 @@ def kept_apart(
     """
     changed, at = places(velocities).copy(), places(positions)
     free = len(at) - fixed
-    # Those that give way to nobody come last, so that nothing undoes what they ask for.
+    # Drones that do not yield come last, so that no later change undoes the separation from them.
     for j in range(1, len(at)):
         for i in range(min(j, free)):
             between = at[i] - at[j]
@@ -247,6 +247,6 @@ def _centred(points: list[tuple[float, float, float]]) -> Places:
 
 def _check(n: int, *, spacing_m: float) -> None:
     if not isinstance(n, int) or n < 1:
-        raise UsageError(f"a formation has at least one place, not {n!r}")
+        raise UsageError(f"a formation needs at least one position, got {n!r}")
     if not (math.isfinite(spacing_m) and spacing_m > 0.0):
-        raise UsageError(f"spacing_m is {spacing_m!r} and must be more than 0 m")
+        raise UsageError(f"spacing_m is {spacing_m!r} and must be above 0 m")

@@ -1,4 +1,4 @@
-"""Fly a swarm in formation, by the positions that the drones report in world axes."""
+"""Fly a swarm in formation by the world positions that its drones report."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ if TYPE_CHECKING:
     from skyloop.client import Swarm
     from skyloop.client.swarm import Tick
 
-MAX_AGE_S: Final = 1.0  #: greatest age of the feedback that is flown by
-SLACK_S: Final = 10.0  #: how much longer than planned a flight may take by default
+MAX_AGE_S: Final = 1.0  #: greatest age of feedback used for steering
+SLACK_S: Final = 10.0  #: default allowance on top of a flight's planned time
 _PEAK: Final = 1.875  # peak speed over mean speed of a minimum-jerk trajectory
 
 
 @dataclass(frozen=True, slots=True)
 class FormationReport:
-    """How a flight in formation went."""
+    """The result of a formation flight."""
 
     seconds: float
-    slots: dict[str, Vector]  #: where each drone was to be at the end, in world axes [m]
-    errors_m: dict[str, float]  #: how far from its slot each drone was
-    closest_m: float  #: least distance between any two drones; infinite for one drone
-    spread_s: float | None  #: greatest time between the first and the last set-point of one tick
+    slots: dict[str, Vector]  #: planned final position of each drone, in world axes [m]
+    errors_m: dict[str, float]  #: each drone's distance from its slot
+    closest_m: float  #: smallest distance between any two drones; infinite for one drone
+    spread_s: float | None  #: longest time between the first and the last set-point of one tick
 
 
 class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
-    Each drone must be airborne and report position and yaw. Drones that fail on the way, as by a position that is not
-    known for half a second, are handled as ``on_error`` of the swarm decides. All others keep clear of them, and of
-    every drone of the swarm that this flight does not steer, where it was seen last.
+    Each drone must be airborne and report position and yaw. Drones that fail on the way, for example with a position
+    unknown for half a second, are handled by the swarm's ``on_error`` policy. All others keep clear of them, and of
+    every drone of the swarm that this flight does not steer, at its last known position.
 
     Attributes:
         drones: The swarm.
-        apart_m: The least distance between two drones.
+        apart_m: The smallest distance to keep between two drones.
     """
 
     def __init__(
@@ -61,8 +61,8 @@ class Formation:
         Args:
             drones: The swarm to fly.
             rate_hz: Rate of the set-points.
-            apart_m: Flights that would bring two drones closer are refused, and drones that come closer are steered
-                apart.
+            apart_m: The smallest distance between two drones: flights that would bring drones closer are refused, and
+                drones that come closer are steered apart.
             settings: Gains, limits and acceptance radii; None are the defaults.
 
         Raises:
@@ -71,7 +71,7 @@ class Formation:
         """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
-        assignment("a formation", "control")  # loaded, or refused, here and not while the drones fly to their places
+        assignment("a formation", "control")  # load SciPy, or fail, now and not in flight
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz
@@ -83,23 +83,23 @@ class Formation:
         """Return the mean of the drones' positions, world axes [m].
 
         Raises:
-            UsageError: A drone does not report its position, is on the ground, or none is active.
+            UsageError: A drone does not report its position or is on the ground, or none is active.
         """
         return _vector(_positions(self._ready()).mean(axis=0))
 
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:
-        """Assign drones to slots and fly there straight, all leaving and arriving together; they hover at the end.
+        """Assign drones to slots and fly there in straight lines, leaving and arriving together; then hover.
 
         Args:
             slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
             speed_m_s: Greatest speed of the drone with the longest path.
-            yaw: Of all drones [rad]; None leaves it free.
-            timeout_s: Drones that are not at their slot by then have failed; None is ten seconds more than planned.
+            yaw: Yaw of all drones [rad]; None leaves it free.
+            timeout_s: Drones not at their slot by then have failed; None allows ten seconds more than planned.
 
         Returns:
-            Where each drone is at the end, and how close they came to each other.
+            The drones' final positions, and how close they came to each other.
 
         Raises:
             UsageError: A drone can't be flown by its position, two would come closer than ``apart_m``, or no drone is
@@ -107,7 +107,7 @@ class Formation:
             SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
-            raise UsageError(f"speed_m_s is {speed_m_s!r} and must be more than 0 m/s")
+            raise UsageError(f"speed_m_s is {speed_m_s!r} and must be above 0 m/s")
         before = self._ready()
         starts = _positions(before)
         goals = places(slots)
@@ -130,10 +130,10 @@ class Formation:
         return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
 
     def hold(self, seconds: float) -> FormationReport:
-        """Keep each drone at its present position; they hover at the end.
+        """Keep each drone at its current position; then hover.
 
         Args:
-            seconds: How long.
+            seconds: Duration.
 
         Raises:
             UsageError: A drone can't be flown by its position, or none is active.
@@ -155,19 +155,19 @@ class Formation:
         lead: Callable[[Tick], AnyAction] | None = None,
         turn: bool = True,
     ) -> FormationReport:
-        """Keep followers at offsets from a leader, whose velocity is fed forward; the drones hover at the end.
+        """Keep followers at offsets from a leader, feeding its velocity forward; then hover.
 
         Args:
             leader: The leader's name.
-            offsets: Of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False`` east,
-                north and up of it.
-            seconds: How long.
-            lead: Returns the leader's action at each tick, which is sent together with the followers' set-points; None:
-                another client flies the leader.
+            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False``
+                east, north and up of it.
+            seconds: Duration.
+            lead: Returns the leader's action at each tick, sent together with the followers' set-points; None: another
+                client flies the leader.
             turn: Whether offsets and yaw turn with the leader.
 
         Raises:
-            UnknownNameError: The swarm has no drone of such a name.
+            UnknownNameError: The swarm has no drone of that name.
             UsageError: The leader is among the followers, a drone can't be flown by its position, or none is active.
             SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
                 followers hover and this call returns.
@@ -177,7 +177,7 @@ class Formation:
             if name not in self.drones:
                 raise UnknownNameError("drone in this swarm", name, self.drones.names)
         if leader in wanted:
-            raise UsageError(f"{leader} leads, and can't follow itself")
+            raise UsageError(f"{leader} is the leader and can't follow itself")
         self._ready()
         slots: dict[str, NDArray[np.float64]] = {}
         for tick in self.drones.ticks(self._rate_hz, seconds):
@@ -191,12 +191,12 @@ class Formation:
             self._steer(now, goals, drift, {leader: first, **others}, also={} if lead is None else {leader: lead(tick)})
         return self._report(slots, seconds)
 
-    # Inside ----------------------------------------------------------------------------------------------------
+    # Internals -------------------------------------------------------------------------------------------------
 
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
-        """Return the newest state of those that are flown, and of all others in the air, where they were seen last.
+        """Return the newest state of the drones flown here, and the last known state of all others in the air.
 
-        One that is flown and whose position is not known any more has failed; then it is one of the others.
+        A drone flown here whose position is no longer known has failed and joins the others.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -217,7 +217,7 @@ class Formation:
                 heard = True
             if airframe.feedback is not None and airframe.feedback.state is not FlightState.LANDED:
                 last = _carried_on(airframe)
-                if last.position_m is not None:  # kept clear of, also where nothing is heard of it any more
+                if last.position_m is not None:  # keep clear of it even if its feedback has stopped
                     others[name] = last if heard else replace_fields(last, velocity_m_s=None)
         return now, others
 
@@ -243,7 +243,7 @@ class Formation:
         if nearest.distance_m < self.apart_m:
             raise UsageError(
                 f"{names[nearest.first]} and {names[nearest.second]} would come within {nearest.distance_m:.2f} m of "
-                f"each other, and must keep {self.apart_m:g} m apart: choose other places, or fly there in two steps"
+                f"each other, but must stay {self.apart_m:g} m apart: choose other positions, or fly there in two steps"
             )
 
     def _steer(
@@ -281,7 +281,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """Acceptance radii for a moment after the arrival, when the drones hover."""
+        """Wider acceptance radii, for drones that hover just after arrival."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -304,20 +304,20 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
         World axes [m], shape (3,).
 
     Raises:
-        UsageError: The leader's position or yaw are not known.
+        UsageError: The leader's position or yaw is unknown.
     """
     problem = lacking(leader)
     if problem or leader.position_m is None or leader.yaw_rad is None:
-        raise UsageError(f"no place relative to the leader can be kept: {problem}")
+        raise UsageError(f"can't keep a position relative to the leader: {problem}")
     relative = _offset(offset)
     turned = rotation_from_euler(0.0, 0.0, leader.yaw_rad) @ relative if turn else relative
     return np.asarray(leader.position_m + turned, dtype=np.float64)
 
 
 def _carried_on(airframe: Airframe) -> Feedback:
-    """Return a drone's newest feedback, with its last position carried on, and its last yaw, where it has none."""
+    """Return a drone's newest feedback; extrapolate the last position, or reuse the last yaw, if missing."""
     sample = airframe.feedback
-    assert sample is not None, "nobody asks before there is any"
+    assert sample is not None, "called only after the first feedback"
     now_ns = sample.captured_ns
     sample = replace_fields(sample, yaw_rad=airframe.yaw_rad(now_ns))
     position = airframe.position_m(now_ns, longest_s=math.inf)
@@ -353,7 +353,7 @@ def _vector(place: NDArray[np.float64]) -> Vector:
 
 
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
-    """Return the reported velocity in world axes; zero for a drone that does not report it, or not its yaw."""
+    """Return the reported velocity in world axes; zero if it or the yaw is not reported."""
     if sample.yaw_rad is None:
         return np.zeros(3)
     return _in_world(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample)

@@ -1,14 +1,14 @@
-"""The law that flies through a gate, and the shortest way round posts and gates. Pure: no clock, no thread.
+"""Fly through a gate, and find the shortest way around posts and gates. Pure: no clock, no thread.
 
 Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006):
-sightings and feedback in, velocities out. The gate's position and its axis are kept in odometry axes, where they stand
-still but for the odometry's drift. The vehicle is brought onto the gate's axis while it faces the opening, comes nearer
-the better it is aligned, and flies through. The last metre and a half is flown by odometry, because there the gate is
-larger than the image.
+sightings and feedback in, velocities out. The gate's position and axis are kept in odometry axes, where only the
+odometry's drift moves them. The vehicle moves onto the gate's axis while facing the opening, comes nearer as it gets
+better aligned, and flies through. It flies the last metre and a half by odometry, because there the gate is larger than
+the image.
 
-The way round is found on the ground plan by a visibility graph (Lozano-Pérez and Wesley, "An algorithm for planning
-collision-free paths among polyhedral obstacles", Communications of the ACM 22(10), 1979) over points around each
-obstacle, searched by Dijkstra's algorithm.
+The way around obstacles comes from a visibility graph of the ground plan (Lozano-Pérez and Wesley, "An algorithm for
+planning collision-free paths among polyhedral obstacles", Communications of the ACM 22(10), 1979) over points around
+each obstacle, searched by Dijkstra's algorithm.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from skyloop.messages.geometry import wrap_angle
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 
-_AROUND = 8  # points around each end
-_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # so far out, the lines between them stay clear
-_WITHIN_M = 0.02  # how much nearer one may be than where one stands already
+_AROUND = 8  # graph points around each end of a wall
+_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor at which the lines between those points stay clear
+_WITHIN_M = 0.02  # how much nearer to a wall than the start the way may come
 
 
 class GatePhase(StrEnum):
-    """What :class:`GateLaw` is doing."""
+    """The phases of :class:`GateLaw`."""
 
-    SEARCHING = "searching the gate"  #: turning on the spot, at one height after the other
-    ALIGNING = "going to the gate's axis"  #: seen a moment ago
-    RECOVERING = "lost the gate: holding the place, turning to where it must be"
-    GOING = "flying to before the gate"  #: where the map says, or where it was seen
-    PASSING = "flying through"  #: aligned and near: what is left is flown by odometry
+    SEARCHING = "searching for the gate"  #: turning on the spot at a series of heights
+    ALIGNING = "moving onto the gate's axis"  #: the gate was seen a moment ago
+    RECOVERING = "lost the gate: holding position, turning towards it"
+    GOING = "flying to the gate"  #: by the map, or by a sighting
+    PASSING = "flying through"  #: aligned and near; the rest is flown by odometry
     PASSED = "through"
 
 
@@ -56,23 +56,23 @@ class GateSettings:
     The defaults suit a small indoor vehicle and openings of about a metre.
     """
 
-    lead_s: float = 0.12  #: from a command's decision to its taking hold
-    #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
+    lead_s: float = 0.12  #: from deciding a command until it takes effect
+    #: Share of the velocity error added to the set-point: stiffens a soft velocity loop against gusts.
     velocity_gain: float = 1.0
-    speed_m_s: float = 1.1  #: greatest, horizontally
-    cruise_m_s: float = 0.8  #: through the gate, and to it at most
+    speed_m_s: float = 1.1  #: greatest horizontal speed
+    cruise_m_s: float = 0.8  #: speed through the gate, and greatest speed towards it
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.4
     acceleration_m_s2: float = 2.0
     aside_gain: float = 1.3  #: [1/s]
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
-    stand_m: float = 1.7  #: distance before the gate where the vehicle must be aligned
-    aligned_m: float = 0.15  #: off the axis, across and in height
-    aligned_rad: float = 0.25  #: off its heading
-    cone: float = 0.3  #: how much farther off the axis it may be for each metre before that
+    stand_m: float = 1.7  #: distance in front of the gate at which the vehicle must be aligned
+    aligned_m: float = 0.15  #: largest offset from the axis, sideways and in height
+    aligned_rad: float = 0.25  #: largest heading error
+    cone: float = 0.3  #: additional offset allowed per metre in front of that
     beyond_m: float = 0.7  #: distance behind the gate at which it counts as passed
-    fresh_s: float = 0.4  #: since last seen: it flies on
+    fresh_s: float = 0.4  #: continue without a sighting for this long
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
     search_heights_m: tuple[float, ...] = (0.0, 0.5, -0.4)
@@ -81,9 +81,9 @@ class GateSettings:
 
 
 class Axis(NamedTuple):
-    """Where the vehicle is in the gate's axes."""
+    """The vehicle's position in the gate's axes."""
 
-    along_m: float  #: in the direction of flight; negative before the gate
+    along_m: float  #: in the direction of flight; negative in front of the gate
     aside_m: float  #: to the left of the axis
     above_m: float
 
@@ -93,7 +93,7 @@ class GateLaw(VelocityLaw):
 
     Attributes:
         phase: As of the last step.
-        axis: Where the vehicle is, as of the last step; None while the gate is not known.
+        axis: The vehicle's position, as of the last step; None while the gate's is unknown.
     """
 
     def __init__(self, settings: GateSettings | None = None) -> None:
@@ -104,14 +104,14 @@ class GateLaw(VelocityLaw):
         self.axis: Axis | None = None  #: as of the last step
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._gate = _new_filter()
-        self._way: Array | None = None  # through the gate, horizontal unit vector
+        self._way: Array | None = None  # direction through the gate, horizontal unit vector
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
         """Forget the gate and search for another.
 
         Args:
-            turning: Which way to search first; positive is counter-clockwise.
+            turning: Direction to search first; positive is counter-clockwise.
         """
         self.phase = GatePhase.SEARCHING
         self.forget()
@@ -126,15 +126,14 @@ class GateLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
 
-        Ignored while the vehicle's attitude or motion is not known, and where it is far from where the gate was seen
-        before.
+        Ignore it while the vehicle's attitude or motion is unknown, or if it is far from earlier sightings of the gate.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].
-            normal: Normal of the side that is seen, in body axes, (3,).
+            normal: Normal of the visible side, in body axes, (3,).
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
-            trust: How sure the normal is, 0 to 1.
+            trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
@@ -187,7 +186,7 @@ class GateLaw(VelocityLaw):
         if self.phase is GatePhase.PASSED or axis.along_m > s.beyond_m:
             return GatePhase.PASSED
         if self.phase is GatePhase.PASSING:
-            # Odometry is good for the few seconds that this takes, and no longer.
+            # Odometry is only good for the few seconds that this takes.
             late = unseen_s > 2.0 * (s.stand_m + s.beyond_m) / s.cruise_m_s
             return GatePhase.RECOVERING if late else GatePhase.PASSING
         if unseen_s > s.recovering_s:
@@ -199,7 +198,7 @@ class GateLaw(VelocityLaw):
         return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
 
     def _approach(self, axis: Axis) -> float:
-        """Return the speed along the axis while aligning [m/s]: to the place before the gate, within the cone only."""
+        """Return the speed along the axis while aligning [m/s]: towards the gate only within the cone."""
         s = self.settings
         left_m = -s.stand_m - axis.along_m
         if left_m < 0.0:
@@ -210,12 +209,12 @@ class GateLaw(VelocityLaw):
 
 
 def _new_filter() -> ConstantVelocityFilter:
-    """Create a filter for a thing that stands still, in axes that drift by some centimetres a second."""
+    """Create a filter for a fixed point in axes that drift by some centimetres a second."""
     return ConstantVelocityFilter(3, intensity_m2_s3=0.002, speed_m_s=0.03, gate=6.0)
 
 
 class Wall(NamedTuple):
-    """What a way must keep away from: the points within ``reach_m`` of a line; of a point where both ends are one."""
+    """An obstacle: all points within ``reach_m`` of a line, or of a point if both ends are equal."""
 
     begin: Point
     end: Point
@@ -223,14 +222,14 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, without the start and with the goal; None where there is none.
+    """Return the points of the shortest way, without the start but with the goal; None if there is none.
 
-    A start or goal that is too near to a wall may stay as near as it is, but the way comes no nearer.
+    A start or goal too near to a wall is allowed, but the way comes no nearer to that wall.
 
     Args:
         start: East, north [m].
         goal: East, north [m].
-        walls: At most a few dozen: the effort grows with the cube of their number.
+        walls: At most a few dozen: the effort grows with the cube of the number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Fly through gates of known colours and sizes, one after the other."""
+"""Fly through a series of gates of known colours and sizes."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _SEEN: Colour = (64, 220, 100)
 
 @dataclass(frozen=True, slots=True)
 class GateKind:
-    """What one gate of a course looks like."""
+    """The appearance of one gate of a course."""
 
     name: str
     colour: tuple[int, int, int]  #: red, green, blue, 0 to 255
     inner_size_m: tuple[float, float] = (1.2, 1.2)  #: width and height of the opening
-    turning: float = 1.0  #: which way to turn first when it is not in view: above 0 to the left, below to the right
+    turning: float = 1.0  #: which way to turn first if it is out of view: positive is left, negative is right
 
 
 #: The course of the world ``gates``.
@@ -48,14 +48,14 @@ FIVE_GATES = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A course whose gates and poles have places on a map: x, y, z [m], yaw as the vehicle's own.
+    """A course with a map of its gates and poles: x, y, z [m], yaw as the vehicle's own.
 
     Attributes:
-        gates: In order.
-        places: Of the gates.
-        poles: What else stands about.
-        pole_colour: Red, green, blue, 0 to 255; None where the camera can't tell poles by their colour.
-        start: Where the vehicle takes off, x and y.
+        gates: Gates in order.
+        places: Places of the gates.
+        poles: Other obstacles.
+        pole_colour: Red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour.
+        start: Take-off position, x and y.
         map_m: Standard deviation of these places [m].
     """
 
@@ -68,7 +68,7 @@ class Course:
 
     def __post_init__(self) -> None:
         if len(self.gates) != len(self.places):
-            raise UsageError(f"{len(self.gates)} gates have {len(self.places)} places; each needs one")
+            raise UsageError(f"each gate needs one place: got {len(self.gates)} gates and {len(self.places)} places")
 
 
 #: The gates of the worlds ``race0`` to ``race3``.
@@ -79,7 +79,7 @@ RACE_GATES = (
     GateKind("gate 4", (194, 63, 180)),
 )
 RACE_POLES = (208, 31, 31)  #: the colour of their poles
-#: The track of the worlds ``race0`` and ``race1``. In ``race2`` all of it is moved by up to 0.45 m.
+#: The track of the worlds ``race0`` and ``race1``. In ``race2`` everything is displaced by up to 0.45 m.
 RACE_TRACK = Course(
     RACE_GATES,
     (
@@ -95,11 +95,11 @@ RACE_TRACK = Course(
 
 
 def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -> Course:
-    """Return the course whose map is that of a simulated world: its gates by name, its first start, its poles.
+    """Build a course from a simulated world's map: its gates by name, its first start, its poles.
 
     Args:
-        geometry: As a simulated drone tells it in its parameter ``world.geometry``.
-        gates: The course, in order, by the names that the gates have in the world.
+        geometry: From a simulated drone's parameter ``world.geometry``.
+        gates: The gates of the course, in order, named as in the world.
 
     Raises:
         UsageError: The world has no such gate, or no start.
@@ -120,16 +120,17 @@ def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -
 
 
 class FlyThroughGates(Behaviour):
-    """Flies through gates of known colours, one after the other, and hovers behind the last.
+    """Flies through a series of gates of known colours and hovers behind the last.
 
-    With a :class:`Course` it flies by its map, which is corrected by what the camera sees: to before each gate, round
-    poles and other gates, and through it in its direction. Where a gate is not seen it hovers and ends with a warning.
+    With a :class:`Course` it flies by the map, corrected by the camera's sightings: to the front of each gate, around
+    poles and other gates, and through in the gate's direction. If a gate stays out of sight it hovers and ends with a
+    warning.
 
-    Each gate is searched by its colour. A gate that is lost on the way makes the vehicle hold its position and turn to
-    where the gate must be, then search for it again. The vehicle must be airborne when :meth:`run` is called.
+    Gates are found by colour. After losing a gate, the vehicle holds its position, turns to the gate's expected
+    direction, then searches for it again. The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
-        passed: How many gates were flown through.
+        passed: Number of gates flown through.
     """
 
     name = "gates"
@@ -147,12 +148,12 @@ class FlyThroughGates(Behaviour):
 
         Args:
             drone: The drone to fly.
-            gates: The course, in order; or with a map.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law, which a map decides; None are the defaults.
+            gates: The gates in order, or a course with a map.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: :class:`CourseSettings` with a map, else :class:`GateSettings`; None are the defaults.
 
         Raises:
-            UsageError: There is no gate, a colour has no hue, or the settings are the other law's.
+            UsageError: There is no gate, a colour has no hue, or the settings belong to the other law.
             UnknownNameError: The vehicle has no such camera.
             MissingExtraError: OpenCV is not installed.
         """
@@ -164,12 +165,12 @@ class FlyThroughGates(Behaviour):
         self._poles: PoleDetector | None = None
         if course is None:
             if isinstance(settings, CourseSettings):
-                raise UsageError("CourseSettings are of a course with a map; give a Course, or GateSettings")
+                raise UsageError("CourseSettings need a course with a map: give a Course, or GateSettings")
             self._gate_law: GateLaw | CourseLaw = GateLaw(settings)
             self._gate_law.next_gate(turning=self._gates[0].turning)
         else:
             if isinstance(settings, GateSettings):
-                raise UsageError("a course with a map is flown by CourseSettings, not by GateSettings")
+                raise UsageError("a course with a map needs CourseSettings, not GateSettings")
             self._gate_law = _law_of(course, settings)
             if course.poles and course.pole_colour is not None:
                 self._poles = PoleDetector(course.pole_colour)
@@ -178,16 +179,16 @@ class FlyThroughGates(Behaviour):
 
     @property
     def phase(self) -> GatePhase:
-        """What the behaviour is doing."""
+        """The current phase."""
         return self._gate_law.phase
 
     @property
     def gate(self) -> GateKind | None:
-        """The gate that is next; None when all are passed."""
+        """The next gate; None after the last."""
         return self._gates[self.passed] if self.passed < len(self._gates) else None
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the nearest gate of the colour that is next, and update the law."""
+        """Detect the nearest gate of the next colour, and update the law."""
         if self.phase is GatePhase.PASSED:
             self._next()
         gate = self.gate
@@ -221,7 +222,7 @@ class FlyThroughGates(Behaviour):
         if gate is None:
             self.finish(f"through {before.name}, the last of {len(self._gates)}")
         else:
-            self.emit(f"through {before.name}, on to {gate.name}")
+            self.emit(f"through {before.name}, next is {gate.name}")
             if isinstance(self._gate_law, CourseLaw):
                 self._gate_law.next_gate()
             else:

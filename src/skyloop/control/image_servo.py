@@ -1,7 +1,7 @@
-"""Hold a position by images alone: before a marker, or over the ground without the vehicle's position and velocity.
+"""Hold a position by images alone: in front of a marker, or over the ground without known position and velocity.
 
-Before a marker it is image-based visual servoing (:mod:`skyloop.control.interaction`); over the ground the optical flow
-gives the drift, which attitudes counter.
+The marker is approached by image-based visual servoing (:mod:`skyloop.control.interaction`); over the ground, optical
+flow measures the drift, and attitude set-points counter it.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _LOST: Colour = (255, 180, 60)
 
 
 class ServoPhase(StrEnum):
-    """What :class:`ImageServoLaw` is doing."""
+    """The phases of :class:`ImageServoLaw`."""
 
-    SEARCHING = "searching the marker"
+    SEARCHING = "searching for the marker"
     SERVOING = "servoing"
-    HOLDING = "lost the marker: holding the place"
+    HOLDING = "lost the marker: holding position"
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +59,13 @@ class ServoSettings:
     """
 
     gain: float = 0.8  #: [1/s]
-    #: Share of the velocity's error, where the velocity is known, that is asked for on top, against gusts.
+    #: Share of the velocity error, if the velocity is known, added to the set-point against gusts.
     velocity_gain: float = 1.0
     speed_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.0
     acceleration_m_s2: float = 2.0
-    fresh_s: float = 0.3  #: since last seen: it flies on
+    fresh_s: float = 0.3  #: continue without a sighting for this long
     holding_s: float = 2.0
     search_rad_s: float = 0.7
 
@@ -81,7 +81,7 @@ class ImageServoLaw(VelocityLaw):
 
     Attributes:
         phase: As of the last step.
-        error: Root mean square of the points' distances from where they are wanted, in the plane at z = 1.
+        error: Root mean square distance of the points from their wanted places, in the plane at z = 1.
     """
 
     def __init__(
@@ -90,22 +90,22 @@ class ImageServoLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            camera: How the camera is mounted.
-            wanted: Where the level camera is to see the points, (n, 2) in the plane at z = 1.
-            depth_m: How far the points are from the camera then.
+            camera: The camera, with its mounting.
+            wanted: Wanted places of the points in the level camera, (n, 2) in the plane at z = 1.
+            depth_m: Distance of the points from the camera at the goal.
             settings: None are the defaults.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
-        mounting_rotation(camera)  # raises now, and not in flight
+        mounting_rotation(camera)  # raises here rather than in flight
         s = self.settings = settings or ServoSettings()
         limits = SetpointLimits(
             s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0
         )
         super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING
-        self.error = math.inf  #: root mean square of the points' distances from where they are wanted, plane at z = 1
+        self.error = math.inf  #: root mean square distance of the points from their wanted places, plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
         self._depth_m = depth_m
@@ -116,11 +116,11 @@ class ImageServoLaw(VelocityLaw):
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
         """Update with the points of a frame.
 
-        Ignored, as if nothing was seen, while the attitude is not known, and where the vehicle is tilted so far that a
-        level camera would not see the points. The depth of all points is estimated from how large they look.
+        Ignored, as if nothing was seen, while the attitude is unknown, and if the vehicle is tilted so far that a level
+        camera would not see the points. The depth of all points is estimated from their apparent size.
 
         Args:
-            points: As the camera saw them, (n, 2) in the plane at z = 1.
+            points: The points as the camera saw them, (n, 2) in the plane at z = 1.
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
         """
@@ -133,7 +133,7 @@ class ImageServoLaw(VelocityLaw):
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
-        # The mean of the depths now and at the goal keeps large motions straight (their equation 14).
+        # Averaging the depths now and at the goal keeps large motions straight (their equation 14).
         now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))
         depths = np.full(len(level), (now_m + self._depth_m) / 2)
         self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
@@ -159,9 +159,9 @@ class ImageServoLaw(VelocityLaw):
 
 
 class ImageServo(Behaviour):
-    """Flies to where a marker looks as it would from ``distance_m`` straight before it, and holds that position.
+    """Flies to where a marker looks as it would from ``distance_m`` straight in front of it, and holds that position.
 
-    Works in the image alone; of the marker only its size is used, for the wanted image. Runs until it is stopped.
+    Works in the image alone; the marker's size serves only to compute the wanted image. Runs until stopped.
     """
 
     name = "servo"
@@ -182,12 +182,12 @@ class ImageServo(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            marker_id: Which marker.
-            distance_m: Wanted distance, straight before the marker.
+            marker_id: Id of the marker.
+            distance_m: Wanted distance, straight in front of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: One that looks forward; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            camera: A camera that looks forward; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UsageError: The distance is not a finite number above 0, or the camera does not look forward.
@@ -208,12 +208,12 @@ class ImageServo(Behaviour):
 
     @property
     def phase(self) -> ServoPhase:
-        """What the behaviour is doing."""
+        """The current phase."""
         return self._servo_law.phase
 
     @property
     def error_px(self) -> float:
-        """Root mean square of the corners' distances from where they are wanted; infinite before the first sighting."""
+        """Root mean square distance of the corners from their wanted places; infinite before the first sighting."""
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -235,15 +235,15 @@ class ImageServo(Behaviour):
 
 
 def _size(points: Array) -> float:
-    """How large points look, by the root mean square of their distances from their middle."""
+    """Return the apparent size of points: the root mean square distance from their middle."""
     return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 class FlowPhase(StrEnum):
-    """What :class:`FlowLaw` is doing."""
+    """The phases of :class:`FlowLaw`."""
 
-    WAITING = "waiting for the first pictures of the ground"
-    HOLDING = "holding the place by the ground's picture"
+    WAITING = "waiting for the first images of the ground"
+    HOLDING = "holding position by images of the ground"
     LOST = "lost the ground: hovering"
 
 
@@ -255,14 +255,14 @@ class FlowSettings:
         UsageError: A number is negative or not finite.
     """
 
-    gain: float = 2.5  #: acceleration by distance [1/s²]
-    damping: float = 2.6  #: acceleration by velocity [1/s]
-    integral: float = 0.6  #: acceleration by distance and time, for the wind [1/s³]
+    gain: float = 2.5  #: acceleration per distance [1/s²]
+    damping: float = 2.6  #: acceleration per velocity [1/s]
+    integral: float = 0.6  #: acceleration per distance and time, against wind [1/s³]
     tilt_rad: float = 0.2
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
     lead_s: float = 0.12  #: from a set-point's decision until it takes effect
-    fresh_s: float = 0.3  #: greatest age of the last sighting of the ground that is still flown by
+    fresh_s: float = 0.3  #: continue without a sighting of the ground for this long
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -273,7 +273,7 @@ class FlowSettings:
 
 @dataclass(slots=True)
 class _Kept:
-    """What to hold: yaw [rad], altitude [m], and position (2,) [m] in the tracker's axes."""
+    """The state to hold: yaw [rad], altitude [m], and position (2,) [m] in the tracker's axes."""
 
     yaw: float
     altitude: float
@@ -283,12 +283,12 @@ class _Kept:
 class FlowLaw(AirframeLaw):
     """Computes attitudes from horizontal positions. Pure: times are on the proxy's clock [ns].
 
-    A PID of each axis: acceleration by position, velocity and the integral of the position. The velocity comes from a
+    One PID per axis: acceleration from position, velocity and the integral of the position. The velocity comes from a
     constant-velocity filter of the positions, not from the vehicle.
 
     Attributes:
         phase: As of the last step.
-        off_m: Estimated distance from the position to hold; None while it is not known.
+        off_m: Estimated distance from the position to hold; None while unknown.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
@@ -296,7 +296,7 @@ class FlowLaw(AirframeLaw):
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING
-        self.off_m: float | None = None  #: estimated distance from the position to hold; None while it is not known
+        self.off_m: float | None = None  #: estimated distance from the position to hold; None while unknown
         self._loop = VectorPi(Gains(p=s.gain, i=s.integral), 2, most=0.5 * s.tilt_rad * GRAVITY_M_S2)
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
         self._kept: _Kept | None = None
@@ -311,7 +311,7 @@ class FlowLaw(AirframeLaw):
         """Update with a position; the first one, and the first after a second without, becomes the one to hold.
 
         Args:
-            place: Where the vehicle was at the capture, (2,) [m], along yaw 0 and to its left.
+            place: The vehicle's position at the capture, (2,) [m], along yaw 0 and to its left.
             captured_ns: Capture of the frame.
         """
         newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
@@ -325,7 +325,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the set-point for now: level, which brakes nothing, while the position is not known."""
+        """Compute the set-point for now; level, without braking, while the position is unknown."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -353,11 +353,11 @@ class FlowLaw(AirframeLaw):
 
 
 class FlowHover(Behaviour):
-    """Holds the position, height and yaw at which it first saw the ground, by the camera that looks down.
+    """Holds the position, height and yaw at which it first saw the ground, by a camera that looks down.
 
-    Needs attitude and height from the vehicle, uses nothing else of its feedback, and flies by attitude. Without sight
-    of the ground it hovers as the vehicle itself can, by which some drift, emits a warning, and holds wherever it sees
-    the ground again.
+    Needs the vehicle's attitude and height, uses nothing else of its feedback, and flies by attitude. Without sight of
+    the ground the vehicle hovers by its own means, perhaps drifting, and a warning is emitted; the behaviour then
+    holds the position at which it sees the ground again.
     """
 
     name = "flow hover"
@@ -368,8 +368,8 @@ class FlowHover(Behaviour):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            camera: One that looks down.
-            settings: Of the law; None are the defaults.
+            camera: A camera that looks down.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -384,20 +384,20 @@ class FlowHover(Behaviour):
 
     @property
     def phase(self) -> FlowPhase:
-        """What the behaviour is doing."""
+        """The current phase."""
         return self._flow_law.phase
 
     @property
     def off_m(self) -> float | None:
-        """Estimated distance from the position to hold [m]; None while it is not known."""
+        """Estimated distance from the position to hold [m]; None while unknown."""
         return self._flow_law.off_m
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point; hover in place of it while the ground is not seen, which the event of the phase says."""
+        """Send the set-point; hover instead while the ground is out of view (the phase's event reports it)."""
         if self.phase is FlowPhase.HOLDING:
             super().steer(wanted)
         else:
-            let_go(self.drone, "the ground is not seen")
+            let_go(self.drone, "the ground is out of view")
 
     def look(self, frame: Frame) -> list[Shape]:
         """Track the ground."""

@@ -1,12 +1,12 @@
-"""Image-based visual servoing of points: the interaction matrix, the level camera, and four degrees of freedom. Pure.
+"""Image-based visual servoing of points: interaction matrix, level camera, four degrees of freedom. Pure.
 
 Chaumette and Hutchinson, "Visual servo control, part I: basic approaches", IEEE Robotics & Automation Magazine 13(4),
-2006: equation numbers below are theirs. Camera axes are optical: x right, y down, z forward; points are where their
-rays meet the plane at z = 1, shape (n, 2). A multirotor must tilt to fly, which moves the picture of what stands still;
-so points are turned into the picture of a *virtual level camera* first, which has the vehicle's yaw but neither its
-roll nor its pitch (Jabbari, Oriolo and Bolandi, "An adaptive scheme for image-based visual servoing of an underactuated
-UAV", Int. J. Robotics and Automation 29(1), 2014), and the twist is sought among those that the levelled vehicle can
-take: forward, left, up and yaw.
+2006; equation numbers below are theirs. Camera axes are optical: x right, y down, z forward. Points are the
+intersections of their rays with the plane at z = 1, shape (n, 2). A multirotor must tilt to fly, which shifts even
+fixed points in the image. Points are therefore first turned into the image of a *virtual level camera* that has the
+vehicle's yaw but not its roll and pitch (Jabbari, Oriolo and Bolandi, "An adaptive scheme for image-based visual
+servoing of an underactuated UAV", Int. J. Robotics and Automation 29(1), 2014), and the twist is restricted to the
+levelled vehicle's motions: forward, left, up and yaw.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:
-    """Return how points move in the image with the camera's twist: (2n, 6), equation 11.
+    """Return the interaction matrix (2n, 6) of points: their image motion per camera twist, equation 11.
 
     The twist is velocity [m/s] and angular velocity [rad/s] of the camera along and about its own axes, (6,); the rows
     are x and y of each point in turn.
@@ -33,11 +33,11 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
         depths_m: Shape (n,), above 0.
 
     Raises:
-        UsageError: The shapes are others, or a number is out of its range.
+        UsageError: A shape is wrong, or a number is out of its range.
     """
     points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
-        raise UsageError(f"points have shape (n, 2) and depths (n,), not {points.shape} and {depths.shape}")
+        raise UsageError(f"points need shape (n, 2) and depths (n,), got {points.shape} and {depths.shape}")
     if not (np.isfinite(points).all() and np.isfinite(depths).all() and (depths > 0.0).all()):
         raise UsageError("points must be finite, and depths above 0")
     x, y, z, none = points[:, 0], points[:, 1], 1.0 / depths, np.zeros(len(points))
@@ -47,13 +47,13 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 
 
 def camera_twist(camera: CameraInfo) -> Array:
-    """Return the twist of a level camera by the levelled vehicle's motion, (6, 4).
+    """Return the matrix (6, 4) from the levelled vehicle's motion to the twist of a level camera.
 
-    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's place in the body matters: one that is
-    mounted before the centre swings when the vehicle turns.
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's place in the body matters: a camera
+    mounted ahead of the centre swings when the vehicle turns.
 
     Raises:
-        UsageError: The camera does not say how it is mounted.
+        UsageError: The camera's mounting is unknown.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
@@ -66,13 +66,13 @@ def camera_twist(camera: CameraInfo) -> Array:
 
 
 def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
-    """Return where the level camera would see points, (n, 2).
+    """Return the points as a level camera would see them, (n, 2).
 
     Args:
-        points: As the camera sees them, (n, 2).
-        camera: How it is mounted.
-        roll: Of the vehicle [rad].
-        pitch: Of the vehicle [rad].
+        points: The points as the camera sees them, (n, 2).
+        camera: The camera, with its mounting.
+        roll: Roll of the vehicle [rad].
+        pitch: Pitch of the vehicle [rad].
 
     Raises:
         UsageError: A point would not be in front of a level camera.
@@ -86,25 +86,25 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that brings the level camera's points to where they are wanted, exponentially.
+    """Compute the motion that brings the level camera's points exponentially to their wanted places.
 
     ``-gain · (L·T)⁺ · e`` (equation 5, with T of :func:`camera_twist`).
 
     Args:
-        points: Where the level camera sees them, (n, 2), two or more.
-        wanted: Where they are wanted, (n, 2).
+        points: The points in the level camera, (n, 2), two or more.
+        wanted: Their wanted places, (n, 2).
         depths_m: Shape (n,), above 0.
-        camera: How it is mounted.
+        camera: The camera, with its mounting.
         gain: [1/s]
 
     Returns:
         Forward, left, up [m/s] and yaw rate [rad/s], (4,).
 
     Raises:
-        UsageError: The shapes do not fit, or there are fewer than two points.
+        UsageError: The shapes differ, or there are fewer than two points.
     """
     if np.shape(points) != np.shape(wanted) or len(points) < 2:
-        raise UsageError(f"two points or more, and as many wanted ones, not {np.shape(points)} and {np.shape(wanted)}")
+        raise UsageError(f"servo needs two or more points, and equal shapes: {np.shape(points)}, {np.shape(wanted)}")
     jacobian = interaction_matrix(points, depths_m) @ camera_twist(camera)
     error = (np.asarray(points) - np.asarray(wanted)).reshape(-1)
     return np.asarray(-gain * (np.linalg.pinv(jacobian, rcond=1e-3) @ error))

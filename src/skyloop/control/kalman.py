@@ -1,11 +1,11 @@
-"""Kalman filters of points that are seen now and then. Pure. Times are nanoseconds on one clock.
+"""Kalman filters of points seen intermittently. Pure. Times are nanoseconds on one clock.
 
-:class:`ConstantVelocityFilter` goes straight on, in any number of dimensions. :class:`TurningTargetFilter` also turns
-and speeds up, as a platform on wheels does: its horizontal state is (x, y, vx, vy, ω, ax, ay), a coordinated turn with
-an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley
-2001, section 11.7) and an acceleration that fades (Singer, "Estimating Optimal Tracking Filter Performance for Manned
-Maneuvering Targets", IEEE T-AES 6(4), 1970). What is fast and turns is explained by the turn, which is predicted to go
-on; what is slow, by the acceleration. Its height has a filter of its own.
+:class:`ConstantVelocityFilter` assumes straight motion, in any number of dimensions. :class:`TurningTargetFilter` also
+turns and speeds up, as a platform on wheels does: its horizontal state is (x, y, vx, vy, ω, ax, ay), a coordinated turn
+with an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+Wiley 2001, section 11.7) plus an acceleration that fades (Singer, "Estimating Optimal Tracking Filter Performance for
+Manned Maneuvering Targets", IEEE T-AES 6(4), 1970). The turn explains fast motion on a curve and is predicted to
+continue; the acceleration explains slow motion. A separate filter tracks the height.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
-#: Added to the spread of an innovation, so that what is known all but exactly can be divided by.
+#: Added to an innovation's variance, so that a nearly exact state does not cause a division by zero.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
-_SEEN = np.eye(2, 7)  # what of the state is measured
-_STEP_S = 0.1  # longest step of a prediction: within it the acceleration keeps its direction
-_STRAIGHT_RAD = 1e-4  # below this angle the transition is computed by its series
-_HEIGHT_INTENSITY_M2_S3 = 0.01
-_CLIMB_M_S = 0.3  # standard deviation of the vertical velocity at first
+_SEEN = np.eye(2, 7)  # the measured part of the state
+_STEP_S = 0.1  # longest step of a prediction; within a step the acceleration keeps its direction
+_STRAIGHT_RAD = 1e-4  # below this angle the transition uses its series expansion
+_HEIGHT_INTENSITY_M2_S3 = 0.01  # random acceleration of the height
+_CLIMB_M_S = 0.3  # initial standard deviation of the vertical velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +41,11 @@ class Estimate:
     at_ns: int
     position: Array  #: (n,) [m]
     velocity: Array  #: (n,) [m/s]
-    covariance: Array  #: (2n, 2n) of position and velocity, in this order [m², m²/s, m²/s²]
+    covariance: Array  #: (2n, 2n) of position and velocity, in that order [m², m²/s, m²/s²]
 
     @property
     def deviation_m(self) -> float:
-        """Standard deviation of the position: the root of the sum of its variances."""
+        """Standard deviation of the position: the root of its summed variances."""
         n = len(self.position)
         return math.sqrt(float(np.trace(self.covariance[:n, :n])))
 
@@ -58,9 +58,9 @@ class TurnEstimate:
         at_ns: The time.
         position: (3,) [m].
         velocity: (3,) [m/s].
-        turn_rate: Of the horizontal velocity, counter-clockwise from above [rad/s].
-        extra: Horizontal acceleration beside that of the turn, (2,) [m/s²].
-        covariance: Of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
+        turn_rate: Turn rate of the horizontal velocity, counter-clockwise from above [rad/s].
+        extra: Horizontal acceleration on top of the turn's, (2,) [m/s²].
+        covariance: Covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
     """
 
     at_ns: int
@@ -77,7 +77,7 @@ class TurnEstimate:
 
     @property
     def turning_rad_s(self) -> float:
-        """How fast the horizontal velocity turns, by both accelerations, either way; 0 for what stands."""
+        """Turn rate of the horizontal velocity by both accelerations, unsigned; 0 for a standing point."""
         (vx, vy), (ax, ay) = self.velocity[:2].tolist(), self.acceleration.tolist()
         squared = vx * vx + vy * vy
         return abs(vx * ay - vy * ax) / squared if squared > 0.0 else 0.0
@@ -97,10 +97,10 @@ _E = TypeVar("_E", Estimate, TurnEstimate)
 
 
 class _Filter(ABC, Generic[_E]):
-    """What both have in common.
+    """The common base of both filters.
 
     Attributes:
-        refused: Measurements outside of the gate since the last one within it.
+        refused: Measurements outside the gate since the last one inside it.
     """
 
     def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
@@ -111,7 +111,7 @@ class _Filter(ABC, Generic[_E]):
             raise UsageError(f"gate is {gate!r} and must be above 0")
         self._n, self._gate = dimensions, gate
         self._estimate: _E | None = None
-        self.refused = 0  #: measurements outside of the gate since the last one within it
+        self.refused = 0  #: measurements outside the gate since the last one inside it
 
     @property
     def newest(self) -> _E | None:
@@ -124,7 +124,7 @@ class _Filter(ABC, Generic[_E]):
         Args:
             position: As in :meth:`update`.
             deviation_m: As in :meth:`update`.
-            at_ns: When it was measured.
+            at_ns: Time of the measurement.
 
         Raises:
             UsageError: A shape is wrong, or a number is not finite.
@@ -139,10 +139,10 @@ class _Filter(ABC, Generic[_E]):
         Args:
             position: Shape (n,) [m].
             deviation_m: Its standard deviation [m], one for all axes, or its covariance (n, n) [m²].
-            at_ns: When it was measured.
+            at_ns: Time of the measurement.
 
         Returns:
-            Whether it was used; False outside of the gate (counted in :attr:`refused`), or if older than the last one.
+            Whether it was used; False outside the gate (counted in :attr:`refused`), or if older than the last one.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or both estimate and measurement are exact.
@@ -160,11 +160,11 @@ class _Filter(ABC, Generic[_E]):
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict the estimate for a time; before the last measurement it is the estimate as of that measurement.
+        """Predict the estimate for a time; for times before the last measurement, return that measurement's estimate.
 
         Args:
             at_ns: The time to predict for.
-            longest_s: How far the last measurement is extrapolated at most.
+            longest_s: Longest extrapolation of the last measurement.
 
         Raises:
             UsageError: There was no measurement.
@@ -182,7 +182,7 @@ class _Filter(ABC, Generic[_E]):
 
     @abstractmethod
     def _corrected(self, before: _E, measured: Array, noise: Array, at_ns: int) -> _E | None:
-        """Return the estimate after a measurement; None if that is outside of the gate."""
+        """Return the estimate after a measurement; None if it is outside the gate."""
 
     @abstractmethod
     def _moved(self, last: _E, dt: float) -> _E: ...
@@ -198,7 +198,7 @@ class _Filter(ABC, Generic[_E]):
             noise = np.eye(n) * noise**2
         if measured.shape != (n,) or noise.shape != (n, n):
             raise UsageError(
-                f"a position has shape ({n},) and a covariance ({n}, {n}), not {measured.shape} and {noise.shape}"
+                f"a position needs shape ({n},) and a covariance ({n}, {n}), got {measured.shape} and {noise.shape}"
             )
         if not (np.isfinite(measured).all() and np.isfinite(noise).all()):
             raise UsageError("a measured position and its deviation must be finite")
@@ -209,7 +209,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
     """A Kalman filter of a point with constant velocity and random accelerations.
 
     Attributes:
-        refused: Measurements outside of the gate since the last one within it.
+        refused: Measurements outside the gate since the last one inside it.
     """
 
     def __init__(
@@ -223,11 +223,11 @@ class ConstantVelocityFilter(_Filter[Estimate]):
         """Initialise the filter.
 
         Args:
-            dimensions: Of the position; 1 or more.
-            intensity_m2_s3: Of the acceleration's white noise: within a second the velocity wanders by the root of it.
-            speed_m_s: Standard deviation of each component of the velocity at first.
-            gate: Measurements farther off than so many standard deviations (Mahalanobis distance) are refused;
-                ``math.inf`` refuses none.
+            dimensions: Dimensions of the position; 1 or more.
+            intensity_m2_s3: White noise of the acceleration: within a second the velocity wanders by its root.
+            speed_m_s: Initial standard deviation of each velocity component.
+            gate: Refuse measurements more than this many standard deviations off (Mahalanobis distance); ``math.inf``
+                refuses none.
 
         Raises:
             UsageError: An argument is out of its range.
@@ -248,7 +248,7 @@ class ConstantVelocityFilter(_Filter[Estimate]):
         n, off = self._n, measured - before.position
         spread = before.covariance[:n, :n] + noise
         if not spread.any():
-            raise UsageError("a measurement without deviation, of a point that is known exactly, adds no information")
+            raise UsageError("an exact measurement of an exactly known point adds no information")
         spread = (spread + spread.T) / 2 + np.eye(n) * max(_EXACT_M2, _ROUNDING * float(np.abs(spread).max()))
         if math.sqrt(max(0.0, float(off @ np.linalg.solve(spread, off)))) > self._gate:
             return None
@@ -265,10 +265,10 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates the motion of a point in levelled axes from measured positions (3,) with one deviation, above 0.
+    """Estimates the motion of a point in levelled axes from measured positions (3,), each with one deviation above 0.
 
     Attributes:
-        refused: Measurements outside of the gate since the last one within it.
+        refused: Measurements outside the gate since the last one inside it.
     """
 
     def __init__(
@@ -285,13 +285,13 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
         """Initialise the filter.
 
         Args:
-            intensity_m2_s3: Of the acceleration's white noise, beside the other two.
-            speed_m_s: Standard deviation of each component of the velocity at first.
-            turn_rad_s: Standard deviation of the turn rate at first.
-            turn_wander_rad_s: By how much the turn rate wanders within a second.
-            extra_m_s2: Standard deviation of each component of the acceleration beside the turn.
-            extra_s: Within this time that acceleration fades to a third; above 0.
-            gate: Positions farther off than so many standard deviations (Mahalanobis distance) are refused.
+            intensity_m2_s3: Intensity of the acceleration's white noise, on top of the turn and the extra acceleration.
+            speed_m_s: Initial standard deviation of each velocity component.
+            turn_rad_s: Initial standard deviation of the turn rate.
+            turn_wander_rad_s: How far the turn rate wanders within a second.
+            extra_m_s2: Standard deviation of each component of the extra acceleration.
+            extra_s: Time in which the extra acceleration fades to a third; above 0.
+            gate: Refuse positions more than this many standard deviations off (Mahalanobis distance).
 
         Raises:
             UsageError: An argument is out of its range.
@@ -318,7 +318,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
     def _started(self, measured: Array, noise: Array, at_ns: int) -> TurnEstimate:
         covariance = self._first + _SEEN.T @ noise[:2, :2] @ _SEEN
         rate = 0.0
-        if self._estimate is not None:  # what turned may well go on turning
+        if self._estimate is not None:  # a target that turned may well keep turning
             rate, known = self._estimate.turn_rate, float(self._estimate.covariance[4, 4])
             covariance[4, 4] = min(covariance[4, 4], known + self._again)
         height = self._height.start(measured[2:], noise[2:, 2:], at_ns)
@@ -381,7 +381,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
 
 
 def _turn(rate: float, dt: float) -> tuple[float, float, float, float]:
-    """Return sin(ωt)/ω and (1 - cos(ωt))/ω [s], and their derivatives by ω [s²]."""
+    """Return sin(ωt)/ω and (1 - cos(ωt))/ω [s], and their derivatives with respect to ω [s²]."""
     angle = rate * dt
     if abs(angle) < _STRAIGHT_RAD:
         return dt, angle * dt / 2, -angle * dt * dt / 3, dt * dt / 2

@@ -1,12 +1,12 @@
-"""The law that lands on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
+"""Land on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
-The marker's motion is that of a filter which knows straight motion and steady turns (:mod:`.turning`), in odometry
-axes. The vehicle flies where the marker will be when the set-point is in force, with the marker's velocity and
-acceleration, by its own predicted motion (:mod:`.response`). It descends while it is within a cone over the marker, as
-in Saripalli, Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003:
-outside of the cone it keeps its height, or climbs to see more, and closes up first. The last part, where the marker no
-longer fits into the image, is flown by prediction. It is aborted, by a climb along the marker's predicted path, where
-the vehicle would touch down too far off. After a number of aborted attempts it gives up and hovers at a safe height.
+A filter of straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. The vehicle flies to
+where the marker will be when the set-point takes effect, with the marker's velocity and acceleration, by the vehicle's
+predicted motion (:mod:`.response`). It descends while inside a cone over the marker, as in Saripalli, Montgomery and
+Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003; outside the cone it keeps its
+height, or climbs to see more, and closes up first. The last part, where the marker no longer fits into the image, is
+flown by prediction. If the vehicle would touch down too far off, it aborts with a climb along the marker's predicted
+path. After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
@@ -33,51 +33,51 @@ __all__ = ["LandingLaw", "LandingPhase", "LandingSettings", "SpiralSearch"]
 
 Array = NDArray[np.float64]
 
-_KEPT_S = 2.0  # estimates of the past, to see how well the marker's motion was foreseen
-_MOST_REFUSED = 4  # sightings in a row that don't fit the filter: then it restarts
-_CONTRADICTED = 2  # and so many abort a touch-down
-_LATEST_S = 0.1  # for which a turn goes on as in the feedback next to a frame
-_REACTION_S = 0.25  # for which a difference of velocity counts: the vehicle takes it out within this time
-_JUST = 0.999  # of a limit: turned into body axes, a speed may be longer by the last digit
-_MOVES_M_S = 0.1  # what is slower has no direction that could turn
-_FRESH_S = 0.2  # greatest age of the motion by which it counts as down
-_GIVEN_UP_CLIMB_S = 4.0  # a vehicle without an altimeter climbs for so long
+_KEPT_S = 2.0  # history of estimates, to check how well the marker's motion was predicted
+_MOST_REFUSED = 4  # after this many sightings in a row outside the gate, the filter restarts
+_CONTRADICTED = 2  # after this many, a touch-down is aborted
+_LATEST_S = 0.1  # longest extrapolation of the turn rate from the feedback at a frame
+_REACTION_S = 0.25  # a velocity error shifts the touch-down point for this long; then the vehicle has removed it
+_JUST = 0.999  # margin below a limit: turning a velocity into body axes may round it up
+_MOVES_M_S = 0.1  # a slower target has no direction that could turn
+_FRESH_S = 0.2  # greatest age of the motion for which a touch-down counts
+_GIVEN_UP_CLIMB_S = 4.0  # duration of the climb of a vehicle without an altimeter
 
 
 class LandingPhase(StrEnum):
-    """What :class:`LandingLaw` is doing."""
+    """The phases of :class:`LandingLaw`."""
 
-    SEARCHING = "searching the marker"  #: waiting, then on a square spiral, at the search height
-    CHASING = "going over the marker"
-    DESCENDING = "going down over the marker"
-    RECOVERING = "lost the marker: climbing where it must be"
-    COMMITTED = "touching down"  #: too near to see the marker whole
+    SEARCHING = "searching for the marker"  #: waiting, then on a square spiral, at the search height
+    CHASING = "moving over the marker"
+    DESCENDING = "descending over the marker"
+    RECOVERING = "lost the marker: climbing at its predicted position"
+    COMMITTED = "touching down"  #: too near to see the whole marker
     DOWN = "down"
     GIVEN_UP = "giving up: climbing to a safe height"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """The marker relative to the vehicle, when the set-point of now is in force."""
+    """The marker relative to the vehicle, when a set-point sent now takes effect."""
 
     target: TurnEstimate
     offset: Array  #: (3,) [m], from the vehicle's centre
     velocity: Array  #: (2,) [m/s]
-    height: float  #: of the feet over the marker [m]
-    touching_off: float  #: how far off the vehicle would touch if it went down now [m]
+    height: float  #: height of the feet over the marker [m]
+    touching_off: float  #: distance by which a touch-down now would miss [m]
 
 
 class LandingLaw(AirframeLaw):
-    """Computes velocities from feedback and sightings; the motors are to stop at :attr:`phase` DOWN.
+    """Computes velocities from feedback and sightings; the motors stop at :attr:`phase` DOWN.
 
     Times are on the proxy's clock [ns].
 
     Attributes:
         settings: As given.
         phase: As of the last step.
-        height_m: Of the feet over the marker, as of the last step; None while searching.
+        height_m: Height of the feet over the marker, as of the last step; None while searching.
         off_m: Horizontal distance from the marker's centre, as of the last step; None while searching.
-        aborted: Touch-downs that were aborted so far.
+        aborted: Number of aborted touch-downs.
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
@@ -85,18 +85,18 @@ class LandingLaw(AirframeLaw):
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING
-        self.height_m: float | None = None  #: of the feet over the marker, as of the last step
+        self.height_m: float | None = None  #: height of the feet over the marker, as of the last step
         self.off_m: float | None = None  #: horizontally from the marker's centre, as of the last step
-        self.aborted = 0  #: touch-downs that were aborted so far
+        self.aborted = 0  #: number of aborted touch-downs
         self._response = VelocityResponse(s.response)
         self._target = TurningTargetFilter()
         self._past: deque[TurnEstimate] = deque()
         self._seen_ns: int | None = None
         self._began_ns: int | None = None
-        self._searching_ns: int | None = None  # since when it searches
+        self._searching_ns: int | None = None  # start of the search
         self._gave_up_ns: int | None = None
         self._search = SpiralSearch(s.search_lane_m, s.search_speed_m_s, s.search_largest_m)
-        self._place: Array | None = None  # where it waits
+        self._place: Array | None = None  # where to wait
         self._committed_ns: int | None = None
         limits = SetpointLimits(
             s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2, climb_acceleration_m_s2=s.climb_acceleration_m_s2
@@ -105,12 +105,12 @@ class LandingLaw(AirframeLaw):
 
     @property
     def target_speed_m_s(self) -> float | None:
-        """Horizontal speed of the marker; None before it was seen."""
+        """Horizontal speed of the marker; None before the first sighting."""
         newest = self._target.newest
         return None if newest is None else float(np.hypot(*newest.velocity[:2]))
 
     def safe(self, now_ns: int) -> bool:
-        """Whether it has given up and reached the height at which it is safe to hover."""
+        """Return whether the law has given up and reached a height at which it is safe to hover."""
         if self._gave_up_ns is None:
             return False
         altitude = self.airframe.altitude_m(now_ns)
@@ -125,7 +125,7 @@ class LandingLaw(AirframeLaw):
             self._response.add(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart from rest with the search for the marker; who was down may have been flown elsewhere."""
+        """Restart from rest with a search; a vehicle that was down may have been flown elsewhere."""
         super().pause()
         self._limiter.reset(Velocity())
         self._response.pause()
@@ -134,7 +134,7 @@ class LandingLaw(AirframeLaw):
             self.phase = LandingPhase.SEARCHING
 
     def forget(self) -> None:
-        """Forget where the marker is; who is down, or gave up, stays so."""
+        """Forget where the marker is; the phases DOWN and GIVEN_UP stay."""
         self._target, self._seen_ns, self._committed_ns = TurningTargetFilter(), None, None
         self._place, self._searching_ns = None, None
         self._past.clear()
@@ -144,11 +144,11 @@ class LandingLaw(AirframeLaw):
         self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
+        """Update with a sighting; ignore it while the vehicle's attitude or motion is unknown.
 
         Args:
             position: The marker's centre in body axes, (3,) [m].
-            at_capture: Feedback with the attitude at the capture; if it is from before, its turn goes on.
+            at_capture: Feedback with the attitude at the capture; an older one is extrapolated by its turn rate.
             captured_ns: Capture of the frame.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position)
@@ -172,7 +172,7 @@ class LandingLaw(AirframeLaw):
             self._past.popleft()
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero while the vehicle's motion is not known, and when it is down."""
+        """Compute the set-point for now; all zero while the vehicle's motion is unknown, and once down."""
         if self.phase is LandingPhase.DOWN or not self._ready(now_ns):
             return Velocity()
         newest, ahead = self.airframe.newest, self._response.predict(now_ns)
@@ -195,22 +195,22 @@ class LandingLaw(AirframeLaw):
         return Velocity(forward=forward, left=left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _turn(self, own: Motion) -> float:
-        """Return the yaw rate that lays the image's longer side along a fast marker's way [rad/s]."""
+        """Return the yaw rate that aligns the image's longer side with a fast marker's motion [rad/s]."""
         s, newest = self.settings, self._target.newest
         if newest is None or float(np.hypot(*newest.velocity[:2])) < s.turn_from_m_s:
             return 0.0
         way = math.atan2(newest.velocity[1], newest.velocity[0])
-        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # either end first
+        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # in either direction
         return clamped(1.5 * error, s.turn_rad_s)
 
     def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
-        """Return the marker relative to the vehicle; None if it was never seen, or not for too long."""
+        """Return the marker relative to the vehicle; None if it was never seen, or not recently."""
         s = self.settings
         if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
             return None
         target = self._target.at(own.at_ns)
         if self.phase is LandingPhase.SEARCHING and target.speed_deviation_m_s > s.known_m_s:
-            return None  # by its place alone, it would meet a fast marker the wrong way
+            return None  # by position alone, the vehicle would meet a fast marker head-on
         offset, velocity = target.position - own.position, (target.velocity - own.velocity)[:2]
         height = -float(offset[2]) - s.feet_m
         left_s = clamped(height / s.final_descent_m_s, _REACTION_S)
@@ -239,7 +239,7 @@ class LandingLaw(AirframeLaw):
         if self._unseen_s(now_ns) > s.fresh_s:
             return LandingPhase.RECOVERING
         if relative.height < s.commit_m:
-            if not self._sure(relative):
+            if not self._may_touch_down(relative):
                 return LandingPhase.CHASING
             self._committed_ns = now_ns
             return LandingPhase.COMMITTED
@@ -247,15 +247,15 @@ class LandingLaw(AirframeLaw):
         return LandingPhase.DESCENDING if within else LandingPhase.CHASING
 
     def _misses(self, relative: _Relative, now_ns: int) -> bool:
-        """Whether a touch-down under way is to be aborted."""
+        """Return whether to abort a touch-down that has begun."""
         s = self.settings
         if relative.height < s.nearly_m:
             return relative.touching_off > s.pad_m
         contradicted = self._target.refused >= _CONTRADICTED
         return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s or contradicted
 
-    def _sure(self, relative: _Relative) -> bool:
-        """Whether to touch down: over the marker, as fast as it, and it does what was foreseen."""
+    def _may_touch_down(self, relative: _Relative) -> bool:
+        """Return whether the vehicle is over the marker, as fast as it, and predicted its recent motion well."""
         s = self.settings
         if self._target.refused or relative.touching_off > s.commit_off_m:
             return False
@@ -286,7 +286,7 @@ class LandingLaw(AirframeLaw):
         return acceleration, float(target.velocity[2]) + self._climb(relative)
 
     def _closing(self, offset: Array) -> Array:
-        """Return the velocity towards the marker, relative to it, (2,) [m/s]: it can be taken out on arrival."""
+        """Return the velocity towards the marker, relative to it, (2,) [m/s], from which the vehicle can stop there."""
         s = self.settings
         rate, off = s.position_gain / s.velocity_gain, float(np.hypot(*offset))
         near = s.braking_m_s2 / rate**2
@@ -307,7 +307,7 @@ class LandingLaw(AirframeLaw):
         return clamped(max(0.0, off / s.view - height), s.climb_m_s)
 
     def _searched(self, own: Motion, now_ns: int) -> Array:
-        """Return the velocity of the search: waiting where the marker passed last, or here; then on the spiral."""
+        """Return the search velocity: wait where the marker last passed, or here, then fly the spiral."""
         s = self.settings
         if self._searching_ns is None:
             self._searching_ns = now_ns
@@ -318,7 +318,7 @@ class LandingLaw(AirframeLaw):
         return self._search.step(own.position[:2])
 
     def _allowed(self, up: float) -> float:
-        """Limit a climb [m/s]; towards the ceiling it slows down, as the proxy would do it."""
+        """Limit a climb [m/s]; slow down towards the ceiling, as the proxy does."""
         most = self.settings.climb_m_s
         room = math.inf if self._altitude is None else max(0.0, self.settings.ceiling_m - self._altitude)
         return within(up, -most, min(most, room))
@@ -330,7 +330,7 @@ class LandingLaw(AirframeLaw):
 
 
 def _then(newest: Motion, ahead: Predicted) -> Motion:
-    """Return the vehicle's motion when the set-point of now is in force."""
+    """Return the vehicle's motion when a set-point sent now takes effect."""
     dt = seconds(ahead.at_ns - newest.at_ns)
     position = newest.position + np.array([*ahead.moved, newest.velocity[2] * dt])
     velocity = np.array([*ahead.velocity, newest.velocity[2]])
@@ -338,10 +338,10 @@ def _then(newest: Motion, ahead: Predicted) -> Motion:
 
 
 class SpiralSearch:
-    """Flies an expanding square around its start; at its greatest size it returns to the start and starts over.
+    """Flies an expanding square around its start; after the largest square it returns and starts over.
 
-    The search of sea rescue with a camera that looks down: International Aeronautical and Maritime Search and Rescue
-    Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes, each a quarter turn from the one before).
+    The expanding-square search of sea rescue, with a camera that looks down: International Aeronautical and Maritime
+    Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes, each a quarter turn on).
     """
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
@@ -381,7 +381,7 @@ class SpiralSearch:
         return way * (min(self._speed, 1.5 * distance) / max(distance, 1e-9))
 
     def _next(self, corner: Array) -> Array:
-        """Return where the next leg ends."""
+        """Return the end of the next leg."""
         if self._leg >= self._legs and self._begin is not None:
             self._leg = 0
             return self._begin

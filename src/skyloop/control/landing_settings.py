@@ -1,4 +1,4 @@
-"""Settings of the landing: gains, limits, heights, and when it aborts or gives up."""
+"""Settings of the landing law: gains, limits, heights, and when to abort or give up."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skyloop.messages import Value
 
 _MAY_BE_0 = frozenset({"wait_s", "climb_gain", "sight_s"})
 _MAY_BE_INFINITE = frozenset({"give_up_s", "ceiling_m"})
-_BELOW_CEILING_M = 0.2  # so far below the greatest altitude it searches: the proxy slows climbs down before it
+_BELOW_CEILING_M = 0.2  # margin of the search height below the greatest altitude: the proxy slows climbs near it
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,58 +26,58 @@ class LandingSettings:
         UsageError: A number is out of its range, or two contradict each other.
     """
 
-    response: ResponseSettings = field(default_factory=ResponseSettings)  #: of the vehicle to velocity set-points
-    position_gain: float = 12.0  #: acceleration by offset [1/s²]
-    velocity_gain: float = 6.0  #: acceleration by error of velocity [1/s]
-    climb_gain: float = 1.0  #: share of the climb's error that is asked for on top
-    speed_m_s: float = 8.0  #: greatest, horizontally
-    climb_m_s: float = 0.7  #: greatest, up and down
-    acceleration_m_s2: float = 15.0  #: greatest change of the set-point, horizontally: for vehicles that answer faster
-    climb_acceleration_m_s2: float = 2.0  #: and vertically
-    closing_m_s: float = 1.5  #: greatest speed relative to the marker, on the way to it
-    braking_m_s2: float = 1.0  #: by which it slows down to the marker's velocity on arrival
-    known_m_s: float = 0.5  #: it follows the marker once its velocity is known so well (standard deviation)
-    sight_m: float = 0.004  #: standard deviation of a sighting's position next to the camera
-    sight_share: float = 0.004  #: and how much it grows with each metre of distance
-    sight_s: float = 0.01  #: by how much the attitude may be late for the frame: the more it turns, the farther off
+    response: ResponseSettings = field(default_factory=ResponseSettings)  #: response to velocity set-points
+    position_gain: float = 12.0  #: acceleration per offset [1/s²]
+    velocity_gain: float = 6.0  #: acceleration per velocity error [1/s]
+    climb_gain: float = 1.0  #: share of the climb's error added to the set-point
+    speed_m_s: float = 8.0  #: greatest horizontal speed
+    climb_m_s: float = 0.7  #: greatest vertical speed
+    acceleration_m_s2: float = 15.0  #: greatest horizontal change of the set-point, for vehicles that respond faster
+    climb_acceleration_m_s2: float = 2.0  #: greatest vertical change of the set-point
+    closing_m_s: float = 1.5  #: greatest speed relative to the marker on the way to it
+    braking_m_s2: float = 1.0  #: deceleration to the marker's velocity on arrival
+    known_m_s: float = 0.5  #: follow the marker once its velocity's standard deviation is below this
+    sight_m: float = 0.004  #: standard deviation of a sighting's position close to the camera
+    sight_share: float = 0.004  #: growth of that deviation per metre of distance
+    sight_s: float = 0.01  #: possible delay between attitude and frame: errors grow with the turn rate
 
     descent_m_s: float = 0.45
-    cone_m: float = 0.06  #: radius of the cone at the marker: outside of it, the vehicle does not descend
-    cone: float = 0.2  #: how much wider it is for each metre of height
-    view: float = 0.3  #: farther off than this share of its height, the vehicle climbs to keep the marker in view
-    #: Below this it descends by the filter, whether it sees the marker or not, if it is over the marker's centre, as
-    #: fast as the marker, and the marker has lately moved as was predicted ``foresight_s`` before.
+    cone_m: float = 0.06  #: radius of the cone at the marker; outside it, the vehicle does not descend
+    cone: float = 0.2  #: growth of that radius per metre of height
+    view: float = 0.3  #: beyond this share of its height off, the vehicle climbs to keep the marker in view
+    #: Below this height the vehicle descends by the filter, with or without sight of the marker, if it is over the
+    #: marker's centre, as fast as the marker, and the marker's motion matches the prediction ``foresight_s`` earlier.
     commit_m: float = 0.6
     commit_off_m: float = 0.08
     commit_m_s: float = 0.25
-    commit_turn_rad_s: float = 1.2  #: what turns faster is waited for
+    commit_turn_rad_s: float = 1.2  #: the vehicle waits while the marker turns faster
     foresight_s: float = 0.7
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
-    #: It aborts where it would touch farther off than this, or the marker is unseen for longer than ``blind_s``; when
-    #: it is all but down, only where it would miss the platform.
+    #: Abort a touch-down that would miss by more than this, or when the marker is unseen for longer than ``blind_s``;
+    #: just above the marker (``nearly_m``), abort only if it would miss the platform.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1
-    pad_m: float = 0.3  #: what touches so far from the marker's centre still stands safely on the platform
-    touch_m: float = 0.03  #: so near it counts as touched
-    feet_m: float = 0.06  #: below the body's centre
+    pad_m: float = 0.3  #: a touch-down this far from the marker's centre is still safely on the platform
+    touch_m: float = 0.03  #: height below which the vehicle counts as touched down
+    feet_m: float = 0.06  #: distance of the feet below the body's centre
 
-    #: It turns the image's longer side along the way of a marker that is faster than this, to see it for longer.
+    #: Turn the image's longer side along the motion of a marker faster than this, to see it for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
-    long_side_rad: float = math.pi / 2  #: of the image, from the vehicle's forward, counter-clockwise from above
+    long_side_rad: float = math.pi / 2  #: from forward, counter-clockwise from above
 
-    fresh_s: float = 0.35  #: since last seen: it flies on
-    recovering_s: float = 4.0  #: so long it flies where the unseen marker must be; then it searches
-    search_height_m: float = 2.6  #: above the ground; also where it is safe to hover
+    fresh_s: float = 0.35  #: continue without a sighting for this long
+    recovering_s: float = 4.0  #: follow the unseen marker's predicted position for this long, then search
+    search_height_m: float = 2.6  #: above the ground; also the safe height to hover at
     search_speed_m_s: float = 1.0
-    search_lane_m: float = 1.1  #: between the lanes of the spiral: what the camera sees from there, less a margin
+    search_lane_m: float = 1.1  #: distance between the spiral's lanes: the camera's view from there, less a margin
     search_largest_m: float = 5.5  #: the spiral's longest leg
     ceiling_m: float = math.inf  #: greatest altitude above the ground
-    wait_s: float = 0.0  #: before it starts on the spiral, it waits so long for the marker to pass by
-    attempts: int = 8  #: it gives up after so many aborted touch-downs
-    give_up_s: float = math.inf  #: it gives up when it has not landed so long after its start
+    wait_s: float = 0.0  #: wait this long for the marker to pass before starting the spiral
+    attempts: int = 8  #: give up after this many aborted touch-downs
+    give_up_s: float = math.inf  #: give up if not landed this long after the start
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -96,11 +96,11 @@ class LandingSettings:
                 raise UsageError(f"{less} is {getattr(self, less):g} and must be below {more}, {getattr(self, more):g}")
 
     def within(self, limits: Mapping[str, Value]) -> LandingSettings:
-        """Return these settings within the limits of a drone, so that it is asked for nothing that it may not do.
+        """Return these settings within the limits of a drone, so that no set-point exceeds them.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.altitude`` and ``limits.tilt``, as in
-                ``drone.config``; one that is missing limits nothing.
+                ``drone.config``; a missing one limits nothing.
 
         Raises:
             UsageError: The drone may not fly high enough to search.

@@ -1,6 +1,6 @@
-"""Limits of numbers, vectors and set-points: of their size, and of how fast they change. Pure.
+"""Limits of numbers, vectors and set-points: of their size and of how fast they change. Pure.
 
-NaN passes none of them: it counts as 0, or as the number of the range that is nearest to 0.
+NaN never passes: it counts as 0, or as the number of the range nearest to 0.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["GRAVITY_M_S2", "SetpointLimiter", "SetpointLimits", "clamped", "lowe
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.80665  #: standard gravity
-_LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
+_LONGEST_STEP_S = 0.2  # a longer pause does not allow a larger step
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """Return a vector (n,) of the same direction, at most ``longest``; zero if a component is not finite."""
+    """Return a vector (n,) in the same direction, at most ``longest`` long; zero if a component is not finite."""
     length = math.sqrt(float(vector @ vector))
     if length <= longest and length < math.inf:
         return vector
@@ -32,13 +32,13 @@ def shortened(vector: Array, longest: float) -> Array:
 
 
 def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.0) -> float:
-    """Return a number, lowered to a limit of a drone if that is below it.
+    """Return a number, lowered to a drone's limit if that is below it.
 
     Args:
         own: The number.
-        limits: As in ``drone.config``; where there is no number of this name, nothing limits.
-        name: Of the limit.
-        less: By how much to stay below the limit.
+        limits: As in ``drone.config``; a missing name limits nothing.
+        name: Name of the limit.
+        less: Margin to stay below the limit.
     """
     limit = limits.get(name)
     return own if isinstance(limit, bool) or not isinstance(limit, int | float) else min(own, limit - less)
@@ -52,10 +52,10 @@ class SetpointLimits:
         UsageError: A limit is not above 0.
     """
 
-    speed_m_s: float = math.inf  #: horizontally
+    speed_m_s: float = math.inf  #: horizontal
     climb_m_s: float = math.inf
     turn_rad_s: float = math.inf
-    acceleration_m_s2: float = math.inf  #: horizontally; a harder one tilts a camera off what it looks at
+    acceleration_m_s2: float = math.inf  #: horizontal; harder acceleration tilts a camera off its target
     climb_acceleration_m_s2: float = math.inf
     turn_acceleration_rad_s2: float = math.inf
 
@@ -67,7 +67,7 @@ class SetpointLimits:
 
 
 class SetpointLimiter:
-    """Limits velocity set-points, and the change from each to the next. The first one may differ by any amount."""
+    """Limits velocity set-points and the change from one to the next; the first may be anything."""
 
     def __init__(self, limits: SetpointLimits) -> None:
         self.limits = limits
@@ -77,7 +77,7 @@ class SetpointLimiter:
         """Limit the next set-point.
 
         Args:
-            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); what is not finite counts as 0.
+            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); values that are not finite count as 0.
             dt_s: Time since the last call; counts as 0.2 s at most, so that a pause does not allow a larger step.
         """
         limits, dt = self.limits, within(dt_s, 0.0, _LONGEST_STEP_S)
@@ -96,7 +96,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Restart from a set-point; None lets the next one be anything."""
+        """Restart from a set-point; None allows any next one."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

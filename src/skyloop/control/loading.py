@@ -1,6 +1,6 @@
-"""Load the user's controller from a Python file, with errors that give the line and the reason, and load it again.
+"""Load the user's controller from a Python file, with errors that give the line and the reason, and reload it.
 
-It is loaded again when the file, or a module beside it that it imports, was saved, without interrupting the flight.
+A saved change of the file, or of a module beside it that it imports, is loaded without interrupting the flight.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError, UsageError
 
 LOOK_S: Final = 0.1  #: how often the files are polled
-Stamp = tuple[int, int, int]  #: what changes when a file is saved: time [ns], size, inode
+Stamp = tuple[int, int, int]  #: changes when a file is saved: time [ns], size, inode
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """Return the controller class in a Python file.
+    """Load the controller class of a Python file.
 
-    The file is executed, and may import modules beside it, as a script may. Imported classes count only if the file
-    defines none of its own.
+    The file is executed and can import modules beside it, as a script can. Imported classes count only if the file
+    defines no controller itself.
 
     Args:
         path: The Python file.
-        class_name: Which class, where the file has several.
+        class_name: Name of the class, if the file has several.
 
     Raises:
         FileFormatError: The file can't be read or executed (with the line), or has no controller.
@@ -50,7 +50,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source: Python's cache takes a file of the same second and size for unchanged."""
+    """Always compiles the source: Python's cache takes a file with the same second and size for unchanged."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -77,7 +77,7 @@ def _run(file: Path) -> ModuleType:
         raise FileFormatError(f"{file}: {where}line {error.lineno}: {error.msg}") from error
     except SystemExit as error:
         raise FileFormatError(
-            f"{file}{_line_of(error, file)}: it ends the program when it is loaded; what only a script does belongs "
+            f"{file}{_line_of(error, file)}: it ends the program when loaded; put script code "
             'under if __name__ == "__main__":'
         ) from error
     except Exception as error:
@@ -100,7 +100,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Return where in the user's file an exception was raised, or an empty string if it was elsewhere."""
+    """Return the line of the user's file that raised an exception; empty if it was raised elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -115,11 +115,11 @@ def _is(name: str | None, file: Path) -> bool:
 
 
 def load_module(file: Path, what: str) -> ModuleType:
-    """Execute a Python file as a module of its own.
+    """Execute a Python file as a separate module.
 
     Args:
         file: The Python file.
-        what: What it should hold; a noun phrase for the error message.
+        what: What the file should contain; a noun phrase for the error message.
 
     Raises:
         FileFormatError: The file can't be read or executed (with the line).
@@ -133,9 +133,9 @@ def load_module(file: Path, what: str) -> ModuleType:
 
 
 class Reloader:
-    """Watches a controller's file, and loads it on its own thread when it was saved. A context manager.
+    """Watches a controller's file and reloads it on a background thread after each save. A context manager.
 
-    A file counts as saved once it is unchanged for ``look_s / 2``, so that a file that is being written is not loaded.
+    A file counts as saved once unchanged for ``look_s / 2``, so that no half-written file is loaded.
     """
 
     def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
@@ -143,7 +143,7 @@ class Reloader:
 
         Args:
             path: The controller's file.
-            class_name: Which class, where the file has several.
+            class_name: Name of the class, if the file has several.
             look_s: How often the files are polled [s].
         """
         self._path = Path(path)
@@ -177,11 +177,11 @@ class Reloader:
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
-        """Return the new class, or the error why the saved file can't be loaded; None if nothing was saved since."""
+        """Return the new class, or the error that kept it from loading; None if nothing was saved since."""
         return self._loaded.popleft() if self._loaded else None
 
     def look(self) -> None:
-        """Poll the files once, and load them if they changed."""
+        """Poll the files once and load them if they changed."""
         found = self._stamps()
         if found == self._seen:
             return
@@ -204,7 +204,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Load the file and its neighbours again; restore the modules that were loaded before if that fails."""
+        """Reload the file and its neighbours; on failure restore the previously loaded modules."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -215,7 +215,7 @@ class Reloader:
             raise
 
     def _neighbours(self) -> dict[str, ModuleType]:
-        """Return the loaded modules from the folder of the user's file: that file, and those beside it."""
+        """Return the loaded modules in the folder of the user's file, that file included."""
         loaded = dict(sys.modules)
         tops = {name for name in loaded if "." not in name and self._lies_here(name, loaded[name])}
         return {name: module for name, module in loaded.items() if name.partition(".")[0] in tops and _file(module)}
@@ -237,7 +237,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return what changes when a file is saved; None while it is missing, as when an editor replaces it."""
+    """Return a stamp that changes with each save; None while the file is missing, as while an editor replaces it."""
     try:
         found = file.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Fly by a policy that was learnt: a network in an ONNX file, from a picture and the state to a set-point."""
+"""Fly by a learned policy: a network in an ONNX file that maps an image and the state to a set-point."""
 
 from __future__ import annotations
 
@@ -31,48 +31,48 @@ STATE_INPUT: Final = "observation.state"
 IMAGE_INPUT: Final = "observation.images."
 OUTPUT: Final = "action"
 MEMORY: Final = "memory"
-NEXT_MEMORY: Final = "next_memory"  #: the output that the memory is at the next picture
-STATE_NAMES: Final = "skyloop.state"  #: of a file's metadata: the state's numbers by name, as a JSON list
-ACTION_NAMES: Final = "skyloop.action"  #: and the action's
-_MOST_SIDE: Final = 4096
-_MOST_MEMORY: Final = 2**20
+NEXT_MEMORY: Final = "next_memory"  #: output that becomes the memory for the next image
+STATE_NAMES: Final = "skyloop.state"  #: metadata key: names of the state's numbers, a JSON list
+ACTION_NAMES: Final = "skyloop.action"  #: metadata key: names of the action's numbers
+_MOST_SIDE: Final = 4096  # limit of an input image [px]
+_MOST_MEMORY: Final = 2**20  # limit of a memory, in numbers
 _PURPOSE: Final = "flying by an ONNX file"
 
 
 class PolicyPhase(StrEnum):
-    """What a policy is doing."""
+    """Whether a policy flies, and if not, why."""
 
     FLYING = "flying"
-    NO_STATE = "the drone does not know all that the policy needs: hovering"
+    NO_STATE = "the drone does not report all values that the policy needs: hovering"
     NO_ACTION = "the policy's action is not finite: hovering"
 
 
 class PolicyNetwork:
-    """A policy's network. Call it from one thread.
+    """A policy's network. Call it from one thread only.
 
     The file has an input ``observation.images.CAMERA`` of float32 (1, 3, height, width), red, green, blue, 0 to 1, and
-    may have ``observation.state`` of float32 (1, n); its output is ``action`` of (1, m). These are the names and the
-    numbers of ``skyloop log export --to lerobot``. Its metadata names the numbers, as JSON lists in ``skyloop.state``
-    and ``skyloop.action``. A network that remembers has an input ``memory``, float32 of a fixed shape, and an output
-    ``next_memory`` of the same shape, which is its ``memory`` at the next picture; at the first it is zeros.
+    may have ``observation.state`` of float32 (1, n); its output is ``action`` of (1, m). Names and numbers match
+    ``skyloop log export --to lerobot``. The metadata lists the numbers' names, as JSON lists in ``skyloop.state`` and
+    ``skyloop.action``. A network with memory has an input ``memory``, float32 of a fixed shape, and an output
+    ``next_memory`` of the same shape, which becomes its ``memory`` for the next image; it starts as zeros.
 
     Args:
         path: The ONNX file.
-        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`; None: those of the metadata.
-        action: ``velocity`` or ``attitude``; None: by the metadata.
-        threads: Of the processor for one run, 1 to 64.
+        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`; None: from the metadata.
+        action: ``velocity`` or ``attitude``; None: from the metadata.
+        threads: CPU threads of one run, 1 to 64.
 
     Attributes:
-        camera: The camera whose pictures it was learnt from.
-        size: Width and height of the pictures that it takes [px]; others are scaled.
+        camera: The camera whose images it was trained on.
+        size: Width and height of its input images [px]; others are scaled.
         state: Names of the state's numbers.
         action: ``velocity`` or ``attitude``.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.
-        UnknownNameError: A name of the state's numbers, or of the action, is not known.
+        UnknownNameError: A name of the state's numbers, or of the action, is unknown.
         UsageError: There is no such file, or an argument is out of its range or contradicts the file.
-        FileFormatError: It is no ONNX file, or its inputs, outputs or metadata are not as above.
+        FileFormatError: It is not an ONNX file, or its inputs, outputs or metadata are not as above.
     """
 
     def __init__(
@@ -100,17 +100,17 @@ class PolicyNetwork:
         self.forget()
 
     def __call__(self, image: NDArray[np.uint8], state: Sequence[float]) -> Velocity | Attitude:
-        """Compute the set-point, and remember what the network keeps for the next picture.
+        """Compute the set-point and keep the network's memory for the next image.
 
         Args:
             image: BGR, shape (height, width, 3), or grey (height, width), uint8, of any size.
-            state: Numbers by :attr:`state`.
+            state: Numbers in the order of :attr:`state`.
 
         Returns:
             The set-point, which may not be finite.
 
         Raises:
-            FileFormatError: The network can't be run, or its action has another number of values.
+            FileFormatError: The network can't be run, or its action has a wrong number of values.
         """
         if image.ndim == 2:
             image = self._cv.cvtColor(image, self._cv.COLOR_GRAY2BGR)
@@ -134,7 +134,7 @@ class PolicyNetwork:
             raise FileFormatError(f"{self._path}: {error}") from None
 
     def forget(self) -> None:
-        """Start anew: the next picture is the first."""
+        """Clear the memory: treat the next image as the first."""
         self._memory = self._blank
 
     def _remember(self, kept: Sequence[NDArray[np.float32]]) -> None:
@@ -146,11 +146,11 @@ class PolicyNetwork:
                 f"{self._path} takes {MEMORY} as {self._blank.shape} and gives {NEXT_MEMORY} as {memory.shape}: "
                 "they must be alike"
             )
-        # What is not finite would stay so with every picture to come.
+        # Values that are not finite would stay in the memory forever.
         self._memory = memory if np.isfinite(memory).all() else self._blank
 
     def _memory_of(self, inputs: Mapping[str, Any], outputs: Sequence[str]) -> NDArray[np.float32] | None:
-        """Return what the network is given with its first picture; None for one without a memory."""
+        """Return the initial memory; None for a network without memory."""
         if (MEMORY in inputs) != (NEXT_MEMORY in outputs):
             raise FileFormatError(
                 f"{self._path} must have both the input {MEMORY} and the output {NEXT_MEMORY}, or neither"
@@ -171,7 +171,7 @@ class PolicyNetwork:
         others = [name for name in inputs if name not in (*pictures, STATE_INPUT, MEMORY)]
         if len(pictures) != 1 or others:
             raise FileFormatError(
-                f"{self._path} has the inputs {', '.join(inputs) or 'none'}, and must have one picture, "
+                f"{self._path} has the inputs {', '.join(inputs) or 'none'}, and must have one image, "
                 f"{IMAGE_INPUT}CAMERA, and may have {STATE_INPUT} and {MEMORY}"
             )
         (name,) = pictures
@@ -198,7 +198,7 @@ class PolicyNetwork:
         shape = inputs[STATE_INPUT].shape
         if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != len(names)):
             raise FileFormatError(
-                f"{self._path} takes {STATE_INPUT} as {tuple(shape)}, and not (1, {len(names)}): {', '.join(names)}"
+                f"{self._path} takes {STATE_INPUT} as {tuple(shape)}, not (1, {len(names)}): {', '.join(names)}"
             )
         return names
 
@@ -211,7 +211,7 @@ class PolicyNetwork:
         for kind, own in ACTIONS.items():
             if names == own:
                 return kind
-        raise FileFormatError(f"{self._path} names the action {', '.join(names)}, and must name that of {_ACTIONS}")
+        raise FileFormatError(f"{self._path} names the action {', '.join(names)}, but must name {_ACTIONS}")
 
     def _names(self, key: str, metadata: Mapping[str, str]) -> tuple[str, ...]:
         try:
@@ -228,12 +228,11 @@ _ACTIONS: Final = " or ".join(f"{kind} ({', '.join(names)})" for kind, names in 
 
 
 class OnnxPolicy(Behaviour):
-    """Flies by a learnt policy: with each frame, its network computes a set-point from the picture and the state.
+    """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
-    Limits, zones and failsafe of the proxy hold as for any application. It hovers, and says so in an event, when frames
-    stop, when the drone does not know a number of the state that the network takes, or did not for half a second, and
-    when the action is not finite.
-    A network that remembers starts anew after each of these.
+    Limits, zones and failsafe of the proxy apply as for any application. The vehicle hovers, and an event reports it,
+    when frames stop, when a number of the state that the network needs is missing or half a second old, and when the
+    action is not finite. A network's memory is cleared after each of these.
     The vehicle must be airborne when :meth:`run` is called. All callbacks run on the thread that called it.
     """
 
@@ -255,30 +254,30 @@ class OnnxPolicy(Behaviour):
         Args:
             drone: The drone to fly.
             path: The ONNX file; see :class:`PolicyNetwork`.
-            camera: Whose frames to use; None is the camera that the file names.
-            state: Names of the state's numbers, where the file does not tell.
-            action: ``velocity`` or ``attitude``, where the file does not tell.
-            threads: Of the processor for one picture.
+            camera: Camera to use; None is the camera named in the file.
+            state: Names of the state's numbers, if the file does not give them.
+            action: ``velocity`` or ``attitude``, if the file does not give it.
+            threads: CPU threads for one image.
 
         Raises:
             MissingExtraError: ONNX Runtime or OpenCV is not installed.
             UsageError: There is no such file, or an argument is out of its range.
-            UnknownNameError: The vehicle has no such camera, or a name is not known.
-            FileFormatError: The file is not a policy's.
+            UnknownNameError: The vehicle has no such camera, or a name is unknown.
+            FileFormatError: The file is not a policy.
         """
         self.network = PolicyNetwork(path, state=state, action=action, threads=threads)
         self._newest = _Newest()
         super().__init__(drone, self._newest, self.network.camera if camera is None else camera)
         self._phase = PolicyPhase.FLYING
-        self._looked_at_ns = 0  # capture of the newest frame that the network was given
+        self._looked_at_ns = 0  # capture of the newest frame given to the network
 
     @property
     def phase(self) -> PolicyPhase:
-        """Whether it flies, or why not."""
+        """The current phase: whether it flies, or why not."""
         return self._phase
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Compute the set-point of a frame, and write it into the frame."""
+        """Compute a frame's set-point and write it on the frame."""
         if frame.captured_ns - self._looked_at_ns > nanoseconds(BLIND_S):
             self.network.forget()
         self._looked_at_ns = frame.captured_ns
@@ -309,7 +308,7 @@ class OnnxPolicy(Behaviour):
 
 
 class _Newest:
-    """The law of a behaviour whose set-point is computed as a frame is looked at."""
+    """The law of a behaviour whose set-point comes from :meth:`Behaviour.look`."""
 
     def __init__(self) -> None:
         self.wanted: Velocity | Attitude = Velocity()

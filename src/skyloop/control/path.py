@@ -1,6 +1,6 @@
-"""Paths: position and velocity by time. World axes x east, y north, z up [m]. Pure.
+"""Paths: position and velocity over time. World axes x east, y north, z up [m]. Pure.
 
-Every object with :class:`Path`'s attributes is a path. Those of this module, but for a :class:`FunctionPath`, start and
+Every object with :class:`Path`'s attributes is a path. All paths of this module except :class:`FunctionPath` start and
 end at rest: each stretch has its own speed limit, and the speeds at the joints come from one backward and one forward
 pass with ``v² = v₀² + 2·a·s`` (a trapezoidal profile; Biagiotti and Melchiorri, "Trajectory Planning for Automatic
 Machines and Robots", Springer 2008, section 3.2).
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.control.limiting import within
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Shorter stretches are skipped: the squares of the speeds that they allow would be too small for a float.
+#: Shorter stretches are skipped: the squares of their speeds would underflow a float.
 SHORTEST_M: Final = 1e-9
 
 
@@ -40,22 +40,22 @@ class MotionProfile:
         """Compute the profile.
 
         Args:
-            stretches: Length [m] and greatest speed [m/s] of each. Speed 0 belongs to a stretch of length 0: a stop.
-                Stretches of at most :data:`SHORTEST_M` take no time.
-            acceleration_m_s2: For speeding up and slowing down; above 0.
+            stretches: Length [m] and greatest speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches
+                of at most :data:`SHORTEST_M` take no time.
+            acceleration_m_s2: Acceleration and deceleration; above 0.
 
         Raises:
             UsageError: A stretch would never end, because its speed limit is 0.
         """
         self._pieces: list[_Piece] = []
-        self.duration_s = 0.0  #: how long the whole profile takes
-        self.length_m = 0.0  #: its whole length
+        self.duration_s = 0.0  #: duration of the whole profile
+        self.length_m = 0.0  #: length of the whole profile
         joints = _joint_speeds(stretches, acceleration_m_s2)
         for (length, limit), (begin, end) in zip(stretches, itertools.pairwise(joints), strict=True):
             self._stretch(length, limit, begin, end, acceleration_m_s2)
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Return the distance done [m] and the speed [m/s] at a time; at rest before 0 and from the end on."""
+        """Return the distance covered [m] and the speed [m/s] at a time; at rest before 0 and after the end."""
         if t_s <= 0.0 or not self._pieces:
             return 0.0, 0.0
         if t_s >= self.duration_s:
@@ -70,7 +70,7 @@ class MotionProfile:
             return
         top = min(limit, math.sqrt((begin * begin + end * end) / 2 + a * length))
         if not top > 0.0:
-            raise UsageError(f"a stretch of {length:g} m with a greatest speed of {limit:g} m/s has no end")
+            raise UsageError(f"a stretch of {length:g} m with a speed limit of {limit:g} m/s never ends")
         up, down = (top * top - begin * begin) / (2 * a), (top * top - end * end) / (2 * a)
         self._piece(up, begin, a, (top - begin) / a)
         cruise = max(0.0, length - up - down)
@@ -85,7 +85,7 @@ class MotionProfile:
 
 
 def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[float]:
-    """Return the speed before the first stretch, between each two, and after the last."""
+    """Return the speeds before the first stretch, between stretches and after the last."""
     limits = [limit for _, limit in stretches]
     speeds = [0.0, *(min(pair) for pair in itertools.pairwise(limits)), 0.0]
     for k in range(len(stretches) - 1, -1, -1):
@@ -96,15 +96,15 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
 
 
 Array = NDArray[np.float64]
-_DIFFERENCE_S = 0.01
+_DIFFERENCE_S = 0.01  # step of the numerical derivative, to each side
 
-#: Lengths, speeds, accelerations and times in this range can be divided by one another without under- or overflow.
+#: Lengths, speeds, accelerations and times in this range divide without under- or overflow.
 _LEAST: Final = 1e-6
 _MOST: Final = 1e6
 
 
 class Path(Protocol):
-    """Position and velocity at each time from 0 to ``duration_s``; before and after, it stands still at its ends."""
+    """Position and velocity at each time from 0 to ``duration_s``; at rest at its ends before and after."""
 
     @property
     def duration_s(self) -> float: ...
@@ -117,10 +117,10 @@ class Path(Protocol):
 
 
 class FunctionPath:
-    """A path given by functions of the time.
+    """A path given by functions of time.
 
     Attributes:
-        duration_s: How long it takes.
+        duration_s: Duration of the path.
     """
 
     def __init__(
@@ -133,7 +133,7 @@ class FunctionPath:
 
         Args:
             position: Returns x, y, z [m] at a time from 0 to ``duration_s``.
-            duration_s: How long it takes.
+            duration_s: Duration of the path.
             velocity: Returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
 
         Raises:
@@ -152,7 +152,7 @@ class FunctionPath:
         return _point(self._position(within(t_s, 0.0, self.duration_s)))
 
     def velocity(self, t_s: float) -> Array:
-        """Return the velocity at a time [s], shape (3,) [m/s]; 0 before the start and from the end on.
+        """Return the velocity at a time [s], shape (3,) [m/s]; 0 before the start and after the end.
 
         Raises:
             UsageError: A function does not return three finite numbers.
@@ -170,7 +170,7 @@ class _Profiled:
 
     @property
     def duration_s(self) -> float:
-        """How long the path takes [s]."""
+        """Duration of the path [s]."""
         return self._profile.duration_s
 
 
@@ -189,10 +189,10 @@ class Polyline(_Profiled):
 
         Args:
             points: At least two that differ, each (3,) [m].
-            speed_m_s: Along the legs.
-            acceleration_m_s2: At start and end, at stops, and across the arcs.
-            corner_m: How far before a corner the arc starts, at most half of a leg; on it the vehicle is no faster than
-                its acceleration allows. 0 stops at each corner.
+            speed_m_s: Speed along the legs.
+            acceleration_m_s2: Acceleration at start and end, at stops, and across the arcs.
+            corner_m: Where an arc starts before its corner, at most half a leg; on the arc the vehicle is no faster
+                than its acceleration allows. 0 stops at each corner.
 
         Raises:
             UsageError: Fewer than two points differ, or a number is out of its range.
@@ -256,12 +256,12 @@ class Circle(_Profiled):
 
         Args:
             centre: x, y, z [m].
-            radius_m: Of the circle.
-            speed_m_s: Along the circle.
-            laps: How often round.
-            begin_rad: Where on the circle it starts, counter-clockwise from east.
-            clockwise: The sense, seen from above.
-            acceleration_m_s2: At start and end.
+            radius_m: Radius of the circle.
+            speed_m_s: Speed along the circle.
+            laps: Number of laps.
+            begin_rad: Start on the circle, counter-clockwise from east.
+            clockwise: Direction, seen from above.
+            acceleration_m_s2: Acceleration at start and end.
 
         Raises:
             UsageError: A number is out of its range.
@@ -302,15 +302,15 @@ class Lemniscate(_Profiled):
         yaw_rad: float = 0.0,
         acceleration_m_s2: float = 0.8,
     ) -> None:
-        """Initialise the path, which starts in the centre.
+        """Initialise the path; it starts in the centre.
 
         Args:
             centre: x, y, z [m].
-            half_width_m: ``a``: from the centre to each end.
-            speed_m_s: Greatest speed, which it has in the centre.
-            laps: How often round.
+            half_width_m: ``a``, from the centre to each end.
+            speed_m_s: Greatest speed, reached in the centre.
+            laps: Number of laps.
             yaw_rad: Turns the figure counter-clockwise.
-            acceleration_m_s2: At start and end.
+            acceleration_m_s2: Acceleration at start and end.
 
         Raises:
             UsageError: A number is out of its range.
@@ -320,7 +320,7 @@ class Lemniscate(_Profiled):
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
-        steepest = self._a * math.sqrt(2.0)  # way per u, where it is greatest
+        steepest = self._a * math.sqrt(2.0)  # greatest distance per u
         turns = 2 * math.pi * _positive("laps", laps)
         self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
 
@@ -340,7 +340,7 @@ class Spline:
     """A smooth curve through points at given times, at rest at both ends: SciPy's clamped cubic spline.
 
     Attributes:
-        duration_s: How long it takes.
+        duration_s: Duration of the path.
     """
 
     def __init__(self, points: Sequence[ArrayLike], times_s: Sequence[float]) -> None:
@@ -348,19 +348,19 @@ class Spline:
 
         Args:
             points: At least two, each (3,) [m].
-            times_s: One for each point, starting at 0 and growing.
+            times_s: One for each point, starting at 0 and increasing.
 
         Raises:
-            UsageError: The times do not fit the points, do not start at 0, or do not grow.
+            UsageError: The times do not fit the points, do not start at 0, or do not increase.
             MissingExtraError: SciPy is not installed.
         """
         places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)
         if len(places) < 2 or times.shape != (len(places),):
             raise UsageError(
-                f"a spline needs two points or more and a time for each, not {len(places)} and {times.size}"
+                f"a spline needs at least two points and a time for each, got {len(places)} and {times.size}"
             )
         if times[0] != 0.0 or not np.isfinite(times).all() or not (np.diff(times) >= _LEAST).all():
-            raise UsageError(f"the times of a spline begin at 0 and grow, by {_LEAST:g} s at least")
+            raise UsageError(f"the times of a spline must start at 0 and increase by at least {_LEAST:g} s")
         try:
             from scipy.interpolate import CubicSpline
         except ImportError as error:
@@ -379,7 +379,7 @@ class Spline:
 
 
 class _Leg:
-    """A straight piece."""
+    """A straight segment."""
 
     def __init__(self, begin: Array, end: Array) -> None:
         self.length = float(np.linalg.norm(end - begin))
@@ -394,7 +394,7 @@ class _Leg:
 
 
 class _Arc:
-    """A piece of a circle that leaves one leg and joins the next."""
+    """A circular arc that leaves one leg and joins the next."""
 
     def __init__(self, corner: Array, before: Array, after: Array, reach: float, turn: float) -> None:
         """Compute the arc from the directions of the legs, the distance ``reach`` to its ends, and the angle [rad]."""
@@ -416,7 +416,7 @@ class _Arc:
 
 
 def _arc(before: Array, corner: Array, after: Array, reach: float) -> _Arc | None:
-    """Return None where there is no corner to round, or where the path turns back on itself."""
+    """Return the arc; None if there is no corner, or if the path turns back on itself."""
     come, go = corner - before, after - corner
     reach = min(reach, float(np.linalg.norm(come)) / 2, float(np.linalg.norm(go)) / 2)
     come, go = come / np.linalg.norm(come), go / np.linalg.norm(go)
@@ -435,7 +435,7 @@ def _distinct(points: list[Array]) -> list[Array]:
 def _point(value: ArrayLike) -> Array:
     point = np.asarray(value, dtype=np.float64)
     if point.shape != (3,) or not (np.abs(point) <= _MOST).all():
-        raise UsageError(f"a place is three numbers, x, y, z in metres, of at most {_MOST:g}, not {value!r:.80}")
+        raise UsageError(f"a point needs three numbers x, y, z in metres, each at most {_MOST:g}, got {value!r:.80}")
     return point
 
 

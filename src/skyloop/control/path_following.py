@@ -27,7 +27,7 @@ APPROACH_M_S: Final = 0.5  #: speed to the start of a path
 
 @dataclass(slots=True)
 class TrackingError:
-    """Statistics of the distance from where the vehicle should have been."""
+    """Statistics of the distance between the vehicle and its target on the path."""
 
     samples: int = 0
     largest_m: float = 0.0
@@ -46,7 +46,7 @@ class TrackingError:
 
 
 class _PathFlyer(Controller):
-    """What both controllers have in common: a law, a position source, and hovering while the source has no position."""
+    """The common base of both controllers: a law and a position source; hovers while the source has no position."""
 
     def __init__(
         self,
@@ -60,9 +60,9 @@ class _PathFlyer(Controller):
         if not 0.0 < max_age_s < math.inf:
             raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds above 0")
         self.settings = (settings or PathSettings()).within(dict(drone.config.items()))
-        self.error = TrackingError()  #: distance from where it should have been, as the position source has it
-        self.done = False  #: the whole path was flown
-        self.lost = False  #: the position is not known now, and the vehicle hovers
+        self.error = TrackingError()  #: distance from the target, by the position source
+        self.done = False  #: the whole path is flown
+        self.lost = False  #: the vehicle hovers because the position is unknown
         self._yaw = yaw
         self._source = source
         self._max_age_ns = nanoseconds(max_age_s)
@@ -70,29 +70,29 @@ class _PathFlyer(Controller):
 
     @property
     def target(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Where the vehicle should be now, and how fast.
+        """The vehicle's current target on the path.
 
         Position (3,) [m] and velocity (3,) [m/s], world axes; None before the first fix.
         """
         return None if self._law is None else self._law.target
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Send the next set-point; hover while the position is not known, or older than ``max_age_s``.
+        """Send the next set-point; hover while the position is unknown or older than ``max_age_s``.
 
         Raises:
-            UsageError: There is no other source, and the vehicle does not report its position at first.
+            UsageError: There is no other source, and the vehicle does not report its position at the start.
         """
         if self.done:
             return
         fix = fix_of(feedback) if self._source is None else self._source()
         if self._source is None and fix is None and self._law is None:
-            raise UsageError(f"it can't fly a path: {lacking(feedback)}; or give the controller a source of positions")
+            raise UsageError(f"can't fly a path: {lacking(feedback)}; or give the controller a position source")
         if fix is None or not fix.finite or abs(feedback.captured_ns - fix.at_ns) > self._max_age_ns:
             self._lose()
             return
         if self.lost:
             self.lost = False
-            self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
+            self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: continuing", Severity.INFO)
         if self._law is None:
             self._law = self._begin(fix)
         if self._is_overruled(feedback):
@@ -103,16 +103,16 @@ class _PathFlyer(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _begin(self, fix: Fix) -> PathLaw:
-        """Return the law for the first fix."""
+        """Create the law for the first fix."""
         raise NotImplementedError
 
     def _look(self, law: PathLaw, fix: Fix) -> None:
-        """Decide after each step what comes next."""
+        """Decide on the next leg after each step."""
         raise NotImplementedError
 
     def _finish(self) -> None:
         self.done = True
-        let_go(self.drone, "the path is flown")
+        let_go(self.drone, "the path has ended")
         self._end()
 
     def _lose(self) -> None:
@@ -125,16 +125,16 @@ class _PathFlyer(Controller):
 
 
 class FollowPath(_PathFlyer):
-    """Flies to a path's start, along it, and hovers at its end; then :meth:`run` returns.
+    """Flies to a path's start, along the path, and hovers at its end; then :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         path: The path.
-        on_path: Whether the start was reached.
+        on_path: Whether the vehicle has reached the start.
         error: Tracking error from the path's start to its end.
-        done: Whether the whole path was flown.
-        lost: Whether the position is not known now, and the vehicle hovers.
+        done: Whether the whole path is flown.
+        lost: Whether the vehicle hovers because the position is unknown.
     """
 
     def __init__(
@@ -151,18 +151,18 @@ class FollowPath(_PathFlyer):
 
         Args:
             drone: The drone to fly.
-            path: In world axes.
-            yaw: A :class:`skyloop.control.YawMode`; None keeps the present yaw.
-            settings: Of the law; None are the defaults.
-            source: Of positions; None is the vehicle's own feedback.
-            max_age_s: With an older position the vehicle hovers.
+            path: The path, in world axes.
+            yaw: A :class:`skyloop.control.YawMode`; None keeps the current yaw.
+            settings: Settings of the law; None are the defaults.
+            source: Position source; None is the vehicle's own feedback.
+            max_age_s: Greatest age of a position; the vehicle hovers with an older one.
 
         Raises:
             UsageError: ``max_age_s`` is not a finite number above 0.
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.path = path
-        self.on_path = False  #: the start was reached
+        self.on_path = False  #: the vehicle has reached the start
 
     def _begin(self, fix: Fix) -> PathLaw:
         return PathLaw(_way(fix.position_m, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
@@ -180,16 +180,16 @@ class FollowPath(_PathFlyer):
 
 
 class Waypoints(_PathFlyer):
-    """Flies straight from one waypoint to the next and stays at each; then hovers, and :meth:`run` returns.
+    """Flies straight from waypoint to waypoint and stays at each; then hovers, and :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
-        waypoints: Where to fly.
-        reached: How many waypoints were reached.
-        error: Distance from where the vehicle should have been, during the whole flight.
-        done: Whether the last waypoint was reached.
-        lost: Whether the position is not known now, and the vehicle hovers.
+        waypoints: The waypoints.
+        reached: Number of waypoints reached.
+        error: Distance from the moving target, over the whole flight.
+        done: Whether the vehicle has reached the last waypoint.
+        lost: Whether the vehicle hovers because the position is unknown.
     """
 
     def __init__(
@@ -211,12 +211,12 @@ class Waypoints(_PathFlyer):
             drone: The drone to fly.
             waypoints: :class:`Waypoint` or (x, y, z) [m], world axes.
             speed_m_s: Greatest speed between waypoints.
-            acceleration_m_s2: At the start and end of each leg.
+            acceleration_m_s2: Acceleration at the start and end of each leg.
             hold_s: How long to stay at each waypoint.
-            yaw: A :class:`skyloop.control.YawMode`, for waypoints without a yaw; None keeps the present yaw.
-            settings: Of the law; None are the defaults.
-            source: Of positions; None is the vehicle's own feedback.
-            max_age_s: With an older position the vehicle hovers.
+            yaw: A :class:`skyloop.control.YawMode`, for waypoints without a yaw; None keeps the current yaw.
+            settings: Settings of the law; None are the defaults.
+            source: Position source; None is the vehicle's own feedback.
+            max_age_s: Greatest age of a position; the vehicle hovers with an older one.
 
         Raises:
             UsageError: There is no waypoint, or a number is out of its range.
@@ -231,7 +231,7 @@ class Waypoints(_PathFlyer):
         self._speed = (speed_m_s, acceleration_m_s2)
         self._hold_ns = nanoseconds(hold_s)
         self._there_ns: int | None = None  # arrival at the next waypoint
-        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises now if speed or acceleration are out of range
+        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises here if speed or acceleration is out of range
 
     def _begin(self, fix: Fix) -> PathLaw:
         goal = self.waypoints[0]
@@ -271,7 +271,7 @@ class _Stay:
 
 
 def _way(begin: Vector, end: Vector, speed_m_s: float, acceleration_m_s2: float = 0.8) -> Path:
-    """Return a straight path, or one that stays where both ends are the same."""
+    """Return a straight path, or one that stays in place if both ends are equal."""
     if math.dist(begin, end) < 1e-6:
         return _Stay(end)
     return Polyline([begin, end], speed_m_s=speed_m_s, acceleration_m_s2=acceleration_m_s2)

@@ -1,9 +1,9 @@
-"""A PID controller of one number, and a PI controller of a vector. Pure: the time step is an argument.
+"""A PID controller of one number and a PI controller of a vector. Pure: the time step is an argument.
 
-Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and through a filter
-(section 3.3), what a limit takes off is fed back into the integral (back-calculation, section 3.5), and new gains do
-not make the output jump, because the integral term, not the integral, is kept (section 3.6). The vector's integral
-grows only as far as limits after the loop don't take off what it asks for (conditional integration, section 3.5).
+Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is filtered (section
+3.3); the part that a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains cause no
+jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's integral
+grows only as far as later limits let its output through (conditional integration, section 3.5).
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Gains:
         UsageError: A number is negative or not finite.
     """
 
-    p: float = 1.0  #: output per error
-    i: float = 0.0  #: output per error and second
-    d: float = 0.0  #: output per change of the measurement a second
+    p: float = 1.0  #: output per unit of error
+    i: float = 0.0  #: output per unit of error and second
+    d: float = 0.0  #: output per change of the measurement per second
     derivative_filter_s: float = 0.05  #: time constant of the low pass before the derivative
-    #: Time constant with which the integral term follows what a limit takes off; None: p/i, or at once without p.
+    #: Time constant with which the integral term follows a limited output; None: p/i, or at once without p.
     tracking_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class Gains:
 
     @property
     def tracking_time_s(self) -> float:
-        """The time constant of back-calculation in force [s]."""
+        """The effective time constant of back-calculation [s]."""
         if self.tracking_s is not None:
             return self.tracking_s
         return self.p / self.i if self.i > 0.0 else 0.0
@@ -54,8 +54,8 @@ class Gains:
 class Pid:
     """A PID loop of one number.
 
-    :attr:`gains` may be replaced in flight. With an integral gain the output does not jump then, because the integral
-    term takes up the difference; without one it changes no faster than the rate limit allows.
+    :attr:`gains` can be replaced in flight. With an integral gain the output does not jump, because the integral term
+    takes up the difference; without one it changes no faster than the rate limit allows.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class Pid:
         """Initialise the loop.
 
         Args:
-            gains: The gains to begin with.
+            gains: Initial gains.
             low: Least output.
             high: Greatest output.
             rate: Greatest change of the output per second.
-            angle: Whether set-point and measurement are angles [rad], whose difference is taken the short way round.
+            angle: Whether set-point and measurement are angles [rad]: their difference is the shorter way around.
 
         Raises:
             UsageError: ``low`` is not below ``high``, or ``rate`` is not above 0.
@@ -96,7 +96,7 @@ class Pid:
 
     @property
     def gains(self) -> Gains:
-        """The gains in force."""
+        """The current gains."""
         return self._gains
 
     @gains.setter
@@ -106,7 +106,7 @@ class Pid:
             slope = self._slope.value or 0.0
             self._integral += (old.p - new.p) * self._error - (old.d - new.d) * slope
         elif old.i > 0.0:
-            self._integral = 0.0  # nothing would ever take it out again
+            self._integral = 0.0  # nothing would ever remove it
         self._slope.time_constant_s = new.derivative_filter_s
         self._gains = new
 
@@ -119,13 +119,13 @@ class Pid:
         """Compute the output for a new measurement.
 
         Args:
-            set_point: Where the measured value is to be.
+            set_point: The wanted value.
             measured: The measured value, in the same unit.
             dt_s: Time since the last measurement [s].
-            feed_forward: Is added to the output before the limits.
+            feed_forward: Added to the output before the limits.
 
         Returns:
-            The output, within ``low`` and ``high`` and the rate limit; as before where an argument is not finite.
+            The output, within ``low`` and ``high`` and the rate limit; unchanged if an argument is not finite.
         """
         if not all(map(math.isfinite, (set_point, measured, feed_forward, dt_s))):
             return 0.0 if self._output is None else self._output
@@ -139,18 +139,18 @@ class Pid:
         limited = within(self._unlimited, self._low, self._high)
         if self._output is not None and self._rate < math.inf:
             nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
-            # The sum is rounded, and may be a last bit beyond the limit that it goes to.
+            # Rounding may carry the sum one bit beyond the limit.
             limited = min(nearer, limited) if limited >= self._output else max(nearer, limited)
         self.applied(limited)
         return limited
 
     def applied(self, output: float) -> None:
-        """Report what was really applied of the last output, where a limit outside of this loop reduced it.
+        """Report the output really applied, if a limit outside this loop reduced it.
 
-        The integral term follows it (back-calculation). :meth:`step` calls this with its own output.
+        The integral term follows it (back-calculation). :meth:`step` calls this with its own limited output.
 
         Args:
-            output: What was applied.
+            output: The applied output.
         """
         if self._gains.i > 0.0:
             self._integral += gain(self._gains.tracking_time_s, self._dt_s) * (output - self._unlimited)
@@ -158,14 +158,14 @@ class Pid:
         self._output = output
 
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
-        """Restart with the integral term for which ``output`` is the next output, so that taking over is no jump.
+        """Restart with the integral term that makes ``output`` the next output, so that taking over causes no jump.
 
-        Without an integral gain the next output is what error and derivative give.
+        Without an integral gain, error and derivative alone give the next output.
 
         Args:
-            output: What was applied until now.
-            set_point: The set-point now.
-            measured: The measured value now; None counts the error as 0.
+            output: The output applied until now.
+            set_point: The current set-point.
+            measured: The current measured value; None counts the error as 0.
         """
         self._error = 0.0 if measured is None else self._difference(set_point, measured)
         self._integral = output - self._gains.p * self._error if self._gains.i > 0.0 else 0.0
@@ -177,7 +177,7 @@ class Pid:
 
 
 class VectorPi:
-    """A PI loop of a vector. Its integral grows only by what is really applied, and not at all in a pause.
+    """A PI loop of a vector. Its integral grows only as far as the output is applied, and not during pauses.
 
     Attributes:
         integral: The integral term, (n,), in units of the output.
@@ -187,30 +187,30 @@ class VectorPi:
         """Initialise the loop.
 
         Args:
-            gains: Their derivative and ``tracking_s`` are not used.
-            dimensions: Of the vector.
-            most: Greatest length of the integral term.
+            gains: The gains; derivative and ``tracking_s`` are unused.
+            dimensions: Length of the vector.
+            most: Greatest magnitude of the integral term.
         """
         self.gains = gains
         self._most = most
         self._before = self.integral = np.zeros(dimensions)
 
     def step(self, error: Array, dt_s: float) -> Array:
-        """Return the output (n,) for an error (n,) that lasted for ``dt_s`` [s]; report :meth:`applied` after it."""
+        """Return the output (n,) for an error (n,) that lasted ``dt_s`` [s]; call :meth:`applied` afterwards."""
         self._before = self.integral
         self.integral = shortened(self.integral + self.gains.i * error * dt_s, self._most)
         return self.gains.p * error + self.integral
 
     def applied(self, asked: Array, applied: Array) -> None:
-        """Take back by how much the integral grew, along the axes in which less was applied than was asked for.
+        """Undo the integral's growth along the axes in which limits cut the output.
 
         Args:
-            asked: All that was asked for with the last output in it, (n,).
-            applied: What limits left of it, (n,).
+            asked: The whole set-point that contains the last output, (n,).
+            applied: That set-point after the limits, (n,).
         """
         wound_up = (applied - asked) * (self.integral - self._before) < 0.0
         self.integral = np.where(wound_up, self._before, self.integral)
 
     def reset(self) -> None:
-        """Restart without an integral, because others flew, or what was measured is too old."""
+        """Restart without an integral, because another client flew or the measurement is too old."""
         self._before = self.integral = np.zeros_like(self.integral)

@@ -1,4 +1,4 @@
-"""Rehearsals of a controller in simulated time: with delay, loss and noise, and faster than real time."""
+"""Rehearse a controller in simulated time: with delay, loss and noise, and faster than real time."""
 
 from skyloop.stepping.rehearsal import Radio, rehearse
 

@@ -1,7 +1,7 @@
-"""Routes: waypoints with speeds, headings and actions, in files ``NAME.route.json``; and what speaks against one.
+"""Routes: waypoints with speeds, headings and actions, stored in ``NAME.route.json``, and checks before the flight.
 
 World axes are x east, y north, z up [m]; yaw is counter-clockwise from x [rad]. ``docs/routes.md`` describes the file.
-Legs, heights, speeds, battery and start are checked before the flight.
+The checks cover legs, heights, speeds, battery and start.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Speed = Annotated[float, msgspec.Meta(ge=0.05, le=30.0)]
 Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Point = tuple[Metres, Metres]
-SETTLE_S: Final = 1.0  #: what a leg takes longer than at its full speed: to get under way and to come to rest
-LOOK_S: Final = 3.0
-PHOTO_S: Final = 1.0
-DESCENT_M_S: Final = 0.4
-SLACK_M: Final = 0.15  #: as that of the proxy
+SETTLE_S: Final = 1.0  #: extra time of a leg for getting under way and coming to rest
+LOOK_S: Final = 3.0  #: estimated duration of a look
+PHOTO_S: Final = 1.0  #: estimated duration of a photo
+DESCENT_M_S: Final = 0.4  #: assumed landing speed, for the estimate
+SLACK_M: Final = 0.15  #: same as the proxy's
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -66,13 +66,13 @@ class Look(_Part, frozen=True, tag_field="do", tag="look"):
 
 
 class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
-    """Stay at the waypoint [s]."""
+    """Stay at the waypoint for a time [s]."""
 
     seconds: Seconds
 
 
 class Photo(_Part, frozen=True, tag_field="do", tag="photo"):
-    """Save a frame; None is the vehicle's first camera."""
+    """Save a frame of a camera; None is the vehicle's first."""
 
     camera: Name | None = None
 
@@ -87,10 +87,10 @@ class RouteWaypoint(_Part, frozen=True):
         x: East [m].
         y: North [m].
         z: Up [m].
-        speed: Greatest on the way there [m/s]; None: the route's.
-        yaw: Turned to on the way there [rad]; None: the present one is kept.
-        look_at: In place of a yaw, the point (x, y) that it looks at [m].
-        actions: What is done there, in this order.
+        speed: Greatest speed on the way there [m/s]; None: the route's.
+        yaw: Yaw to turn to on the way there [rad]; None keeps the current one.
+        look_at: Point (x, y) to face instead of a fixed yaw [m].
+        actions: Actions to do there, in this order.
     """
 
     x: Metres
@@ -104,7 +104,7 @@ class RouteWaypoint(_Part, frozen=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.yaw is not None and self.look_at is not None:
-            raise UsageError("a waypoint has a yaw or a point to look at, not both")
+            raise UsageError("a waypoint takes a yaw or a point to look at, not both")
 
     @property
     def position(self) -> Vector:
@@ -113,11 +113,11 @@ class RouteWaypoint(_Part, frozen=True):
 
     @property
     def goal(self) -> Waypoint:
-        """Return where to fly, with the yaw there."""
+        """Return the position and yaw to fly to."""
         return Waypoint(self.x, self.y, self.z, self.yaw if self.look_at is None else self.yaw_to(self.look_at))
 
     def yaw_to(self, point: Point) -> float:
-        """Return the yaw that looks from here to a point [rad]."""
+        """Return the yaw that faces a point from here [rad]."""
         return math.atan2(point[1] - self.y, point[0] - self.x)
 
 
@@ -125,12 +125,12 @@ class Route(_Part, frozen=True, kw_only=True):
     """A route.
 
     Attributes:
-        waypoints: In the order in which they are flown to.
-        name: For people.
-        speed: Greatest between waypoints that have none of their own [m/s].
-        end: What is done after the last one: ``hover``, ``land``, or ``return``: fly back to where the route began, at
-            the last waypoint's height, and land.
-        version: Of the file's format.
+        waypoints: In the order of the flight.
+        name: A name for people.
+        speed: Greatest speed towards waypoints without their own [m/s].
+        end: What to do after the last waypoint: ``hover``, ``land``, or ``return``: fly back to the start of the route
+            at the last waypoint's height, and land.
+        version: Version of the file's format.
 
     Raises:
         UsageError: A number is not finite, or there is no waypoint.
@@ -145,10 +145,10 @@ class Route(_Part, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.waypoints:
-            raise UsageError("a route has at least one waypoint")
+            raise UsageError("a route needs at least one waypoint")
 
     def speed_to(self, index: int) -> float:
-        """Return the greatest speed on the way to a waypoint [m/s]; beyond the last one, on the way back."""
+        """Return the greatest speed on the way to a waypoint [m/s]; an index past the last means the way back."""
         own = self.waypoints[index].speed if index < len(self.waypoints) else None
         return self.speed if own is None else own
 
@@ -162,7 +162,7 @@ def parse_route(content: bytes | str) -> Route:
     """Read a route from the content of its file.
 
     Raises:
-        UsageError: It is none; the message says where and why.
+        UsageError: The content is not a route; the message says where and why.
     """
     try:
         return checked(msgspec.json.decode(content, type=Route))
@@ -171,11 +171,11 @@ def parse_route(content: bytes | str) -> Route:
 
 
 def load_route(path: str | Path) -> Route:
-    """Read a route's file.
+    """Read a route file.
 
     Raises:
         FileFormatError: It can't be read.
-        UsageError: It is no route; the message says where and why.
+        UsageError: The file is not a route; the message says where and why.
     """
     content = files.read_text(path, "the route", LARGEST_FILE)
     try:
@@ -185,19 +185,19 @@ def load_route(path: str | Path) -> Route:
 
 
 def save_route(route: Route, path: str | Path) -> None:
-    """Write a route's file; one that is there is replaced.
+    """Write a route file; replace an existing one.
 
     Raises:
-        UsageError: It can't be written, or a number of the route is out of its range.
+        UsageError: It can't be written, or a number of the route is out of range.
     """
     files.write(files.expand(path), checked(route).to_json())
 
 
 def checked(route: Route) -> Route:
-    """Return the route, with every number within its range.
+    """Return the route after checking the range of every number.
 
     Raises:
-        UsageError: One is not; a route that a program made is checked only here.
+        UsageError: A number is out of range. Routes built by a program are checked only here.
     """
     try:
         return msgspec.convert(msgspec.to_builtins(route), Route)
@@ -207,20 +207,20 @@ def checked(route: Route) -> Route:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What a route is checked against.
+    """The conditions that a route is checked against.
 
     Attributes:
-        space: Where the vehicle may fly.
-        start: Where the route begins [m]: the vehicle's position, or above it where it takes off first; None: unknown.
+        space: Where flying is allowed.
+        start: Start of the route [m]: the vehicle's position, or above it before a take-off; None: unknown.
         problem: Why the vehicle can't be flown by position; empty if it can.
         ground_m: Height of the ground in world axes; None: unknown.
-        battery: Charge now, 0 to 1; None: unknown.
+        battery: Current charge, 0 to 1; None: unknown.
         speed_m_s: Greatest horizontal speed.
         climb_m_s: Greatest speed up or down.
         altitude_m: Greatest height above the ground.
         battery_warn: Charge below which the vehicle warns.
         battery_land: Charge below which the vehicle lands.
-        flight_time_s: How long a full battery lasts.
+        flight_time_s: Flight time of a full battery.
     """
 
     space: Space = field(default_factory=Space)
@@ -237,29 +237,29 @@ class Conditions:
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """Something that speaks against a route, or that one should know."""
+    """A problem of a route, or a warning about it."""
 
-    waypoint: int | None  #: from 1 on; None: of the whole route. A problem of a leg has the number of its end
+    waypoint: int | None  #: from 1; None: the whole route. Problems of a leg have the number of its end
     severity: Literal["error", "warning"]
     reason: str
 
 
 class RouteCheck(msgspec.Struct, frozen=True):
-    """What was found, and an estimate of the flight."""
+    """The findings, and an estimate of the flight."""
 
     findings: tuple[Finding, ...]
     length_m: float
     seconds: float
-    battery_left: float | None  #: charge at the end, 0 to 1; None where it is not known now
+    battery_left: float | None  #: charge at the end, 0 to 1; None if the current charge is unknown
 
     @property
     def ok(self) -> bool:
-        """Whether nothing forbids the flight."""
+        """Whether the route has no errors."""
         return all(one.severity != "error" for one in self.findings)
 
 
 def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) -> Conditions:
-    """Return what a vehicle's newest feedback and its parameters say.
+    """Read the conditions from a vehicle's newest feedback and its parameters.
 
     Raises:
         ParameterError: The no-fly zones can't be read.
@@ -274,7 +274,7 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
         value = parameters.get(name, "")
         return value if isinstance(value, str) else ""
 
-    problem = "nothing is known of the vehicle yet" if feedback is None else lacking(feedback)
+    problem = "no feedback from the vehicle yet" if feedback is None else lacking(feedback)
     start, ground = None, None
     if feedback is not None and feedback.position_m is not None:
         x, y, z = start = feedback.position_m
@@ -303,13 +303,13 @@ def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
     Args:
         drone: The drone; connected as an observer is enough.
         route: The route.
-        wait_s: How long a position is waited for, as after connecting.
+        wait_s: How long to wait for a position, for example after connecting.
 
     Raises:
         LinkError: The proxy does not answer.
     """
     feedback = None
-    with suppress(LinkError):  # nothing came yet: that is a finding
+    with suppress(LinkError):  # no feedback yet: that becomes a finding
         if wait_s > 0.0:
             with suppress(NoAnswerError):
                 drone.wait(lambda newest: newest.position_m is not None, wait_s)
@@ -319,14 +319,14 @@ def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
 
 
 def check_route(route: Route, conditions: Conditions) -> RouteCheck:
-    """Check each waypoint, each leg, and the whole.
+    """Check each waypoint, each leg and the whole route.
 
-    The estimate: each leg at its speed, :data:`SETTLE_S` more for starting and stopping, the actions' times, and the
-    battery in proportion to the time, by ``flight_time_s``.
+    The estimate adds up each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the actions'
+    times; the battery falls in proportion to that time, by ``flight_time_s``.
 
     Args:
         route: The route.
-        conditions: The vehicle, its limits and where it may fly.
+        conditions: The vehicle, its limits and where flying is allowed.
     """
     found: list[Finding] = []
 
@@ -353,7 +353,7 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
             error(number, back + problem)
         speed = route.speed_to(index)
         if speed > c.speed_m_s:
-            warning(number, f"{back}{speed:g} m/s is asked for, and at most {c.speed_m_s:g} m/s flown (limits.speed)")
+            warning(number, f"{back}{speed:g} m/s is more than limits.speed allows: flown at {c.speed_m_s:g} m/s")
         if at is not None:
             length_m += math.dist(at, place)
             seconds += _leg_s(at, place, min(speed, c.speed_m_s), c.climb_m_s)
@@ -368,7 +368,7 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
         seconds += max(0.0, places[-1][2] - (c.ground_m or 0.0)) / DESCENT_M_S
     left = None if c.battery is None else c.battery - seconds / c.flight_time_s
     if left is None:
-        warning(None, "the battery's charge is not known: it is not checked whether it lasts")
+        warning(None, "the battery's charge is unknown: can't check whether it lasts")
     elif left < c.battery_land:
         minutes = f"{seconds / 60:.1f} minutes of the {c.flight_time_s / 60:g} of a full battery (battery.flight_time)"
         error(None, f"the battery ends below {c.battery_land:.0%}, where the vehicle lands: the route takes {minutes}")
@@ -378,18 +378,18 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
 
 
 def _height_problem(place: Vector, c: Conditions) -> str:
-    """Return what is wrong with a place's height; empty if nothing is."""
+    """Return the problem with a point's height; empty if there is none."""
     ground = c.ground_m
     if ground is None:
         return ""
     if place[2] < ground - SLACK_M:
         return f"z is {place[2]:g} m, below the ground at {ground:.2f} m"
     if place[2] > ground + c.altitude_m + SLACK_M:
-        return f"z is {place[2]:g} m, and at most {ground + c.altitude_m:.2f} m is allowed (limits.altitude)"
+        return f"z is {place[2]:g} m and must be at most {ground + c.altitude_m:.2f} m (limits.altitude)"
     return ""
 
 
 def _leg_s(at: Vector, to: Vector, speed: float, climb: float) -> float:
-    """Return how long a leg takes [s]."""
+    """Return the duration of a leg [s]."""
     away = math.dist(at, to)
     return SETTLE_S + max(away / speed, abs(to[2] - at[2]) / climb) if away > 0.01 else 0.0

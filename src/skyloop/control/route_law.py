@@ -1,7 +1,7 @@
-"""Flies routes: the law of their course, the controller for programs, and the photos of any flight along a route.
+"""Fly routes: the law of their course, the controller for programs, and the photos of any flight along a route.
 
-Programs, the command line and the cockpit's page all fly routes by this law. It is pure, with times as arguments: what
-comes next, from the newest feedback.
+Programs, the command line and the cockpit's page all fly routes by this law. It is pure: times are arguments, and it
+decides the next step from the newest feedback.
 """
 
 from __future__ import annotations
@@ -39,22 +39,22 @@ from skyloop.vision.opencv import opencv
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-TURN_S: Final = 15.0  #: a turn that takes longer is given up
-PHOTO_S: Final = 5.0  #: so long a photo is waited for
-SLOWEST: Final = 3.0  #: a leg may take so many times what it takes at its speed,
-EXTRA_S: Final = 20.0  #: and this more [s]; then the route pauses
-_NEAR_RAD: Final = 0.12
-ENDED: Final = "a failsafe took over on the way: this program sent nothing for a while, or a link was lost"
-TAKEN: Final = "another command of this program took its place"
-PHOTOS: Final = "photos"  #: the folder that photos are saved to where none is named
-LOG: Final = "route"  #: under this name the progress is logged on the drone
-WAYPOINTS: Final = "waypoints"  #: and under this one the places that are left, for maps
-_QUALITY: Final = 92
-_LOG_S: Final = 4.0  #: maps forget places that were logged longer than 10 s ago
+TURN_S: Final = 15.0  #: longest wait for a turn
+PHOTO_S: Final = 5.0  #: longest wait for a photo
+SLOWEST: Final = 3.0  #: a leg may take this many times its duration at full speed
+EXTRA_S: Final = 20.0  #: plus this time; then the route pauses
+_NEAR_RAD: Final = 0.12  # yaw error at which a look is done
+ENDED: Final = "a failsafe took over: this program sent nothing for a while, or a link was lost"
+TAKEN: Final = "another command of this program replaced it"
+PHOTOS: Final = "photos"  #: default folder of photos
+LOG: Final = "route"  #: log name of the progress
+WAYPOINTS: Final = "waypoints"  #: log name of the remaining waypoints, for maps
+_QUALITY: Final = 92  # JPEG quality
+_LOG_S: Final = 4.0  #: maps drop places logged more than 10 s ago
 
 
 class RouteState(StrEnum):
-    """Where a route is."""
+    """The state of a flight along a route."""
 
     READY = "ready"
     FLYING = "flying"  #: to the next waypoint
@@ -66,25 +66,25 @@ class RouteState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Send this to the vehicle, newly."""
+    """Send this action to the vehicle as a new command."""
 
     action: Position | Hover | Land
 
 
 @dataclass(frozen=True, slots=True)
 class TakePhoto:
-    """Save a frame that is captured from now on, then call :meth:`RouteLaw.photo_done`."""
+    """Save a frame captured from now on, then call :meth:`RouteLaw.photo_done`."""
 
-    waypoint: int  #: from 1 on
+    waypoint: int  #: from 1
     camera: str | None
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Something to tell: its kind is ``route.started``, ``route.waypoint_reached``, ``route.paused`` and so on."""
+    """A progress report of kind ``route.started``, ``route.waypoint_reached``, ``route.paused`` and so on."""
 
     kind: str
-    waypoint: int  #: the next, or the present one; from 1 on
+    waypoint: int  #: the next or the current one; from 1
     text: str
 
 
@@ -92,15 +92,15 @@ Effect = Command | TakePhoto | Progress
 
 
 class RouteLaw:
-    """The course of one flight along a route. Its methods return what is to be done now, in this order.
+    """The course of one flight along a route. Its methods return the effects to carry out now, in order.
 
     Args:
         route: The route.
 
     Attributes:
-        state: Where it is.
-        index: The waypoint that is flown to, or that it is at, from 0 on; beyond the last one it flies back.
-        problem: Why it paused by itself; empty if it did not.
+        state: State of the flight.
+        index: The waypoint ahead, or the one it is at, from 0; past the last one on the way back.
+        problem: Why the law paused without a request; empty otherwise.
     """
 
     def __init__(self, route: Route) -> None:
@@ -109,35 +109,35 @@ class RouteLaw:
         self.index = 0
         self.problem = ""
         self._goals: list[RouteWaypoint] = list(route.waypoints)
-        self._step = 0  # the action that is done at the waypoint
-        self._arrived = False  # at the waypoint: its actions have begun
-        self._skipped_all = False  # while paused: what is left is its end
-        self._since_ns: int | None = None  # when the present action began
+        self._step = 0  # index of the waypoint's current action
+        self._arrived = False  # at the waypoint, whose actions have begun
+        self._skipped_all = False  # while paused: only the route's end remains
+        self._since_ns: int | None = None  # start of the current action
         self._deadline_ns: int | None = None
-        self._photo: str | None = None  # what became of the photo: empty for saved; None: not known yet
+        self._photo: str | None = None  # result of the photo: empty if saved; None: pending
 
     @property
     def over(self) -> bool:
-        """Whether nothing comes any more."""
+        """Whether the flight has ended."""
         return self.state in (RouteState.DONE, RouteState.STOPPED)
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it commands the vehicle now."""
+        """Whether the law commands the vehicle now."""
         return self.state in (RouteState.FLYING, RouteState.ACTING)
 
     @property
     def goal(self) -> Waypoint:
-        """Where it flies to, or is."""
+        """The waypoint ahead, or the one it is at."""
         return self._goals[self.index].goal
 
-    # What somebody wants ----------------------------------------------------------------------------------------
+    # Requests ---------------------------------------------------------------------------------------------------
 
     def start(self, feedback: Feedback) -> list[Effect]:
         """Begin at the first waypoint.
 
         Raises:
-            UsageError: The vehicle is on the ground, or its position is not known.
+            UsageError: The vehicle is on the ground, or its position is unknown.
         """
         problem = lacking(feedback)
         if problem or feedback.position_m is None:
@@ -150,14 +150,14 @@ class RouteLaw:
         return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
 
     def pause(self, why: str = "") -> list[Effect]:
-        """Hover until :meth:`resume`; ``why`` is told if it was not a person who asked."""
+        """Hover until :meth:`resume`; ``why`` is the reason if no person requested it."""
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
         return [Command(Hover()), self._tell("paused", why or "as asked")]
 
     def resume(self) -> list[Effect]:
-        """Fly on, straight to the waypoint that comes next; to the route's end if all were left out."""
+        """Continue straight to the next waypoint, or to the route's end if all were skipped."""
         if self.state is not RouteState.PAUSED:
             return []
         if self._skipped_all:
@@ -165,14 +165,14 @@ class RouteLaw:
         return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
 
     def skip(self) -> list[Effect]:
-        """Leave the present waypoint out; a paused route stays paused, also where none is left."""
+        """Skip the current waypoint; a paused route stays paused, even if none remains."""
         if self.over or self.state is RouteState.READY or self._skipped_all:
             return []
-        told = self._tell("skipped", self._what())
-        return [told, *self._next(fly=self.is_under_way)]
+        skipped = self._tell("skipped", self._what())
+        return [skipped, *self._next(fly=self.is_under_way)]
 
     def stop(self) -> list[Effect]:
-        """Hover, and fly no farther."""
+        """Hover and end the route."""
         if self.over:
             return []
         under_way = self.is_under_way
@@ -180,16 +180,16 @@ class RouteLaw:
         return [*([Command(Hover())] if under_way else []), self._tell("stopped", "as asked")]
 
     def photo_done(self, problem: str = "") -> None:
-        """Tell what became of the photo; may be called from any thread."""
+        """Report the result of the photo; can be called from any thread."""
         self._photo = problem
 
-    # What the vehicle does --------------------------------------------------------------------------------------
+    # The vehicle's progress ---------------------------------------------------------------------------------------
 
     def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Go on, by the newest feedback.
+        """Take the next step, by the newest feedback.
 
         Args:
-            feedback: The newest.
+            feedback: The newest feedback.
             now_ns: The time, on the clock of ``feedback.captured_ns``.
         """
         if not self.is_under_way:
@@ -198,7 +198,7 @@ class RouteLaw:
             self.state, self.problem = RouteState.STOPPED, f"the vehicle is {feedback.state.value}"
             return [self._tell("stopped", self.problem)]
         if lacking(feedback):
-            return []  # the proxy lets it hover meanwhile
+            return []  # the proxy hovers the vehicle meanwhile
         if self.state is RouteState.FLYING:
             return self._on_the_way(feedback, now_ns)
         return self._act(feedback, now_ns)
@@ -215,11 +215,11 @@ class RouteLaw:
             return self.pause(f"{self._what()} was not reached in time")
         first, self._arrived = not self._arrived, True
         self.state, self._since_ns = RouteState.ACTING, None
-        told = [self._tell("waypoint_reached", self._what())] if first else []
-        return [*told, *self._act(feedback, now_ns)]
+        arrived = [self._tell("waypoint_reached", self._what())] if first else []
+        return [*arrived, *self._act(feedback, now_ns)]
 
     def _act(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Do the actions of the waypoint, one after the other."""
+        """Do the actions of the waypoint in turn."""
         effects: list[Effect] = []
         while self._step < len(self._actions):
             action = self._actions[self._step]
@@ -248,7 +248,7 @@ class RouteLaw:
         return []
 
     def _done(self, action: Action, feedback: Feedback, for_s: float) -> tuple[bool, str]:
-        """Whether an action is done, and what went wrong with it."""
+        """Return whether an action is done, and its problem."""
         if isinstance(action, Wait):
             return for_s >= action.seconds, ""
         if isinstance(action, Look):
@@ -256,7 +256,7 @@ class RouteLaw:
             return (True, "") if left <= _NEAR_RAD else (for_s > TURN_S, "the turn took too long")
         if self._photo is not None:
             return True, self._photo
-        return for_s > PHOTO_S, "no frame came in time"
+        return for_s > PHOTO_S, "no frame arrived in time"
 
     def _yaw(self, look: Look) -> float:
         return self._goals[self.index].yaw_to(look.at) if look.at is not None else look.yaw or 0.0
@@ -291,17 +291,17 @@ def _name(action: Action) -> str:
 
 
 class FlyRoute(Controller):
-    """Flies along a route, does what is to be done at its waypoints, and returns from :meth:`run` at its end.
+    """Flies along a route and does the actions at its waypoints; :meth:`run` returns at the route's end.
 
     The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
-    ``data["route"]`` as ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg, or a
-    failsafe or another command of this program ends it, the route pauses with the reason, and :meth:`resume` goes on.
-    :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the
+    ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg,
+    or a failsafe or another command of this program ends it, the route pauses with the reason until :meth:`resume`.
+    :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` can be called from any thread; they take effect with the
     next feedback.
 
     Attributes:
         law: The course: its state, waypoint and problem.
-        photos: What was saved.
+        photos: Paths of the saved photos.
     """
 
     def __init__(
@@ -317,7 +317,7 @@ class FlyRoute(Controller):
         Args:
             drone: The drone to fly.
             route: The route; check it first (:meth:`check`).
-            folder: Where photos are saved; made when it is needed.
+            folder: Folder of photos; created when needed.
             on_progress: Called with each step, on the thread that runs the controller.
         """
         super().__init__(drone)
@@ -326,11 +326,11 @@ class FlyRoute(Controller):
         self._folder = Path(folder)
         self._on_progress = on_progress
         self._asked: list[Callable[[], list[Effect]]] = []
-        self._leg: int | None = None  # number of the intent that flies the present one
+        self._leg: int | None = None  # intent that flies the current leg
         self._logged_ns: int | None = None
 
     def check(self) -> RouteCheck:
-        """Return what speaks against the route now, by the drone's newest feedback and its parameters."""
+        """Check the route against the drone's newest feedback and its parameters."""
         return check_for(self.drone, self.law.route)
 
     def pause(self) -> None:
@@ -338,22 +338,22 @@ class FlyRoute(Controller):
         self._asked.append(self.law.pause)
 
     def resume(self) -> None:
-        """Fly on to the waypoint that comes next."""
+        """Continue to the next waypoint."""
         self._asked.append(self.law.resume)
 
     def skip(self) -> None:
-        """Leave the present waypoint out."""
+        """Skip the current waypoint."""
         self._asked.append(self.law.skip)
 
     def end(self) -> None:
-        """Hover, and return from :meth:`run`."""
+        """Hover and return from :meth:`run`."""
         self._asked.append(self.law.stop)
 
     def on_feedback(self, feedback: Feedback) -> None:
         """Take the next step.
 
         Raises:
-            UsageError: The route has not begun, and the vehicle does not report its position or is on the ground.
+            UsageError: Before the start, the vehicle does not report its position or is on the ground.
         """
         law = self.law
         if law.state is RouteState.READY:
@@ -362,7 +362,7 @@ class FlyRoute(Controller):
             self._carry_out(self._asked.pop(0)())
         if refused := self._why_ended():
             effects = law.pause(refused)
-            if refused == TAKEN:  # which goes on, in place of a hover
+            if refused == TAKEN:  # the other command continues, so don't hover
                 effects = [each for each in effects if not isinstance(each, Command)]
             self._carry_out(effects)
         self._carry_out(law.update(feedback, feedback.captured_ns))
@@ -378,7 +378,7 @@ class FlyRoute(Controller):
                 self._leg = None
                 if isinstance(effect.action, Position):
                     self._leg = ask(self.drone, effect.action)
-                else:  # it hovers or lands because of how the route goes, not of a person
+                else:  # the route, not a person, makes it hover or land
                     let_go(self.drone, f"the route is {self.law.state.value}", land=isinstance(effect.action, Land))
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
@@ -396,7 +396,7 @@ class FlyRoute(Controller):
     def _tell(self, step: Progress) -> None:
         text = f"{step.kind}: {step.text}"
         bad = step.kind == "route.paused" and bool(self.law.problem)
-        self._logged_ns = None  # what is left has changed
+        self._logged_ns = None  # the remaining waypoints have changed
         severity = Severity.WARNING if bad else Severity.INFO
         self.drone.emit(EventKind.VEHICLE_MESSAGE, text, severity, route=step.kind, waypoint=str(step.waypoint))
         self.drone.log.text(text, name=LOG)
@@ -404,7 +404,7 @@ class FlyRoute(Controller):
             self._on_progress(step)
 
     def _why_ended(self) -> str:
-        """Return why the present leg is not flown any more, once; empty if it is."""
+        """Return why the current leg ended early, once; empty while it is flown."""
         flown = commands(self.drone)
         outcome = None if self._leg is None else flown.outcome(self._leg)
         if outcome is None or not outcome.failed or not flown.may_ask:
@@ -416,10 +416,10 @@ class FlyRoute(Controller):
 
 
 def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
-    """Save the next frame as a JPEG named by the time, the waypoint and the camera. Waits for it.
+    """Wait for the next frame and save it as a JPEG named by time, waypoint and camera.
 
     Raises:
-        SkyloopError: No frame came in time, the vehicle has no such camera, or the file can't be written.
+        SkyloopError: No frame arrived in time, the vehicle has no such camera, or the file can't be written.
     """
     camera = wanted.camera or next((info.name for info in drone.capabilities.cameras), None)
     if camera is None:
@@ -428,15 +428,15 @@ def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
     cv2 = opencv("saving photos")
     done, jpeg = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
     if not done:
-        raise UsageError(f"frame {frame.seq} of {camera} could not be made a JPEG")
+        raise UsageError(f"frame {frame.seq} of {camera} can't be encoded as a JPEG")
     moment = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S.%f")[:-3]
     name = f"waypoint{wanted.waypoint}-{camera}.jpg"
     path, number = folder / f"{moment}-{name}", 1
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{folder} can't be made: {error.strerror or error}") from None
-    while path.exists():  # of the same moment, as after a clock was set back
+        raise UsageError(f"{folder} can't be created: {error.strerror or error}") from None
+    while path.exists():  # same time, for example after the clock was set back
         number += 1
         path = folder / f"{moment}-{number}-{name}"
     write(path, jpeg.tobytes())

@@ -1,13 +1,13 @@
-"""Where a thing is, how it moves and how large it is, from its box in images. Pure: times are on the proxy's clock.
+"""Estimate a target's position, motion and size from its box in images. Pure: times are on the proxy's clock.
 
 An extended Kalman filter (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
-Wiley 2001, section 10.3) of the place where the thing stands, its horizontal velocity, the height of its foot and the
-logarithm of its height. Each box gives an azimuth and the slopes to the lower and the upper edge. So the range comes
-from all there is, with an uncertainty to go by: from the known size of a class or a thing, from the ground that it
-stands on where the vehicle knows its own height, and from the vehicle's motion, as what is near grows faster. Where
-none of these is known, the range at the start is taken to be a nominal one, and all ranges scale with it: the law then
-keeps the apparent size, as in image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based
-GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 2013).
+Wiley 2001, section 10.3) of the position of the target's foot, its horizontal velocity, the foot's height and the
+logarithm of the target's height. Each box gives an azimuth and the slopes to its lower and upper edge. The range comes,
+with an uncertainty, from all available cues: the known size of a class or target; the ground that it stands on, if the
+vehicle knows its own height; and the vehicle's motion, because near things grow faster. Without any cue, the initial
+range is a nominal one, and all ranges scale with it: the law then keeps the apparent size, as in image-based following
+(Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object tracking and following for unmanned
+aerial vehicles", SSRR 2013).
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
 
-_NEAREST_M: Final = 0.3
-_RECKONING_M2_S3: Final = 0.5  # intensity of dead reckoning's error: gusts, and a drag other than the assumed one
-_LATE_S: Final = 0.5  # a box that is later than this is of no use
-_ADAPTING: Final = 0.3  # of the surprise, by one box
-_USUAL: Final = 1.5  # surprise that is taken for noise
-_MOST_SURPRISE: Final = 4.0
-_STRAIGHT_S: Final = 4.0  # nothing unseen is thought to go straight on for longer
-_GONE_S: Final = 0.2  # a thing that was not seen for longer, and for more images than one or two, is hidden
-_GONE_INTERVALS: Final = 2.5
-_BEFORE_S: Final = 0.2  # before it was seen last: what hid it had not begun to cut its box off then
-_GATE: Final = 4.0  # standard deviations, of the azimuth
-_EDGE_GATE: Final = 3.0  # of an edge: a farther one is hidden by something, or the image of something else
-_OUTGROWN: Final = 3.0  # standard deviations of both edges, outwards
-_PACE_PER_S: Final = 0.2  # deviation of a velocity, by a range that is only a guess
-LEAST_SLOPE: Final = 0.04  # of an edge, below which its height says nothing about the range
-SURE_OF_SIZE: Final = 0.4  # deviation of the logarithm of the height, from which on it counts as unknown
+_NEAREST_M: Final = 0.3  # least range
+_RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning: gusts, and a wrong drag constant
+_LATE_S: Final = 0.5  # later boxes are useless
+_ADAPTING: Final = 0.3  # weight of one box in the average surprise
+_USUAL: Final = 1.5  # surprise up to this counts as noise
+_MOST_SURPRISE: Final = 4.0  # limit of a single box in the average
+_STRAIGHT_S: Final = 4.0  # longest straight prediction of an unseen target
+_GONE_S: Final = 0.2  # a target unseen for longer, and for more than one or two images, is hidden
+_GONE_INTERVALS: Final = 2.5  # ... measured in intervals between boxes
+_BEFORE_S: Final = 0.2  # this long before the last sighting, the occluder had not begun to cut off the box
+_GATE: Final = 4.0  # standard deviations of the azimuth
+_EDGE_GATE: Final = 3.0  # standard deviations of an edge: beyond it the edge is hidden or belongs to another thing
+_OUTGROWN: Final = 3.0  # standard deviations by which both edges lie outside
+_PACE_PER_S: Final = 0.2  # velocity deviation per metre of a guessed range
+LEAST_SLOPE: Final = 0.04  # below this slope an edge's height says nothing about the range
+SURE_OF_SIZE: Final = 0.4  # deviation of the log height from which the size counts as unknown
 
 
 def _is_number(value: object) -> bool:
@@ -52,15 +52,15 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """What is known beforehand of a kind of thing.
+    """Prior knowledge about a kind of target.
 
     Attributes:
-        height_m: How high it is; None: not known.
-        height_share: Standard deviation of that, as a share of it.
-        radius_m: From its middle to where its lower edge is seen.
-        intensity_m2_s3: Of the random acceleration: within a second the velocity wanders by the root of it.
-        on_ground: Whether it stands on the ground. None: what has a class is taken to; of anything else that is one
-            guess among others (:mod:`.target_range`).
+        height_m: Height; None: unknown.
+        height_share: Standard deviation of the height, as a share of it.
+        radius_m: Distance from its middle to its visible lower edge.
+        intensity_m2_s3: Intensity of the random acceleration: within a second the velocity wanders by its root.
+        on_ground: Whether it stands on the ground. None: assumed for a target with a class; for others one hypothesis
+            among several (:mod:`.target_range`).
 
     Raises:
         UsageError: A number is out of its range.
@@ -81,7 +81,7 @@ class Traits:
                 raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
 
 
-#: By the name of a class. Heights of people and cars vary by about this much; a bus is no car.
+#: Traits by class name, with the typical spread of heights; a bus is not a car.
 TRAITS: Final = {
     "person": Traits(height_m=1.74, height_share=0.06, radius_m=0.25, intensity_m2_s3=0.6),
     "car": Traits(height_m=1.45, height_share=0.2, radius_m=1.2, intensity_m2_s3=3.0),
@@ -91,23 +91,23 @@ TRAITS: Final = {
     "dog": Traits(height_m=0.55, height_share=0.4, radius_m=0.2, intensity_m2_s3=2.0),
     "box": Traits(radius_m=0.3, intensity_m2_s3=0.05),
 }
-UNKNOWN: Final = Traits(radius_m=0.1)  #: of what has no class
+UNKNOWN: Final = Traits(radius_m=0.1)  #: a target without a class
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """A target at one time.
+    """The state of a target at one time.
 
     Attributes:
         at_ns: On the proxy's clock.
-        foot: Where it stands, (3,) [m]: odometry axes, the third above the ground.
-        velocity: Horizontal, (2,) [m/s]; through the air, where the vehicle does not report its own.
-        height_m: How high it is.
-        place_m: Standard deviation of its place: the root of the sum of its horizontal variances.
+        foot: Position of its foot, (3,) [m]: odometry axes, the third above the ground.
+        velocity: Horizontal velocity, (2,) [m/s]; through the air if the vehicle does not report its own.
+        height_m: Its height.
+        place_m: Standard deviation of its position: the root of the summed horizontal variances.
         range_m: Horizontal distance from the camera that saw it last.
         range_deviation_m: Standard deviation along the line of sight.
-        range_known: Whether the range is good enough to fly by; False while nothing but a guess tells it.
-        margin_m: How much nearer it may be, for which a vehicle stays farther off; 0 for a target on the ground.
+        range_known: Whether the range is good enough to fly by; False while it is only a guess.
+        margin_m: Extra distance to keep, because the target may be nearer; 0 for a target on the ground.
     """
 
     at_ns: int
@@ -122,7 +122,7 @@ class TargetState:
 
     @property
     def middle(self) -> Array:
-        """Its middle, (3,) [m]."""
+        """The target's middle, (3,) [m]."""
         return np.add(self.foot, (0.0, 0.0, self.height_m / 2))
 
 
@@ -133,22 +133,22 @@ class _Estimate(NamedTuple):
 
 
 class TargetEstimator:
-    """The filter of one thing.
+    """The filter of one target.
 
     Attributes:
-        traits: What was known beforehand.
-        refused: Boxes in a row that did not fit.
-        seen_ns: Capture of the last box that fitted; None before :meth:`start`.
+        traits: Prior knowledge.
+        refused: Consecutive boxes that did not fit.
+        seen_ns: Capture of the last box that fit; None before :meth:`start`.
     """
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
         """Initialise the filter.
 
         Args:
-            traits: What is known of the thing.
-            nominal_m: Its distance at the start where nothing tells it.
-            relative: Whether the vehicle's own velocity is known by dead reckoning only, whose changing error adds to
-                the thing's motion.
+            traits: Prior knowledge about the target.
+            nominal_m: Assumed initial distance if there is no cue.
+            relative: Whether the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
+                target's motion.
         """
         self.traits = traits
         self.refused = 0
@@ -158,18 +158,18 @@ class TargetEstimator:
         self._at_ns = 0
         self._state = np.zeros(6)  # x, y, velocities, foot's height, log of the height
         self._covariance = np.eye(6)
-        self._surprise = 1.0  # of late: the squared Mahalanobis distance of an azimuth and a size, about 1
-        self._eye: Array = np.zeros(3)  # of the camera that saw it last
-        self._before: deque[_Estimate] = deque()  # of the boxes before, as far back as _BEFORE_S
-        self._interval_s = 0.0  # between the last two boxes
+        self._surprise = 1.0  # recent mean of the squared Mahalanobis distance of azimuth and size, about 1
+        self._eye: Array = np.zeros(3)  # position of the camera that saw it last
+        self._before: deque[_Estimate] = deque()  # estimates of earlier boxes, back to _BEFORE_S
+        self._interval_s = 0.0  # time between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
         """Start from the first box.
 
         Args:
-            view: What the box shows.
-            camera: That took the image.
-            at_ns: Its capture.
+            view: Directions of the box.
+            camera: The camera that took the image.
+            at_ns: Capture of the image.
             ground: Whether the camera's height above the ground is known.
         """
         traits, height = self.traits, float(camera.position[2])
@@ -182,7 +182,7 @@ class TargetEstimator:
             slopes = max(1e-3, view.top - view.bottom)
             guesses.append((traits.height_m / slopes, math.hypot(traits.height_share, 1.5 * view.edge / slopes)))
         if ground and traits.height_m is not None and view.top is not None and abs(view.top) > LEAST_SLOPE:
-            above = traits.height_m - height  # of the camera
+            above = traits.height_m - height  # height of the target's top above the camera
             share = math.hypot(traits.height_share * traits.height_m / max(0.05, abs(above)), view.edge / abs(view.top))
             if above / view.top > 0.0:
                 guesses.append((above / view.top, share + view.tilt / abs(view.top)))
@@ -206,20 +206,20 @@ class TargetEstimator:
         covariance[2:4, 2:4] = np.eye(2) * (1.0 if self._intensity < 3.0 else 4.0)
         covariance[4, 4] = 0.05**2 if ground else (0.1 * distance) ** 2
         covariance[5, 5] = log_deviation**2
-        if not known:  # what is farther than it was taken to be is larger, too
+        if not known:  # a target further away than assumed is also larger
             covariance[:2, 5] = covariance[5, :2] = radial / distance * along
             covariance[5, 5] += share**2
         self._begin(self._state, covariance, camera, at_ns)
 
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
-        """Start from the first box, at a range that is only a guess: wherever the thing is, its box is as it is.
+        """Start from the first box at a guessed range, with the size that explains the box.
 
         Args:
-            distance_m: The range; foot and height go along with it.
-            share: Standard deviation of that, as a share of it.
-            view: What the box shows.
-            camera: That took the image.
-            at_ns: Its capture.
+            distance_m: The range; foot and height scale with it.
+            share: Standard deviation of the range, as a share of it.
+            view: Directions of the box.
+            camera: The camera that took the image.
+            at_ns: Capture of the image.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -237,12 +237,12 @@ class TargetEstimator:
         self.loosen(distance_m)
 
     def loosen(self, distance_m: float) -> None:
-        """Count on a faster target the farther it is, directly after the start.
+        """Right after the start, assume a target faster in proportion to its range.
 
-        Else the likelihood of boxes that hardly move would speak for the farthest of several guesses.
+        Otherwise boxes that hardly move would favour the farthest of several guesses.
 
         Args:
-            distance_m: The range that is guessed.
+            distance_m: The guessed range.
         """
         pace = _PACE_PER_S * distance_m
         self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
@@ -257,13 +257,12 @@ class TargetEstimator:
         self._remember(at_ns)
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
-        """Return how badly a box fits.
+        """Measure how badly a box fits.
 
         Returns:
-            The squared Mahalanobis distance divided by the number of what was measured, which is about 1 for its own
-            boxes; and the negative logarithm of its likelihood, up to what all filters have in common for this box.
-            Both are infinite for a box that is too large above and below: something may hide a part of a thing, but
-            add nothing to it.
+            The squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own boxes;
+            and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are infinite
+            for a box that is too large above and below: occlusion hides parts of a target but never adds any.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
@@ -277,21 +276,21 @@ class TargetEstimator:
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
         """Update with a box.
 
-        An edge far from where it is expected is left out: something hides it. A box in another direction is refused.
+        An edge far from its expected position is ignored as hidden. A box in another direction is refused.
 
         Args:
-            view: What the box shows.
-            camera: That took the image.
-            at_ns: Its capture.
+            view: Directions of the box.
+            camera: The camera that took the image.
+            at_ns: Capture of the image.
 
         Returns:
-            Whether the box was used; False also for one that is more than half a second older than the newest.
+            Whether the box was used; False also for a box more than half a second older than the newest.
 
         Raises:
             UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
-            raise UsageError("the target was never seen: call start() with its first box")
+            raise UsageError("no target yet: call start() with its first box")
         late_s = max(0.0, seconds(self._at_ns - at_ns))
         if late_s > _LATE_S:
             return False
@@ -316,9 +315,9 @@ class TargetEstimator:
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state. It is not moved on for more than four seconds, but ever less certain.
+        """Predict the target's state: it moves for at most four seconds, while the uncertainty keeps growing.
 
-        A thing that is hidden goes on as it went shortly before it was: what hides it cuts off its last boxes.
+        A hidden target keeps its motion from shortly before: the occluder cuts off its last boxes.
 
         Args:
             at_ns: The time to predict for.
@@ -327,7 +326,7 @@ class TargetEstimator:
             UsageError: :meth:`start` was not called.
         """
         if self.seen_ns is None:
-            raise UsageError("the target was never seen: call start() with its first box")
+            raise UsageError("no target yet: call start() with its first box")
         state, covariance = self._predict(at_ns)
         away = state[:2] - self._eye[:2]
         distance = max(_NEAREST_M, float(np.hypot(*away)))
@@ -344,14 +343,14 @@ class TargetEstimator:
         )
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return a filter, not started yet, for the same thing where it comes into view again."""
+        """Return a filter, not started yet, for the same target when it comes back into view."""
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
         """Return state and covariance at a time.
 
-        Shortly before the newest box, as detections of other processes come, the state is moved back and the covariance
-        kept.
+        For a time shortly before the newest box (detections from other processes arrive late) the state moves back and
+        the covariance stays.
         """
         dt = seconds(at_ns - self._at_ns)
         if dt <= 0.0:
@@ -362,7 +361,7 @@ class TargetEstimator:
         else:
             from_state, from_covariance = self._state, self._covariance
         move, wander = np.eye(6), np.zeros((6, 6))
-        # A thing that turns surprises the filter again and again: it is believed to turn harder then.
+        # A turning target keeps surprising the filter, so raise its assumed acceleration.
         harder = max(1.0, self._surprise / _USUAL) ** 2
         move[:4, :4], wander[:4, :4] = drift(dt, self._intensity * harder, axes=2)
         wander[4, 4] = 0.02**2 * dt
@@ -383,7 +382,7 @@ def _moved(state: Array, dt_s: float) -> Array:
 
 
 def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) -> tuple[Array, Array, Array]:
-    """Return measured minus expected, its derivative by the state, and the noise's covariance; azimuth first."""
+    """Return measured minus expected, its derivative by the state, and the noise covariance; azimuth first."""
     eye = camera.position
     dx, dy = float(state[0] - eye[0]), float(state[1] - eye[1])
     distance = max(_NEAREST_M, math.hypot(dx, dy))
@@ -400,7 +399,7 @@ def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) ->
     ):
         expected = (level - float(eye[2])) / away
         if slope is None and bound is not None and side * (expected - bound) < 0.0:
-            slope = bound  # it would be seen: so it is at least as near
+            slope = bound  # otherwise the edge would be visible, so it is at least this near
         if slope is None:
             continue
         rows.append(slope - expected)

@@ -1,9 +1,9 @@
-"""Finds one target in image after image: a tracker of its box, and, where there is a detector, its detections.
+"""Find one target in a series of images, by a box tracker and, if there is a detector, by detections.
 
 No drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows the
-target's looks, the scene (:mod:`.target_scene`) where everything is and how it moves. Either finds the target where the
-other does not, and neither may take something else for it: what the tracker returns must be where the target can be,
-and a thing that comes into view after a loss must be where the target can be, look like it, and be the only such one.
+target's appearance; the scene (:mod:`.target_scene`) knows where everything is and how it moves. Each finds the target
+where the other fails, and neither may mistake something else for it: the tracker's box must be where the target can be,
+and a thing that appears after a loss must be where the target can be, look like it, and be the only such thing.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from skyloop.vision.appearance import colours
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, overlap_area
 
-_SAME: Final = 0.4  # overlap of two boxes of one thing
-_POINTED_AT: Final = 0.3  # of the user's box with a detection
-_TRACKER_NOISE: Final = 0.06  # of the edges of its boxes, as a share of their height: less sharp than a detector's
-_BESIDE_LATE: Final = 0.25  # the same where late detections tell the size, which the tracker gets wrong in the long run
-_TAKEN: Final = 0.5  # share of the tracker's box that is within another thing's detection
-_FITS: Final = 12.0  # squared Mahalanobis distance by what was measured, up to which a box can be the target's
-_DOUBT: Final = 6  # images in a row in which the tracker's box is not where the target can be
-_LATELY_S: Final = 1.0  # others are kept clear of for so long after they were seen
-_DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
-_SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
-_LOOKED_AT: Final = 5  # images that are needed for that
-_LOOKED_AT_IN_DOUBT: Final = 10  # until it is known how a newcomer moves
-_LOOKED_AT_LONGEST: Final = 20  # who was not taken for the target by then is not looked at any more
-_OF_LATE: Final = 8  # images that the mean is mostly of
-_TWIN: Final = 0.6  # unlikeness of another thing, up to which nothing but place and motion tells it from the target
-_TWIN_S: Final = 60.0  # since a twin was seen beside the target: a newcomer may be it
-_TWIN_OFF_M: Final = 1.0  # how far a newcomer may then be from where the target should be, and how much faster
-_TWIN_OFF_M_S: Final = 0.5
-_OTHER_WAY_M_S: Final = 2.2  # between the velocities of a newcomer and of the target before it was hidden
-_GOES_ON_S: Final = 6.0  # so long is it believed to have kept its direction
-_CLEARLY: Final = 1.0  # by which any other newcomer must be more unlike
-_FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
-_KEPT_FRAMES: Final = 12  # for detections that come later than their frames
+_SAME: Final = 0.4  # overlap from which two boxes show the same thing
+_POINTED_AT: Final = 0.3  # overlap of the user's box with the detection that it selects
+_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges, as a share of the box height; a detector's are sharper
+_BESIDE_LATE: Final = 0.25  # the same while late detections give the size, which the tracker gets wrong in the long run
+_TAKEN: Final = 0.5  # share of the tracker's box inside another thing's detection
+_FITS: Final = 12.0  # squared Mahalanobis distance per measurement up to which a box can be the target's
+_DOUBT: Final = 6  # consecutive images with the tracker's box where the target can't be
+_LATELY_S: Final = 1.0  # keep clear of others for this long after they were seen
+_DORMANT_S: Final = 1.0  # after this long unseen, the target must be recognised again
+_SIMILAR: Final = 1.6  # mean colour unlikeness up to which a newcomer may be the target
+_LOOKED_AT: Final = 5  # images needed to judge a newcomer
+_LOOKED_AT_IN_DOUBT: Final = 10  # images needed if in doubt: its motion must be known
+_LOOKED_AT_LONGEST: Final = 20  # after this many images a rejected newcomer is no longer considered
+_OF_LATE: Final = 8  # images that dominate the mean
+_TWIN: Final = 0.6  # unlikeness up to which only place and motion distinguish another thing from the target
+_TWIN_S: Final = 60.0  # for this long after a twin was seen, a newcomer may be the twin
+_TWIN_OFF_M: Final = 1.0  # then a newcomer may be this far from the target's expected place ...
+_TWIN_OFF_M_S: Final = 0.5  # ... and differ this much in velocity
+_OTHER_WAY_M_S: Final = 2.2  # greatest difference between a newcomer's velocity and the target's before it was hidden
+_GOES_ON_S: Final = 6.0  # for this long a hidden target is assumed to keep its direction
+_CLEARLY: Final = 1.0  # margin by which every other newcomer must be more unlike
+_FAST_M_S: Final = 4.0  # greatest assumed speed of an unseen thing
+_KEPT_FRAMES: Final = 12  # frames kept for detections that arrive late
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """What was found in one image."""
+    """The result of searching one image."""
 
     box: Box | None  #: x, y, width, height [px]; None: the target was not found
-    confidence: float | None  #: 0 to 1: of the tracker's box its chance to be right, of a detection its score
-    contested: bool = False  #: the target may be in view, but something else may be what was seen
+    confidence: float | None  #: 0 to 1: the tracker's chance to be right, or a detection's score
+    contested: bool = False  #: the target may be in view, but the sighting may be of something else
 
 
 @dataclass(slots=True, eq=False)
@@ -64,16 +64,16 @@ class _Seen:
     image: Image
     camera: Camera
     captured_ns: int
-    box: Box | None = None  # in which the target was found
+    box: Box | None = None  # box of the target
 
 
 class TargetFinder:
-    """Keeps one target.
+    """Finds one target in image after image.
 
     Attributes:
-        estimator: Where the target is; None before it was seen.
-        class_name: Of the target, as far as it is known.
-        detections: Of the newest image that was searched by a detector.
+        estimator: The target's motion; None before the first sighting.
+        class_name: Class of the target, if known.
+        detections: Detections in the newest image searched by a detector.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class TargetFinder:
 
         Args:
             box: The target in the first image: x, y, width, height [px].
-            class_name: Whose largest detection is the target if there is no box; with a box, what it must be.
-            traits: Of the target; None: those of its class.
-            nominal_m: Its distance at the start where nothing tells it.
+            class_name: Without a box, the largest detection of this class is the target; with a box, its class.
+            traits: Traits of the target; None: those of its class.
+            nominal_m: Assumed initial distance if there is no cue.
             relative: Whether the vehicle does not know its own velocity.
 
         Raises:
@@ -109,14 +109,14 @@ class TargetFinder:
         self._tracker = LongTermTracker()
         self._tracking, self._tracker_noise = False, _TRACKER_NOISE
         self._scene: Scene | None = None
-        self._number: int | None = None  # of the target in the scene
+        self._number: int | None = None  # the target's number in the scene
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
-        self._middle: tuple[float, float] | None = None  # where the target should be in the newest image [px]
+        self._middle: tuple[float, float] | None = None  # expected position of the target in the newest image [px]
         self._doubts = 0
-        self._twin_ns: int | None = None  # when another thing that looks like the target was seen beside it
-        self._newcomers: dict[int, tuple[int, float]] = {}  # images of them, and mean unlikeness to the target
+        self._twin_ns: int | None = None  # last sighting of a look-alike beside the target
+        self._newcomers: dict[int, tuple[int, float]] = {}  # number of images, and mean unlikeness to the target
         self._ground = False  # whether the camera's height above the ground is known in the newest image
-        self._agreed = 0  # images in a row in which tracker and a detection agree
+        self._agreed = 0  # consecutive images in which tracker and detection agree
 
     def see(
         self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
@@ -124,11 +124,11 @@ class TargetFinder:
         """Find the target in the next image.
 
         Args:
-            image: A :class:`skyloop.Frame` or array as trackers take it.
-            camera: That took it.
-            captured_ns: Its capture, on the proxy's clock.
+            image: A :class:`skyloop.Frame` or an array, as for trackers.
+            camera: The camera that took it.
+            captured_ns: Capture of the image, on the proxy's clock.
             ground: Whether the camera's height above the ground is known.
-            detections: What a detector found in it; None: it was not searched.
+            detections: Detections in it; None: it was not searched.
 
         Raises:
             UsageError: The first box does not fit into the image.
@@ -155,10 +155,10 @@ class TargetFinder:
         return sighting
 
     def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> bool:
-        """Use detections that come later than their image; return whether they show the target, or may show it.
+        """Use detections that arrive after their image; return whether they show, or may show, the target.
 
-        Where the tracker did not find the target in that image, or elsewhere, it goes on from there. Of an image that
-        is none of the last that were given to :meth:`see` they are ignored.
+        If the tracker missed the target in that image, or found it elsewhere, it restarts from there. Detections of an
+        image that is not among the last ones given to :meth:`see` are ignored.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
@@ -170,7 +170,7 @@ class TargetFinder:
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
-            # Who it is is known without the tracker: looks by which it did not know the target again help nobody.
+            # The target is identified without the tracker, whose model failed to recognise it: drop that model.
             self._tracking = self._tracking and frame.box is not None
             self._resume(frame.image, target.detection.box)
             # The tracker's next step begins in that image, not in the newest.
@@ -179,11 +179,11 @@ class TargetFinder:
 
     @property
     def target(self) -> SceneObject | None:
-        """The target among the detected things; None where no detector knows it."""
+        """The target among the detected things; None if no detector knows it."""
         return None if self._scene is None or self._number is None else self._scene.objects.get(self._number)
 
     def candidate(self, at_ns: int) -> TargetState | None:
-        """Where somebody is who was seen lately and may be the lost target: worth a closer look."""
+        """Return the state of a recently seen thing that may be the lost target and is worth a closer look."""
         scene, found = self._scene, None
         if scene is None or self._number not in scene.dormant:
             return None
@@ -196,7 +196,7 @@ class TargetFinder:
         return None if found is None else found[1].estimator.at(at_ns)
 
     def others(self, at_ns: int) -> list[TargetState]:
-        """Where people and other things are that were detected in the last second, without the target."""
+        """Return the states of things detected in the last second, without the target."""
         if self._scene is None:
             return []
         return [
@@ -219,12 +219,12 @@ class TargetFinder:
         traits = self._given or TRAITS.get(self.class_name or "")
         view = BoxView.of(box, camera, _TRACKER_NOISE)
         if view is None:
-            raise UsageError("the box is straight above or below the vehicle, where it has no bearing: turn or move")
+            raise UsageError("the box is straight above or below the vehicle and has no bearing: turn or move")
         self.estimator = estimator_of(self.class_name, traits, nominal_m=self._nominal_m, relative=self._relative)
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
     def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
-        """Say where the target is in this image, by its detection in it or by the tracker."""
+        """Decide where the target is in this image, by its detection or by the tracker."""
         target, estimator = self.target, self.estimator
         if estimator is None:
             return Sighting(None, None)
@@ -235,7 +235,7 @@ class TargetFinder:
                 self._resume(image, box)
             return Sighting(box, tracked.confidence if agrees else target.detection.score)
         contested = target is not None and target.contested
-        # Which of two the tracker stayed with while they were one is not known.
+        # It is unknown which of two things the tracker stayed with while they were one.
         unsure = target is not None and target.contested_ns > (target.estimator.seen_ns or 0)
         if tracked.box is None or unsure or self._is_taken(tracked.box):
             return Sighting(None, None, contested)
@@ -247,7 +247,7 @@ class TargetFinder:
         view = BoxView.of(box, camera, self._tracker_noise)
         if view is None or estimator.seen_ns is None:
             return Sighting(None, None)
-        if estimator.seen_ns == captured_ns:  # the box that it was started with
+        if estimator.seen_ns == captured_ns:  # the initial box
             return Sighting(box, tracked.confidence)
         fit, _ = estimator.distance(view, camera, captured_ns)
         if fit > _FITS and not self._is_within_reach(view, camera, captured_ns, estimator):
@@ -262,7 +262,7 @@ class TargetFinder:
         return Sighting(box, tracked.confidence)
 
     def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
-        """Whether an unseen target may have gone to where the tracker recognised it; it is taken to be there then."""
+        """Return whether an unseen target can have reached the tracker's box; if so, move the estimate there."""
         assert estimator.seen_ns is not None
         unseen_s = seconds(captured_ns - estimator.seen_ns)
         if unseen_s < _DORMANT_S or self._number is not None:
@@ -277,10 +277,10 @@ class TargetFinder:
         return True
 
     def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
-        """Whether the tracker's box may be the target's, as far as the detector says.
+        """Return whether the tracker's box may be the target's, according to the detector.
 
-        A tracker goes on to see what hides the target: of a target that the detector knows, it is believed between the
-        images that are searched, for a second.
+        A tracker may continue on whatever hides the target. For a target that the detector knows, trust the tracker
+        only between searched images, for a second.
         """
         target, scene = self.target, self._scene
         if box is None or target is None or scene is None or target.seen:
@@ -290,7 +290,7 @@ class TargetFinder:
         return detections is None or any(overlap(one.box, box) >= _SAME for one in detections)
 
     def _is_taken(self, box: Box) -> bool:
-        """Whether the box is that of another thing, by its detection in this image."""
+        """Return whether the box belongs to another thing, by that thing's detection in this image."""
         if self._scene is None or self._number is None:
             return False
         now, taken = self._frames[-1].captured_ns, _TAKEN * box[2] * box[3]
@@ -326,7 +326,7 @@ class TargetFinder:
         if target is not None:
             if target.seen and self._is_unsure(scene, target):
                 target.estimator = self._learning(target, frame, back=True)
-            self.estimator = target.estimator  # two that had been taken for each other may have been exchanged
+            self.estimator = target.estimator  # two confused things may have been exchanged
         if target is None:
             self._choose(scene, frame, tracked)
         elif target.number in scene.dormant:
@@ -336,7 +336,7 @@ class TargetFinder:
             self._note_twins(scene, target, frame.captured_ns)
 
     def _choose(self, scene: Scene, frame: _Seen, tracked: TrackResult) -> None:
-        """Take the detection that the user's box, or the tracker, or else the class means."""
+        """Choose the detection that matches the user's box, the tracker's box or the class."""
         candidates = [each for each in scene.objects.values() if each.seen and self._may_be(each)]
         if not self._tracking:
             confirmed = [each for each in candidates if each.confirmed]
@@ -357,7 +357,7 @@ class TargetFinder:
             self._adopt(scene, best, frame)
 
     def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
-        """Take a newcomer for the target if it can be it, looks like it, and is the only such one."""
+        """Accept a newcomer as the target if it can be the target, looks like it, and is the only such thing."""
         assert target.estimator.seen_ns is not None
         likely: list[tuple[float, SceneObject]] = []
         for each in scene.objects.values():
@@ -369,7 +369,7 @@ class TargetFinder:
                 continue
             images, mean = self._newcomers.get(each.number, (0, 0.0))
             if images and not self._is_expected(target, each, mean, frame.captured_ns):
-                images = 0  # nor by one image in which two are taken for one
+                images = 0  # start over: two things may have merged in an image
             if each.whole:
                 images += 1
                 mean += (unlikeness(target.looks, each.places) - mean) / min(images, _OF_LATE)
@@ -383,16 +383,16 @@ class TargetFinder:
         if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
-            return  # nothing tells them apart
+            return  # they can't be distinguished
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
-        # Of what comes out of hiding the first boxes are of what it comes from behind of, too.
+        # While a thing comes out of hiding, its first boxes also show the occluder, so keep the old colours.
         found.looks, found.hits = target.looks, target.hits + found.hits
         self._adopt(scene, found, frame, back=True)
         del scene.objects[target.number]
 
     def _note_twins(self, scene: Scene, target: SceneObject, at_ns: int) -> None:
-        """Note whether something that looks just like the target is seen beside it."""
+        """Note whether a look-alike is in view beside the target."""
         if target.seen and any(
             each.seen and each.whole and each.confirmed and unlikeness(target.looks, each.looks) < _TWIN
             for each in scene.objects.values()
@@ -401,7 +401,7 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Whether a newcomer moves as the target should, in doubt; and is where it should be, if that has a twin."""
+        """Return whether a newcomer moves like the target and, if the target has a twin, is where it should be."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
@@ -415,13 +415,13 @@ class TargetFinder:
         return self.class_name is None or each.class_name == self.class_name
 
     def _is_unsure(self, scene: Scene, thing: SceneObject) -> bool:
-        """Whether a thing is taken to stand on the ground, and may hang on a wall for all that is known of it."""
+        """Return whether a thing is assumed to stand on the ground but might hang on a wall."""
         traits = scene.traits.get(thing.class_name)
         unsure = traits is None or (traits is self._given and self._unnamed and traits.on_ground is None)
         return unsure and not isinstance(thing.estimator, RangeEstimator)
 
     def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
-        """Return the filter that learns the range of a thing, which was seen in a frame and may be back again."""
+        """Return the filter that learns the range of a thing seen in a frame; with ``back``, of a returned target."""
         before = self.estimator
         if isinstance(before, RangeEstimator) and not back:
             return before
@@ -436,7 +436,7 @@ class TargetFinder:
         return new
 
     def _adopt(self, scene: Scene, thing: SceneObject, frame: _Seen, *, back: bool = False) -> None:
-        if self._given is not None and self.class_name is None:  # what is known of it goes before its class
+        if self._given is not None and self.class_name is None:  # the user's traits take precedence over the class's
             scene.traits[thing.class_name] = self._given
             if self.estimator is not None:
                 thing.estimator = self.estimator

@@ -1,7 +1,7 @@
-"""Follow anything: what is in a box of the image, or whatever is of a class.
+"""Follow anything: the content of a box in the image, or anything of a class.
 
-:class:`TargetFollower` finds the target in frames and computes the set-points that keep it, without thread or clock;
-:class:`FollowTarget`, or a page, gives it frames and feedback, and sends the set-points.
+:class:`TargetFollower` finds the target in frames and computes the set-points, without thread or clock;
+:class:`FollowTarget`, or a page, gives it frames and feedback and sends the set-points.
 """
 
 from __future__ import annotations
@@ -41,36 +41,36 @@ Array = NDArray[np.float64]
 _SEEN: Final[Colour] = (64, 220, 100)
 _LOST: Final[Colour] = (255, 180, 60)
 _OTHER: Final[Colour] = (150, 150, 150)
-_TRACE_S: Final = 4.0
-_TRACE_EACH_S: Final = 0.2
-_FEET_M: Final = 0.08  # below the body's centre: what heights above the ground are measured from
+_TRACE_S: Final = 4.0  # length of the drawn track
+_TRACE_EACH_S: Final = 0.2  # between points of the drawn track
+_FEET_M: Final = 0.08  # below the body's centre; heights above the ground are measured from there
 
 
 @dataclass(frozen=True, slots=True)
 class FollowStatus:
-    """How following goes."""
+    """The state of a pursuit."""
 
     phase: str
     mode: FollowMode
-    box: Box | None  #: of the target in the newest frame [px]; None: not seen in it
+    box: Box | None  #: box of the target in the newest frame [px]; None: not seen in it
     confidence: float | None  #: 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
     class_name: str | None
-    predicted_px: tuple[float, float] | None = None  #: where its middle should be in the newest frame
+    predicted_px: tuple[float, float] | None = None  #: expected position of its middle in the newest frame
     range_m: float | None = None  #: horizontal distance from the camera
     range_deviation_m: float | None = None
     bearing_rad: float | None = None  #: counter-clockwise from straight ahead
-    speed_m_s: float | None = None  #: of the target; None where the vehicle does not know its own
-    lost_s: float = 0.0  #: since it was last seen; 0 while it is seen, or was not seen yet
-    problem: str = ""  #: what keeps it from being followed as wanted; empty for nothing
-    unknown: str = ""  #: what of the vehicle's motion is not known: it has to hover, whatever the set-point
+    speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own
+    lost_s: float = 0.0  #: time since the last sighting; 0 while it is seen, and before the first sighting
+    problem: str = ""  #: obstacle to following as wanted; empty if there is none
+    unknown: str = ""  #: unknown part of the vehicle's motion, for which it must hover, whatever the set-point
 
 
 class TargetFollower(AirframeLaw):
     """Follows one target. Call it from one thread.
 
     Attributes:
-        mode: What to do; may be changed in flight.
-        over: It gave up: the target was lost for too long.
+        mode: How to follow; can be changed in flight.
+        over: Whether it gave up because the target was lost for too long.
     """
 
     def __init__(
@@ -88,18 +88,18 @@ class TargetFollower(AirframeLaw):
         """Initialise the follower.
 
         Args:
-            camera: How the camera is mounted; it looks forward.
+            camera: The camera and its mounting; it must look forward.
             box: The target in the first frame given to :meth:`look`: x, y, width, height [px].
             class_name: Follow the largest thing of this class, if there is no box; needs detections.
-            mode: What to do.
-            detector: Searched in every frame, on the thread that calls :meth:`look`.
-            detects: Detections come from elsewhere, by :meth:`detected`.
-            traits: What is known of the target; None: what is known of its class.
-            settings: Of the law; None are the defaults.
+            mode: How to follow.
+            detector: Detector to run on every frame, on the thread that calls :meth:`look`.
+            detects: Whether detections arrive from elsewhere, by :meth:`detected`.
+            traits: Prior knowledge about the target; None: that of its class.
+            settings: Settings of the law; None are the defaults.
 
         Raises:
-            UsageError: There is neither a box nor a class, a class without detections, or the camera does not look
-                forward, or not say how it is mounted.
+            UsageError: There is neither a box nor a class, a class has no detections, the camera does not look forward,
+                or its mounting is unknown.
             MissingExtraError: OpenCV or, for detections, SciPy is not installed.
         """
         if mounting_rotation(camera)[0, 2] < 0.5:
@@ -107,24 +107,24 @@ class TargetFollower(AirframeLaw):
         if box is None and class_name is None:
             raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
         if box is None and detector is None and not detects:
-            raise UsageError(f"to follow any {class_name!r} a detector is needed: give detector=…, or a box")
+            raise UsageError(f"following any {class_name!r} needs a detector: give detector=…, or a box")
         if box is not None and not all(np.isfinite(part) for part in box):
-            raise UsageError(f"the box is {box!r} and must be of finite numbers")
+            raise UsageError(f"the box is {box!r} and must consist of finite numbers")
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self._law = ChaseLaw(settings, FollowMode(mode))
         self._camera = camera
         self._detector = detector
         self._box, self._class_name, self._traits = box, class_name, traits
         self._finder: TargetFinder | None = None
-        self._seen_ns: int | None = None  # capture of the last frame that showed the target, or may have
+        self._seen_ns: int | None = None  # capture of the last frame that showed, or may have shown, the target
         self._sighting = Sighting(None, None)
-        self._view: Camera | None = None  # of the newest frame
+        self._view: Camera | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
         self._trace: deque[tuple[int, Array]] = deque()
 
     @property
     def settings(self) -> ChaseSettings:
-        """Goal, gains and limits; may be replaced in flight."""
+        """Goal, gains and limits; can be replaced in flight."""
         return self._law.settings
 
     @settings.setter
@@ -133,7 +133,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def mode(self) -> FollowMode:
-        """What to do; may be changed in flight."""
+        """How to follow; can be changed in flight."""
         return self._law.mode
 
     @mode.setter
@@ -142,22 +142,22 @@ class TargetFollower(AirframeLaw):
 
     @property
     def phase(self) -> TargetPhase:
-        """As of the last set-point."""
+        """Phase as of the last set-point."""
         return self._law.phase
 
     @property
     def over(self) -> bool:
-        """Whether it gave up."""
+        """Whether the follower gave up."""
         return self.phase is TargetPhase.GIVEN_UP
 
     @property
     def sighting(self) -> Sighting:
-        """What was found in the newest frame."""
+        """The result of searching the newest frame."""
         return self._sighting
 
     @property
     def finder(self) -> TargetFinder | None:
-        """What finds the target; None before the first frame."""
+        """The finder of the target; None before the first frame."""
         return self._finder
 
     def feedback(self, feedback: Feedback) -> None:
@@ -169,28 +169,28 @@ class TargetFollower(AirframeLaw):
             self._law.feedback(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart set-points from rest; the target is kept."""
+        """Restart set-points from rest; keep the target."""
         super().pause()
         self._law.pause()
 
     @property
     def _relative(self) -> bool:
-        """Whether the vehicle reports no velocity: it is flown by attitude."""
+        """Whether the vehicle reports no velocity and is flown by attitude."""
         return self.airframe.by_tilt
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find the target in the next frame. The first call starts with the box that was given.
+        """Find the target in the next frame. The first call starts with the given box.
 
         Returns:
-            What to draw: the box, where it came along, where it should be, and the phase.
+            Shapes to draw: the box, its track, its expected position, and the phase.
 
         Raises:
-            UsageError: The first box does not fit into the image, or the camera's intrinsics are not known.
+            UsageError: The first box does not fit into the image, or the camera's intrinsics are unknown.
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
-            state = None  # stamped ahead, or nothing is heard of the vehicle: where it looked from is not known
-        # A vehicle whose velocity is not known any more hovers where it was last.
+            state = None  # stamped ahead, or no recent feedback: the camera's pose is unknown
+        # A vehicle without a known velocity hovers at its last position.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
@@ -202,7 +202,7 @@ class TargetFollower(AirframeLaw):
             body[2] = state.altitude_m + _FEET_M
         rates = (0.0, 0.0)
         if state.angular_velocity_rad_s is None and state.yaw_rad is not None:
-            # No gyroscope, so attitude comes seldom, and images bear the time of their arrival.
+            # Without a gyroscope, attitude arrives rarely, and images are stamped on arrival.
             rates = motion.yaw_rate, self.airframe.tilt_rate_rad_s
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
@@ -227,14 +227,14 @@ class TargetFollower(AirframeLaw):
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
-        """Use detections of a processor in one of the last frames, which come later than that."""
+        """Use a processor's detections in a recent frame, which arrive after that frame."""
         if self._finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
             if self._finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
-        """Compute the set-point for now [ns on the proxy's clock]; it holds the vehicle while its motion is not known.
+        """Compute the set-point for now [ns on the proxy's clock]; hold the vehicle while its motion is unknown.
 
         A vehicle that does not report its velocity is flown by attitude.
         """
@@ -261,7 +261,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def status(self) -> FollowStatus:
-        """How it goes, as of the newest frame and set-point."""
+        """The state of the pursuit, as of the newest frame and set-point."""
         estimator, at_ns = self._estimator, self._frame_ns
         box, confidence = self._sighting.box, self._sighting.confidence
         class_name = self._class_name if self._finder is None else self._finder.class_name
@@ -286,7 +286,7 @@ class TargetFollower(AirframeLaw):
         if self.problem:
             return self.problem
         if self._sighting.contested:
-            return "something like it is where it should be"
+            return "a look-alike is at its expected position"
         return "at the end of the leash" if self._law.held_by else ""
 
     def _drawing(self, captured_ns: int) -> list[Shape]:
@@ -295,7 +295,7 @@ class TargetFollower(AirframeLaw):
         assert view is not None
         box = self._sighting.box
         colour = _SEEN if box is not None else _LOST
-        # A processor draws what it finds itself, on the frame that it is in.
+        # A processor draws its own detections, on their frames.
         found = () if self._detector is None else self._finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
@@ -324,15 +324,15 @@ class TargetFollower(AirframeLaw):
 
 
 class FollowTarget(Behaviour):
-    """Keeps a target in view, at a distance; circles it; or only looks at it. It must be airborne when it runs.
+    """Keeps a target in view at a distance, circles it, or only turns to it. The vehicle must be airborne.
 
-    The target is what is in a box of the first frame, or the largest thing of a class. It is tracked by its looks and,
-    where there is a detector, by its detections, and is not mixed up with look-alikes. While it is hidden the vehicle
-    flies on by its last motion for a moment, then hovers, then looks around; after ``give_up_s`` the behaviour ends,
-    hovering. The vehicle needs neither position nor map. One that reports no velocity is flown by attitude.
+    The target is the content of a box in the first frame, or the largest thing of a class. It is tracked by appearance
+    and, with a detector, by its detections, and is not confused with look-alikes. While it is hidden the vehicle first
+    follows its predicted motion, then hovers, then looks around; after ``give_up_s`` the behaviour ends, hovering. The
+    vehicle needs neither position nor map. A vehicle that reports no velocity is flown by attitude.
 
     Attributes:
-        follower: What finds the target and computes the set-points.
+        follower: Finds the target and computes the set-points.
     """
 
     name = "follow target"
@@ -360,21 +360,21 @@ class FollowTarget(Behaviour):
             box: The target in the first frame: x, y, width, height [px].
             class_name: Follow the largest thing of this class, if there is no box. Needs a detector.
             distance_m: Horizontal distance to keep; None: the settings'.
-            bearing_rad: Where to be as seen from the target, counter-clockwise from where it moves to: 0 is ahead of
-                it, π behind. None: on any side, or the settings'.
+            bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion:
+                0 is ahead of it, π behind. None: any side, or the settings'.
             mode: ``follow``, ``orbit`` or ``look``.
             detector: Searches every frame; or the name of a processor whose results are detections, such as that of
-                ``skyloop detect``. None: the target is tracked by its looks alone.
-            height_m: How high the target is, if that is known, for its distance; else that of its class is taken. With
-                neither, the drone only turns until its own motion has shown the range.
-            traits: All that is known of the target, in place of ``height_m``.
-            camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.
+                ``skyloop detect``. None: the target is tracked by appearance alone.
+            height_m: The target's height, if known, to estimate its distance; otherwise the height of its class. With
+                neither, the drone only turns until its own motion has revealed the range.
+            traits: Complete prior knowledge about the target, instead of ``height_m``.
+            camera: Camera to use; None is the vehicle's first camera.
+            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera.
-            UsageError: There is neither a box nor a class; or the camera does not look forward; or a number is out of
-                its range; or the vehicle reports no velocity, and takes no attitudes.
+            UsageError: There is neither a box nor a class, the camera does not look forward, a number is out of its
+                range, or the vehicle neither reports velocity nor takes attitude set-points.
             MissingExtraError: OpenCV or, for detections, SciPy is not installed.
         """
         given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
@@ -385,7 +385,7 @@ class FollowTarget(Behaviour):
         if mode not in list(FollowMode):
             raise UsageError(f"mode is {mode!r} and must be one of {', '.join(FollowMode)}")
         if detector is not None and not isinstance(detector, str | ObjectDetector):
-            raise UsageError(f"detector is {detector!r} and must have detect(image), or be the name of a processor")
+            raise UsageError(f"detector is {detector!r} and needs a detect(image) method, or must name a processor")
         self.follower = TargetFollower(
             camera_info(drone, camera),
             box=None if box is None else _box(box),
@@ -401,12 +401,12 @@ class FollowTarget(Behaviour):
 
     @property
     def phase(self) -> TargetPhase:
-        """What becomes of it."""
+        """The current phase."""
         return self.follower.phase
 
     @property
     def status(self) -> FollowStatus:
-        """How it goes, as of the newest frame."""
+        """The state of the pursuit, as of the newest frame."""
         return self.follower.status
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -414,13 +414,13 @@ class FollowTarget(Behaviour):
         return self.follower.look(frame)
 
     def on_frame(self, frame: Frame) -> None:
-        """Find the target and steer; at the end of patience hover and let :meth:`run` return."""
+        """Find the target and steer; after ``give_up_s``, hover and let :meth:`run` return."""
         super().on_frame(frame)
         if self.follower.over and not self.done:
             self.finish("gave up: the target was lost for too long")
 
     def on_result(self, result: Result) -> None:
-        """Use the detections of a processor in frames of this behaviour's camera; it may see others' too."""
+        """Use a processor's detections in frames of this behaviour's camera; ignore other cameras'."""
         if result.camera == self._mounting.name:
             self.follower.detected(detections_of(result.value), result.captured_ns)
 
@@ -434,7 +434,7 @@ def _box(box: Sequence[float]) -> Box:
 
 
 def detections_of(value: Any) -> list[Detection]:
-    """Return the detections in the value of a result of ``skyloop detect``; what is none is left out."""
+    """Return the detections in a result of ``skyloop detect``; skip malformed ones."""
     found = []
     given = value.get("detections") if isinstance(value, dict) else None
     for one in given if isinstance(given, list | tuple) else ():

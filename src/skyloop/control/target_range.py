@@ -1,14 +1,14 @@
-"""The range of a target that may not stand on the ground: several hypotheses, until the bearings decide. Pure.
+"""The range of a target that may not stand on the ground: hypotheses that the bearings decide between. Pure.
 
 A box that a person draws may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
-only of a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and surely so.
-That is therefore one hypothesis among others, at ranges from near to far, with a filter each (T. R. Kronhamn,
-"Bearings-only target motion analysis based on a multihypothesis Kalman filter and adaptive ownship motion control", IEE
-Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the vehicle stays, all of them fit. Once it has
-moved, above all up or down, where hardly any target moves, those at a wrong range do not.
-
-An altimeter that measures to rising ground, or drifts, reports motion that did not happen. A target that may hang is
-therefore seen from a height that follows the vehicle's own climb, and the altimeter only slowly.
+only of a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and the filter
+is wrongly sure of it. Standing on the ground is therefore one hypothesis among others at ranges from near to far, with
+a filter each (T. R. Kronhamn, "Bearings-only target motion analysis based on a multihypothesis Kalman filter and
+adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the
+vehicle stays, all hypotheses fit. Once it has moved, above all up or down, where hardly any target moves, those at a
+wrong range do not.
+An altimeter over rising ground, or one that drifts, reports motion that did not happen. For a target that may hang, the
+camera's height therefore follows the vehicle's own climb, and the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from skyloop.control.limiting import within
 from skyloop.control.target_estimate import LEAST_SLOPE, SURE_OF_SIZE, UNKNOWN, TargetEstimator, TargetState, Traits
 from skyloop.control.target_view import BoxView, Camera
 
-_RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # to 29 m, and beyond
-_SHARE: Final = 0.3  # standard deviation of each, as a share of it
-_ON_GROUND: Final = 0.5  # that it stands on the ground, before anything was seen
-_AS_BEFORE: Final = 0.5  # standard deviation of the logarithm of the range of a thing that was seen before
-_TOGETHER_S: Final = 0.3  # boxes within this time count as one: a tracker's errors last
-_WORST: Final = 50.0  # cost of a box, by which a guess may lose at most
-_LEAST: Final = 1e-3  # a guess that is less likely is dropped
-_KNOWN: Final = 0.2  # deviation of the range, as a share of it, from which on it is known
-_UNKNOWN: Final = 0.4  # and above which it is not any more
-_STIRRED_M: Final = 0.1  # off from where it was of late, from which on what a box says counts in full
-_OF_LATE_S: Final = 2.0  # of late: the mean of about this time
-_BASELINE: Final = 0.015  # how far off it must have been once, by range, before the range is known
-_JUMP_M: Final = 0.15  # by more the vehicle's height does not change at once, ...
-_JUMP_M_S: Final = 1.0  # ... nor faster than this: what its altimeter measures to is another thing
-_JUMPING_S: Final = 0.5  # a jump takes as long at most, where altimeters are filtered
-_STEADY_S: Final = 30.0  # in which the height of what may hang follows the altimeter, where the climb is known
-_APART_M: Final = 3.0  # by more than this ground and climb differ only after the climb was lost
+_RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # initial ranges of the hypotheses, up to 29 m
+_SHARE: Final = 0.3  # standard deviation of each range, as a share of it
+_ON_GROUND: Final = 0.5  # prior probability that the target stands on the ground
+_AS_BEFORE: Final = 0.5  # standard deviation of the log range of a target seen before
+_TOGETHER_S: Final = 0.3  # boxes within this time count as one, because a tracker's errors persist
+_WORST: Final = 50.0  # greatest cost of a single box for a hypothesis
+_LEAST: Final = 1e-3  # drop less likely hypotheses
+_KNOWN: Final = 0.2  # relative deviation below which the range becomes known
+_UNKNOWN: Final = 0.4  # and above which it becomes unknown again
+_STIRRED_M: Final = 0.1  # offset from its recent position from which a box counts in full
+_OF_LATE_S: Final = 2.0  # averaging time of the recent position
+_BASELINE: Final = 0.015  # offset per range that the vehicle must once have reached before the range is known
+_JUMP_M: Final = 0.15  # the vehicle's height does not change by more than this at once, ...
+_JUMP_M_S: Final = 1.0  # ... nor faster than this: the altimeter now measures to something else
+_JUMPING_S: Final = 0.5  # longest duration of a jump of a filtered altimeter
+_STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter, if the climb is known
+_APART_M: Final = 3.0  # a larger difference of ground and climb means that the climb was lost
 
 
 class RangeEstimator(TargetEstimator):
-    """The filters of one target that may stand on the ground or not."""
+    """The filters of one target that may or may not stand on the ground."""
 
     def __init__(
         self, traits: Traits, *, nominal_m: float = 4.0, relative: bool = False, before: TargetState | None = None
@@ -53,28 +53,28 @@ class RangeEstimator(TargetEstimator):
         """Initialise the filters.
 
         Args:
-            traits: Known traits of the target.
-            nominal_m: Its distance at the start where the vehicle does not know its own height.
-            relative: As of :class:`TargetEstimator`.
-            before: The state in which it was lost, if its range was known then.
+            traits: Prior knowledge about the target.
+            nominal_m: Assumed initial distance if the vehicle does not know its own height.
+            relative: As in :class:`TargetEstimator`.
+            before: State of the target when it was lost, if its range was known.
         """
         super().__init__(traits, nominal_m=nominal_m, relative=relative)
         self._seen_before = before
         self._guesses: list[TargetEstimator] = []
         self._weights = np.ones(0)
-        self._on_ground: TargetEstimator | None = None  # the guess that it stands there, until that is dropped
-        self._sight = self._about = np.zeros(3)  # the first line of sight; where the vehicle was of late
-        self._stirred_m = 0.0  # the farthest that the vehicle ever was from there, across that line
-        self._heights: deque[tuple[int, float]] = deque()  # when, and how high it was lately
-        self._jumped_ns: int | None = None  # when its height jumped last
-        self._base_m = 0.0  # the height, as the altimeter says in the long run, from which the climb counts
+        self._on_ground: TargetEstimator | None = None  # hypothesis that it stands on the ground, until dropped
+        self._sight = self._about = np.zeros(3)  # first line of sight; recent mean position of the vehicle
+        self._stirred_m = 0.0  # greatest distance from it so far, across that line
+        self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
+        self._jumped_ns: int | None = None  # last jump of its height
+        self._base_m = 0.0  # long-term altimeter height from which the climb counts
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
-        """Start from the first box, as :meth:`TargetEstimator.start`.
+        """Start from the first box, as in :meth:`TargetEstimator.start`.
 
-        Without a known height nothing can tell the guesses apart: the range is the nominal one, and the law keeps the
-        apparent size.
+        Without a known height nothing can distinguish the hypotheses: the range is the nominal one, and the law keeps
+        the apparent size.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
         self._base_m = _off_climb(camera)
@@ -84,7 +84,7 @@ class RangeEstimator(TargetEstimator):
         if ground and below and self.traits.on_ground is not False:
             self._on_ground = self._member(view, camera, at_ns, on_ground=True)
             weights.append(_ON_GROUND)
-        stood = self._on_ground is not None and self.traits.on_ground  # as was seen before
+        stood = self._on_ground is not None and self.traits.on_ground  # known from before
         if not stood and (self._size_known or not ground):
             self._member(view, camera, at_ns, on_ground=False)
             weights.append(1.0 - _ON_GROUND)
@@ -102,20 +102,20 @@ class RangeEstimator(TargetEstimator):
         self._judge(self.at(at_ns))
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
-        """Return how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit of all, and the mixture's."""
+        """Measure how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit, and the mixture's."""
         seen_from = self._seen_from(camera, self._steady(camera))
         fits, costs = zip(*(guess.distance(view, one, at_ns) for guess, one in seen_from), strict=True)
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box, as :meth:`TargetEstimator.update`, and drop the guesses that it does not fit.
+        """Update with a box, as :meth:`TargetEstimator.update`, and drop hypotheses that do not fit it.
 
-        All begins anew where the vehicle's height jumps: somebody walks below, it comes over a table, or its height is
-        not known for a moment. By such a motion that was none, the thing would surely be far away.
+        Restart when the vehicle's height jumps: someone walks below, it flies over a table, or its height is unknown
+        for a moment. Such an apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:
-            return super().update(view, camera, at_ns)  # which says so
+            return super().update(view, camera, at_ns)  # which raises the error
         apart_m, since_s = _off_climb(camera) - self._base_m, seconds(at_ns - self.seen_ns)
         if self._learns and (self._jumps(camera, at_ns) or abs(apart_m) > _APART_M):
             self._seen_before = self.at(at_ns) if self._known else self._seen_before
@@ -130,19 +130,19 @@ class RangeEstimator(TargetEstimator):
             self.refused += 1
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
-        # Of a vehicle that stays boxes tell nothing: the guess that counts on the least motion would win slowly.
+        # Boxes from a resting vehicle carry no information: the hypothesis of least motion would slowly win.
         stirred = self._stir(steady, since_s) / _STIRRED_M
-        told = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
+        weight = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
-        self._weights = self._weights * np.exp(-0.5 * worse * told * within(since_s / _TOGETHER_S, 0.0, 1.0))
+        self._weights = self._weights * np.exp(-0.5 * worse * weight * within(since_s / _TOGETHER_S, 0.0, 1.0))
         self._drop()
         self._judge(self.at(self.seen_ns))
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state, as :meth:`TargetEstimator.at`: the mean of all guesses, with its deviation."""
+        """Predict the target's state, as :meth:`TargetEstimator.at`: the hypotheses' mean, with its deviation."""
         if self.seen_ns is None:
-            return super().at(at_ns)  # which says so
+            return super().at(at_ns)  # which raises the error
         states = [guess.at(at_ns) for guess in self._guesses]
         weights = self._weights
 
@@ -167,14 +167,14 @@ class RangeEstimator(TargetEstimator):
 
     @property
     def on_ground(self) -> bool | None:
-        """Whether it stands on the ground: None while that is not known."""
+        """Whether it stands on the ground; None while unknown."""
         if self._on_ground is None:
             return False
         likeliest = self._guesses[int(np.argmax(self._weights))]
         return True if self._known and likeliest is self._on_ground else None
 
     def again(self, at_ns: int) -> TargetEstimator:
-        """Return the filter, not started yet, for the same thing where it comes into view again."""
+        """Return the filter, not started yet, for the same target when it comes back into view."""
         before, stands = self.at(at_ns), self.on_ground
         traits = self.traits if stands is None else replace(self.traits, on_ground=stands)
         return RangeEstimator(
@@ -210,11 +210,11 @@ class RangeEstimator(TargetEstimator):
         return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
 
     def _seen_from(self, camera: Camera, steady: Camera) -> list[tuple[TargetEstimator, Camera]]:
-        """Return each guess with its camera: for a target on the ground, as high as the altimeter says."""
+        """Return each hypothesis with its camera; for a target on the ground, at the altimeter's height."""
         return [(guess, camera if guess is self._on_ground else steady) for guess in self._guesses]
 
     def _jumps(self, camera: Camera, at_ns: int) -> bool:
-        """Return whether the height jumps, or did a moment ago."""
+        """Return whether the height jumps, or jumped a moment ago."""
         height, heights = float(camera.position[2]), self._heights
         while len(heights) > 1 and abs(seconds(at_ns - heights[0][0])) > _JUMPING_S:
             heights.popleft()
@@ -224,7 +224,7 @@ class RangeEstimator(TargetEstimator):
         return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
     def _stir(self, camera: Camera, since_s: float) -> float:
-        """Return how far the vehicle is from where it was of late, across the first line of sight [m]."""
+        """Return the vehicle's distance from its recent position, across the first line of sight [m]."""
         self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
         x, y, z = (camera.position - self._about).tolist()
         off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)
@@ -232,30 +232,30 @@ class RangeEstimator(TargetEstimator):
         return off_m
 
     def _judge(self, state: TargetState) -> None:
-        """Decide whether the range is known: by the size, or by what the vehicle's own motion has shown."""
+        """Decide whether the range is known, by the target's size or from the vehicle's own motion."""
         share = state.range_deviation_m / state.range_m
         if self._known:
             self._known = share < _UNKNOWN or len(self._guesses) == 1
         else:
-            told = self._size_known or self.traits.on_ground
+            sure = self._size_known or self.traits.on_ground
             moved = self._stirred_m > _BASELINE * state.range_m
-            self._known = share < _UNKNOWN if told else moved and share < _KNOWN
+            self._known = share < _UNKNOWN if sure else moved and share < _KNOWN
 
 
 def _off_climb(camera: Camera) -> float:
-    """Return by how much the height differs from the climb [m]."""
+    """Return the difference between height and climb [m]."""
     return 0.0 if camera.rise_m is None else float(camera.position[2]) - camera.rise_m
 
 
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Return the filter, not started yet, of a thing.
+    """Create the filter of a target; call ``start`` on it.
 
     Args:
-        class_name: Of the target; None: a person drew a box, without a class.
-        traits: Known traits of the target; None: there are none.
-        nominal_m: Its distance at the start where nothing tells it.
+        class_name: Class of the target; None: a person drew a box, without a class.
+        traits: Prior knowledge about the target; None: there is none.
+        nominal_m: Assumed initial distance if there is no cue.
         relative: Whether the vehicle does not know its own velocity.
     """
     if traits is not None and (class_name is not None or traits.on_ground is not None):

@@ -1,9 +1,9 @@
-"""Which detection is which thing: things that were seen keep their identity while they cross, hide and return. Pure.
+"""Match detections to things, which keep their identity while they cross, hide and return. Pure.
 
-Detections are matched with filters of where things are, not of where they were in the last image, so the vehicle's own
-motion does no harm, and two that look alike are told apart by place and motion. The pairs are the likeliest ones
-altogether (SciPy's ``linear_sum_assignment``). A detection that another thing could explain nearly as well is used for
-neither: both go on by their motion until they are apart.
+Detections are matched with filters of where things are now, not with their places in the last image, so the vehicle's
+own motion does no harm, and look-alikes are distinguished by place and motion. The pairs are the most likely overall
+assignment (SciPy's ``linear_sum_assignment``). A detection that another thing could explain nearly as well updates
+neither: both continue on their motion until they are apart.
 """
 
 from __future__ import annotations
@@ -25,51 +25,51 @@ from skyloop.vision.object_tracks import Detection
 
 Floats = NDArray[np.float32]
 
-_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # of L, a, b: light changes L most
-_OTHER: Final = 10.0  # unlikeness from which something is another thing; its own: mostly below 0.5, at times 3
-_OTHER_AGAIN: Final = 3.0  # the same, of what was not seen for a moment
-_MOMENT_S: Final = 0.3
-_UNLIKE: Final = 3.0  # weight of the unlikeness against that of where things are
-_LEARNING: Final = 0.05  # of the colours, by one detection; of the first ones the mean
-_GATE: Final = 9.0  # of the squared Mahalanobis distance by the number of what was measured
-_NEVER: Final = 1e6
-_AMBIGUOUS: Final = 4.0  # of the likelihood's negative logarithm, doubled: less is not clear
-_LATELY_S: Final = 1.2  # a thing that was seen so lately may be what a detection shows
-_TOGETHER_S: Final = 3.0  # two that are detected as one for longer are believed to be one
-_FAR_BEHIND: Final = 1.3  # times as far: what is so far behind another thing is hidden by it, and not part of its box
-_EARLIER_S: Final = 0.5  # before two met: what pulls at them as their boxes merge has not begun then
-_APART_S: Final = 0.6  # after they parted: how they move on is known then
-_DIFFER_M_S: Final = 0.8  # between their velocities before: else nothing tells them apart
-_TURNED: Final = 0.3  # of that difference, the other way round, from which they were taken for each other
-_KEEP_S: Final = 2.0  # things that are hidden are remembered for so long: what comes after that may be another one
-_YOUNG_S: Final = 0.5  # and those that were seen only once
-_CONFIRMED: Final = 3  # detections
-_OF_A_PART: Final = 1.0  # unlikeness of what the image cuts off: its halves are others
-_SETTLED: Final = 8  # detections: what was seen less often, perhaps two as one, contests nothing of others
-_YOUNG: Final = 4.0  # by which its costs are higher
-_WELL_KNOWN: Final = 15  # detections: its colours are known then
-_SURE: Final = 0.35  # score of a detection that may be a new thing
+_COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b: light changes L most
+_OTHER: Final = 10.0  # unlikeness from which it is another thing; of the same thing mostly below 0.5, at times 3
+_OTHER_AGAIN: Final = 3.0  # the same for a thing unseen for a moment
+_MOMENT_S: Final = 0.3  # after which _OTHER_AGAIN applies
+_UNLIKE: Final = 3.0  # weight of the unlikeness relative to the position
+_LEARNING: Final = 0.05  # learning rate of the colours per detection; the first ones are averaged
+_GATE: Final = 9.0  # greatest squared Mahalanobis distance per measurement
+_NEVER: Final = 1e6  # cost of a pair that must not match
+_AMBIGUOUS: Final = 4.0  # smaller differences of the doubled negative log-likelihood are ambiguous
+_LATELY_S: Final = 1.2  # a detection may show a thing seen this recently
+_TOGETHER_S: Final = 3.0  # two things detected as one for longer are taken for one
+_FAR_BEHIND: Final = 1.3  # ratio of ranges: a thing this far behind another is hidden, not part of the other's box
+_EARLIER_S: Final = 0.5  # this long before two meet, their merging boxes do not yet distort their velocities
+_APART_S: Final = 0.6  # this long after they part, their velocities are known
+_DIFFER_M_S: Final = 0.8  # difference of their velocities before, needed to distinguish them
+_TURNED: Final = 0.3  # share of that difference, reversed, from which they were confused
+_KEEP_S: Final = 2.0  # how long hidden things are remembered; a later newcomer may be another thing
+_YOUNG_S: Final = 0.5  # the same for things seen only once
+_CONFIRMED: Final = 3  # detections needed to confirm a thing
+_OF_A_PART: Final = 1.0  # unlikeness of a thing that the image cuts off: its colours differ
+_SETTLED: Final = 8  # detections below which a thing, perhaps two in one, contests no others
+_YOUNG: Final = 4.0  # extra cost of such a thing
+_WELL_KNOWN: Final = 15  # detections from which its colours are known
+_SURE: Final = 0.35  # least score of a detection that may be a new thing
 
 
 @dataclass(slots=True, eq=False)
 class SceneObject:
-    """One thing.
+    """One detected thing.
 
     Attributes:
-        number: By which it is known; never given to another one.
-        class_name: Of its detections.
-        estimator: Where it is.
-        detection: The last one.
+        number: Its identity; never reused.
+        class_name: Class of its detections.
+        estimator: Filter of its motion.
+        detection: The last detection.
         looks: Its colours, (6,): see :func:`skyloop.vision.appearance.colours`.
-        places: Those of the last detection that the image did not cut off, (n, 6).
+        places: Colours of the last detection that the image did not cut off, (n, 6).
         whole: Whether the last detection was of the whole thing.
-        hits: How often it was detected.
-        first_ns: When it was detected first.
-        last_ns: When it was detected last.
+        hits: Number of detections.
+        first_ns: Time of the first detection.
+        last_ns: Time of the last detection.
         seen: Whether it was detected in the newest image.
-        contested_ns: When it was contested last.
-        velocities: Of the last half second.
-        contested: Whether it may have been in the newest image, but so may another thing have been.
+        contested_ns: Time when it was last contested.
+        velocities: Its velocities in the last half second.
+        contested: Whether a detection in the newest image may show it or another thing.
     """
 
     number: int
@@ -90,27 +90,27 @@ class SceneObject:
 
     @property
     def confirmed(self) -> bool:
-        """Whether it was seen often enough to be believed."""
+        """Whether it was detected often enough to be trusted."""
         return self.hits >= _CONFIRMED
 
     def learn(self, places: Floats) -> None:
-        """Update the colours with those at places of its newest detection, (n, 6)."""
+        """Update the colours with those of places in its newest detection, (n, 6)."""
         self.places = places
         self.looks = self.looks + max(_LEARNING, 1.0 / self.hits) * (_nearest(self.looks, places) - self.looks)
 
     def remember(self, at_ns: int) -> None:
-        """Keep the velocity of this time for :attr:`earlier`."""
+        """Record the current velocity for :attr:`earlier`."""
         self.velocities.append((at_ns, self.estimator.at(at_ns).velocity))
         while len(self.velocities) > 1 and seconds(at_ns - self.velocities[1][0]) >= _EARLIER_S:
             self.velocities.popleft()
 
     @property
     def earlier(self) -> NDArray[np.float64]:
-        """Its velocity about half a second before it was seen last, (2,) [m/s]."""
+        """Its velocity about half a second before the last detection, (2,) [m/s]."""
         return self.velocities[0][1] if self.velocities else np.zeros(2)
 
     def exchange(self, other: SceneObject) -> None:
-        """Exchange all but the numbers."""
+        """Exchange everything but the numbers."""
         for name in ("estimator", "detection", "hits", "last_ns", "seen", "contested", "velocities"):
             mine, its = getattr(self, name), getattr(other, name)
             setattr(self, name, its)
@@ -124,22 +124,22 @@ class _Seen(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the image cuts off neither its upper nor its lower end."""
+        """Whether the image shows both its upper and its lower end."""
         return self.view.bottom is not None and self.view.top is not None
 
 
 def unlikeness(one: Floats, other: Floats) -> float:
-    """Return how much two things differ in their colours: squared, in units of what light and folds change.
+    """Return the squared colour difference of two things, in units of the changes by light and folds.
 
     Args:
-        one: Of a thing, (6,).
-        other: Of a thing (6,), or of places in a box (n, 6), of which the most similar counts.
+        one: Colours of a thing, (6,).
+        other: Colours of a thing (6,), or of places in a box (n, 6), of which the most similar counts.
     """
     return float(np.min(_unlike(one, other)))
 
 
 def _nearest(one: Floats, places: Floats) -> Floats:
-    """Return the most similar of the colours of places in a box, (6,)."""
+    """Return the most similar colours among places in a box, (6,)."""
     places = np.atleast_2d(places)
     nearest: Floats = places[int(np.argmin(_unlike(one, places)))]
     return nearest
@@ -150,13 +150,13 @@ def _unlike(one: Floats, other: Floats) -> Floats:
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
-    """Whether a thing was seen a moment ago, or may have been seen all the time since it was."""
+    """Return whether a thing was seen a moment ago, or may have been in view ever since."""
     seen_s = seconds(at_ns - (thing.estimator.seen_ns or 0))
     return seen_s < _LATELY_S or (seen_s < _TOGETHER_S and seconds(at_ns - thing.contested_ns) < _LATELY_S)
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Whether a detection may be of two things together: the other's middle is in the box, and not far behind."""
+    """Return whether a detection may show two things: the other's middle is in the box and not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box
@@ -169,21 +169,21 @@ def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Came
 
 
 class Scene:
-    """The things that were detected.
+    """The detected things.
 
     Attributes:
-        objects: By number.
-        kept: Numbers of those that are not forgotten, however long they are hidden.
-        dormant: Numbers of those that no detection is matched with: whether they are back is decided elsewhere.
-        traits: Of classes, for things that are new.
+        objects: Things by number.
+        kept: Numbers of things never forgotten, however long hidden.
+        dormant: Numbers of things not matched with detections; their return is decided elsewhere.
+        traits: Traits by class, for new things.
     """
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
-        """Begin without things.
+        """Initialise an empty scene.
 
         Args:
             relative: Whether the vehicle does not know its own velocity.
-            traits: Of classes, in place of those in :data:`~.target_estimate.TRAITS`.
+            traits: Traits by class, instead of :data:`~.target_estimate.TRAITS`.
 
         Raises:
             MissingExtraError: SciPy is not installed.
@@ -203,10 +203,10 @@ class Scene:
         """Match the detections of the next image.
 
         Args:
-            detections: Of one image.
-            looks: The colours of each: (6,), or (n, 6) at n places from its left to its right.
-            camera: That took it.
-            at_ns: Its capture.
+            detections: Detections in one image.
+            looks: Colours of each: (6,), or (n, 6) at n places from left to right.
+            camera: The camera that took it.
+            at_ns: Capture of the image.
             ground: Whether the camera's height above the ground is known.
         """
         self._forget(at_ns)
@@ -224,7 +224,7 @@ class Scene:
                 self._add(new, camera, at_ns, ground=ground)
 
     def _match(self, seen: list[_Seen], camera: Camera, at_ns: int) -> list[_Seen]:
-        """Update the things that are found among the detections; return the detections that are left."""
+        """Update the things found among the detections; return the unmatched detections."""
         things = [each for number, each in self.objects.items() if number not in self.dormant]
         if not things or not seen:
             return seen
@@ -268,15 +268,15 @@ class Scene:
         return [seen[j] for j in range(len(seen)) if j not in used]
 
     def _meet(self, one: SceneObject, other: SceneObject) -> None:
-        """Remember how two moved against each other before they were seen as one."""
+        """Remember two things' relative motion before they merged."""
         pair = frozenset({one.number, other.number})
         if len(pair) == 2 and pair not in self._met:
             self._met[pair] = one.number, other.number, one.earlier - other.earlier
 
     def _untangle(self, at_ns: int) -> None:
-        """Exchange two that were taken for each other: after they met, each moves on as the other did before.
+        """Exchange two things that were confused: after they met, each moves on as the other did before.
 
-        Whatever the vehicle's own motion adds to both velocities does not matter to their difference.
+        The vehicle's own motion adds equally to both velocities, so their difference is unaffected.
         """
         for pair, (first, second, before) in list(self._met.items()):
             one, other = self.objects.get(first), self.objects.get(second)

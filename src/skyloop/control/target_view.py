@@ -1,7 +1,7 @@
-"""What the box of a thing in an image says about where the thing is. Pure.
+"""Directions of a thing from its box in an image. Pure.
 
-Directions are in *odometry axes* (see :mod:`.target`): the attitude at the capture levels them, so that neither roll
-nor pitch of the vehicle moves a thing. Of an edge that the image cuts off only a bound is known.
+Directions are in *odometry axes* (see :mod:`.airframe`): the attitude at the capture levels them, so neither roll nor
+pitch of the vehicle moves a thing. For an edge cut off by the image, only a bound is known.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from skyloop.vision.tracking import Box
 
 Array = NDArray[np.float64]
 
-_CUT_PX: Final = 2.0  # nearer to the image's edge than this, and than this share of its size, a box may be cut off
+_CUT_PX: Final = 2.0  # a box closer than this to the image's edge, and than this share of its size, may be cut off
 _CUT: Final = 0.07
-_BESIDE: Final = 0.75  # of the image's size from the optical axis: a half is its edge
-_STEEPEST: Final = 0.15  # cosine of the elevation: what is nearly straight above or below has no azimuth
+_BESIDE: Final = 0.75  # in image sizes from the optical axis; 0.5 is the edge
+_STEEPEST: Final = 0.15  # cosine of the elevation; a thing nearly straight above or below has no azimuth
 _TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
-_YAW_RAD: Final = 0.006
-_UNTIMELY_S: Final = 0.06  # of images that have the time of their arrival: by encoding, the network and decoding
+_YAW_RAD: Final = 0.006  # error of the yaw at the capture
+_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival: encoding, network and decoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """Where a camera was and how it was turned when it captured an image.
+    """The pose of a camera when it captured an image.
 
     Attributes:
-        position: In odometry axes, but the third is its height above the ground where that is known, (3,) [m].
-        rotation: From optical axes to odometry axes, (3, 3).
-        intrinsics: Of the image.
+        position: In odometry axes, with the height above the ground, if known, as the third, (3,) [m].
+        rotation: Rotation from optical axes to odometry axes, (3, 3).
+        intrinsics: Intrinsics of the image.
         size: Width and height of the image [px].
         yaw_rad: Standard deviation of its yaw at the capture.
         tilt_rad: Standard deviation of its tilt.
-        rise_m: How high the vehicle's velocity, added up, has brought it, wherever the ground is [m]; None: not known.
+        rise_m: Climb by the vehicle's integrated velocity, wherever the ground is [m]; None: unknown.
     """
 
     position: Array
@@ -66,20 +66,20 @@ class Camera:
         """Place a camera.
 
         Args:
-            mounting: How it is mounted.
+            mounting: The camera, with its mounting.
             feedback: The vehicle's state at the capture.
-            body: Position of the vehicle, (3,) [m]; the third is its height above the ground where that is known.
-            intrinsics: In pixels of the image.
+            body: Position of the vehicle, (3,) [m]; the third is its height above the ground, if known.
+            intrinsics: Intrinsics, in pixels of the image.
             size: Width and height of the image [px].
-            rates_rad_s: Of yaw and of tilt, of a vehicle whose images and attitude have no common clock: the faster it
-                turns, the less certain its attitude is at the capture.
-            risen_m: How high the vehicle's velocity, added up, has brought it [m]; None: not known.
+            rates_rad_s: Rates of yaw and tilt, for a vehicle whose images and attitude have no common clock: the faster
+                it turns, the less certain is its attitude at the capture.
+            risen_m: Climb by the vehicle's integrated velocity [m]; None: unknown.
 
         Returns:
-            None while the attitude is not known.
+            None while the attitude is unknown.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
             return None
@@ -92,9 +92,9 @@ class Camera:
         return cls(body + aside, rotation, intrinsics, size, yaw_rad, tilt_rad, rise_m)
 
     def pixel(self, point: Array) -> tuple[float, float] | None:
-        """Return where a point (3,) is in the image, or a little beside it [px]; None farther off.
+        """Return the pixel of a point (3,), in the image or a little beside it [px]; None further out.
 
-        A lens model holds within the image: far beside it, a polynomial of the distortion leads back into it.
+        A lens model holds only within the image: far outside, the distortion's polynomial folds back into it.
         """
         ray = self.rotation.T @ (point - self.position)
         lens, (columns, rows) = self.intrinsics, self.size
@@ -105,24 +105,24 @@ class Camera:
         return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
     def shows(self, point: Array) -> bool:
-        """Whether a point (3,) is within the image, if nothing hides it."""
+        """Return whether a point (3,) is within the image if nothing hides it."""
         pixel = self.pixel(point)
         return pixel is not None and 0.0 <= pixel[0] < self.size[0] and 0.0 <= pixel[1] < self.size[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoxView:
-    """Where a box's middle and edges are seen.
+    """The directions of a box's middle and edges.
 
     Attributes:
-        azimuth: Of the middle, counter-clockwise from x of odometry axes [rad].
-        bottom: Tangent of the lower edge's elevation; None where the image cuts it off.
+        azimuth: Azimuth of the middle, counter-clockwise from x of odometry axes [rad].
+        bottom: Tangent of the lower edge's elevation; None if the image cuts it off.
         top: The same of the upper edge.
-        below: Tangent of the elevation that a lower edge is below of, where the image cuts it off; None elsewhere.
-        above: The same of an upper edge, which is above of it.
+        below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; else None.
+        above: If the image cuts off the upper edge: tangent of the elevation that the edge lies above; else None.
         azimuth_rad: Standard deviation of the azimuth.
-        edge: Standard deviation of each edge by itself.
-        tilt: Standard deviation that both edges have in common.
+        edge: Standard deviation of each edge alone.
+        tilt: Standard deviation common to both edges.
     """
 
     azimuth: float
@@ -136,15 +136,15 @@ class BoxView:
 
     @classmethod
     def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
-        """Return what a box shows.
+        """Compute the directions of a box.
 
         Args:
             box: x, y, width, height [px].
-            camera: That took the image.
+            camera: The camera that took the image.
             noise: Standard deviation of an edge, as a share of the box's height; a pixel is added.
 
         Returns:
-            None for a box that no camera of this kind can show, or nearly straight above or below.
+            None for a box that this camera can't show, or one nearly straight above or below.
         """
         x, y, width, height = box
         columns, rows = camera.size
@@ -160,7 +160,7 @@ class BoxView:
         across = (1.0 + noise * width) / focal
         near = max(_CUT_PX, _CUT * height)
         if x < near or x + width > columns - near:
-            across += 0.3 * width / focal  # the middle of what is left is not that of the thing
+            across += 0.3 * width / focal  # the middle of the visible part is not the thing's
         cut_below, cut_above = y + height > rows - near, y < near
         return cls(
             azimuth=math.atan2(rays[2, 1], rays[2, 0]),
@@ -175,16 +175,16 @@ class BoxView:
 
 
 def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
-    """Return about where an upright thing is in the image: x, y, width, height [px].
+    """Return the approximate box of an upright thing in the image: x, y, width, height [px].
 
     Args:
-        camera: That takes the image.
-        foot: Where it stands, (3,) [m].
-        height_m: How high it is.
+        camera: The camera that takes the image.
+        foot: Position of its foot, (3,) [m].
+        height_m: Its height.
         share: Width of the box, as a share of its height.
 
     Returns:
-        None where the camera can't show it whole.
+        None if the camera can't show all of it.
     """
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:

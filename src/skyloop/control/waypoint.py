@@ -1,8 +1,8 @@
-"""Positions, where they come from, and a law that flies to one: position and yaw in, velocity out.
+"""Positions, position sources, and a law that flies to a position: position and yaw in, velocity out.
 
-The law is proportional, and pure. The speed is limited, and near the goal it is at most what a given deceleration
-brings to rest there. The error is turned by the yaw alone into the body's levelled axes, in which set-points are given
-(ROS REP 103).
+The law is proportional and pure. The speed is limited; near the goal it is at most the speed from which a given
+deceleration brings the vehicle to rest there. The yaw alone turns the error into the body's levelled axes, in which
+set-points are given (ROS REP 103).
 """
 
 from __future__ import annotations
@@ -58,19 +58,19 @@ class Waypoint:
 class WaypointSettings:
     """Gains, limits and acceptance radii. The defaults suit a small indoor vehicle with velocity control."""
 
-    gain: float = 1.2  #: speed by distance [1/s]
+    gain: float = 1.2  #: speed per distance [1/s]
     yaw_gain: float = 1.5  #: [1/s]
-    speed_m_s: float = 1.0  #: greatest, horizontally
-    climb_m_s: float = 0.6  #: greatest, up or down
-    turn_rad_s: float = 1.2  #: greatest
+    speed_m_s: float = 1.0  #: greatest horizontal speed
+    climb_m_s: float = 0.6  #: greatest vertical speed
+    turn_rad_s: float = 1.2  #: greatest yaw rate
     slow_down_m_s2: float = 0.6  #: deceleration towards the goal
     near_m: float = 0.15  #: acceptance radius
     near_rad: float = 0.1
-    slow_m_s: float = 0.2  #: greatest speed at which the goal counts as reached, where the velocity is known
+    slow_m_s: float = 0.2  #: greatest speed at which the goal counts as reached, if the velocity is known
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position and what helps, or an empty string if it can."""
+    """Return why a vehicle can't be flown to a position, and the remedy; empty if it can."""
     if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
     yaw = feedback.yaw_rad
@@ -81,7 +81,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
     """Compute the velocity that brings a vehicle to a waypoint.
 
     Args:
-        goal: Where to fly.
+        goal: The waypoint to fly to.
         feedback: The vehicle's newest feedback, with position and yaw.
         settings: Gains and limits; None are the defaults.
 
@@ -89,7 +89,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
         Set-point in the body's levelled axes [m/s, rad/s].
 
     Raises:
-        UsageError: Position or yaw are not known.
+        UsageError: Position or yaw is unknown.
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
@@ -107,15 +107,15 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Whether the vehicle is within the acceptance radius and nearly at rest.
+    """Return whether the vehicle is within the acceptance radius and nearly at rest.
 
     Args:
-        goal: Where it is to be.
+        goal: The waypoint.
         feedback: The vehicle's newest feedback; without a velocity it counts as at rest.
         settings: Acceptance radii; None are the defaults.
 
     Raises:
-        UsageError: Position or yaw are not known.
+        UsageError: Position or yaw is unknown.
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
@@ -125,17 +125,17 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 
 
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
-    """Return east, north, up [m] and yaw [rad] from where the vehicle is to the goal."""
+    """Return east, north, up [m] and yaw [rad] from the vehicle to the goal."""
     problem = lacking(feedback)
     if problem or feedback.position_m is None or feedback.yaw_rad is None:
-        raise UsageError(f"it can't fly to a waypoint: {problem}")
+        raise UsageError(f"can't fly to a waypoint: {problem}")
     x, y, z = feedback.position_m
     turn = 0.0 if goal.yaw is None else wrap_angle(goal.yaw - feedback.yaw_rad)
     return goal.x - x, goal.y - y, goal.z - z, turn
 
 
 def _approach(away: float, limit: float, s: WaypointSettings) -> float:
-    """Return the speed at a distance: by the gain, within the limit, and slow enough to come to rest at the goal."""
+    """Return the speed at a distance: by the gain, limited, and slow enough to stop at the goal."""
     return min(s.gain * away, limit, math.sqrt(2.0 * s.slow_down_m_s2 * away))
 
 
@@ -145,23 +145,23 @@ class Fix(NamedTuple):
     at_ns: int  #: on the proxy's clock
     position_m: Vector  #: [m]
     yaw_rad: float  #: counter-clockwise from x [rad]
-    velocity_m_s: Vector | None = None  #: in world axes [m/s], if it is known
+    velocity_m_s: Vector | None = None  #: in world axes [m/s]; None if unknown
 
     @property
     def finite(self) -> bool:
-        """Whether all its numbers are finite."""
+        """Whether all values are finite."""
         return all(map(math.isfinite, (*self.position_m, self.yaw_rad, *(self.velocity_m_s or ()))))
 
 
-#: Returns the newest known position, None while it is not known; must not block.
+#: Returns the newest position, or None while it is unknown; must not block.
 PositionSource = Callable[[], Fix | None]
 
 
 def fix_of(feedback: Feedback) -> Fix | None:
-    """Return the position that the vehicle itself reports.
+    """Return the position reported by the vehicle itself.
 
     Returns:
-        The fix at the feedback's capture; None while position or yaw are not known.
+        The fix at the feedback's capture; None while position or yaw is unknown.
     """
     if feedback.position_m is None or feedback.yaw_rad is None:
         return None
@@ -174,9 +174,9 @@ def fix_of(feedback: Feedback) -> Fix | None:
 
 
 class DeadReckoning:
-    """A position source for a vehicle that reports its velocity but no position: integrates it from where it is now.
+    """Position source that integrates the velocity of a vehicle that reports no position.
 
-    The position drifts by the velocity's error. The height is the vehicle's altitude, where it reports one. Feedback is
+    The position drifts with the velocity's error. The height is the vehicle's altitude, if it reports one. Feedback is
     handled on the thread that receives it.
     """
 
@@ -185,7 +185,7 @@ class DeadReckoning:
 
         Args:
             drone: The drone.
-            begin: Where it is now, x and y [m].
+            begin: The current position, x and y [m].
         """
         self._begin = begin
         self._airframe = Airframe()
@@ -193,7 +193,7 @@ class DeadReckoning:
         self._listener = drone.on_feedback(self._take, inline=True)
 
     def __call__(self) -> Fix | None:
-        """Return the newest position; None before velocity and yaw were received."""
+        """Return the newest position; None before the first velocity and yaw."""
         return self._newest
 
     def close(self) -> None:
@@ -204,7 +204,7 @@ class DeadReckoning:
         self._airframe.add(feedback)
         motion = self._airframe.newest
         if motion is None or motion.at_ns != feedback.captured_ns:
-            return  # nothing new, or nothing of use
+            return  # nothing new, or nothing usable
         east, north, up = motion.position.tolist()
         height = up if feedback.altitude_m is None else feedback.altitude_m
         vx, vy, vz = motion.velocity.tolist()

@@ -1,4 +1,4 @@
-"""Environments for reinforcement learning, over the simulator and much faster than real time (extra ``[gym]``).
+"""Environments for reinforcement learning on the simulator, much faster than real time (extra ``[gym]``).
 
 ::
 
@@ -45,7 +45,7 @@ TASKS = ("Reach", "Hover", "Follow", "Gates")
 
 
 def register() -> None:
-    """Make ``skyloop/Reach-v0`` and the other :data:`TASKS` known to ``gymnasium.make``. May be called twice."""
+    """Register ``skyloop/Reach-v0`` and the other :data:`TASKS` with ``gymnasium.make``. May be called twice."""
     for task in TASKS:
         if f"skyloop/{task}-v0" not in gymnasium.registry:
             gymnasium.register(

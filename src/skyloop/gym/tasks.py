@@ -1,4 +1,4 @@
-"""What the environments ask for, each for all drones of an arena at once: reach a place, hover, follow, fly gates."""
+"""The environments' tasks, each for all drones of an arena at once: reach a position, hover, follow, fly gates."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
 from skyloop.sim.vehicles import VEHICLES
 
-CELL_M: Final = 8.0  #: edge of the square that each drone has for itself
-REACH_M: Final = 3.5  #: a drone further from its cell's centre than this has left it
+CELL_M: Final = 8.0  #: edge of each drone's own square
+REACH_M: Final = 3.5  #: a drone further than this from its cell's centre has left it
 LOWEST_M: Final = 0.3
 HIGHEST_M: Final = 4.5
-_UP_S: Final = 15.0  #: within which every drone has taken off
+_UP_S: Final = 15.0  #: limit for the take-off of all drones
 
 
 class Arena:
-    """``drones`` of them, hovering. Deterministic: the same seed and actions give the same numbers."""
+    """A number of hovering drones. Deterministic: the same seed and actions give the same numbers."""
 
     def __init__(
         self, drones: int, seed: int, *, gusts_m_s: float, period_s: float, vehicle: VehicleParameters
@@ -38,26 +38,26 @@ class Arena:
         self._poses: tuple[Floats, Floats] | None = None
 
     def step(self, commands: Floats) -> None:
-        """Go on by one period with these velocities: forward, left, up [m/s], yaw rate [rad/s]; shape (n, 4)."""
+        """Advance by one period with these velocities: forward, left, up [m/s], yaw rate [rad/s]; shape (n, 4)."""
         for drone, row in enumerate(commands.tolist()):
             self.simulation.command(drone, Velocity(*row))
         self.simulation.step(self._steps)
         self._state = self._poses = None
 
     def put(self, drone: int, place: Floats, yaw: float) -> None:
-        """Put a drone somewhere in its cell, at rest; ``place`` relative to the cell's centre on the floor [m]."""
+        """Move a drone within its cell, at rest; ``place`` is relative to the cell's centre on the floor [m]."""
         x, y, z = place.tolist()
         middle_x, middle_y = self.centres[drone].tolist()
         self.simulation.put(drone, (middle_x + x, middle_y + y, z), yaw)
         self._state = self._poses = None
 
     def state(self) -> tuple[Floats, Floats, Floats]:
-        """Return where the drones are in their cells, how fast and at which angles; not to be changed.
+        """Return the drones' positions in their cells, velocities and angles; do not modify them.
 
         Returns:
             Positions, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll, pitch and
-            yaw, shape (n, 3) [rad]. Positions and angles are the true ones, as motion capture would measure them;
-            velocities are what the drones estimate.
+            yaw, shape (n, 3) [rad]. Positions and angles are the true ones, as from motion capture; velocities are the
+            drones' estimates.
         """
         if self._state is None:
             self._state = self.simulation.motions()
@@ -65,13 +65,13 @@ class Arena:
         return self._state
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Return the drones' poses in the world; see :meth:`Simulation.poses`. Not to be changed."""
+        """Return the drones' poses in the world; see :meth:`Simulation.poses`. Do not modify them."""
         if self._poses is None:
             self._poses = self.simulation.poses()
         return self._poses
 
     def airborne(self) -> NDArray[np.bool_]:
-        """Which drones fly, shape (n,)."""
+        """Return which drones fly, shape (n,)."""
         return self.simulation.airborne()
 
     def _take_off(self) -> None:
@@ -86,7 +86,7 @@ class Arena:
 
 
 def outside(places: Floats) -> NDArray[np.bool_]:
-    """Which drones have left their cell, shape (n,)."""
+    """Return which drones have left their cell, shape (n,)."""
     wide = np.abs(places[:, :2]).max(axis=1) > REACH_M
     low_or_high = (places[:, 2] < LOWEST_M) | (places[:, 2] > HIGHEST_M)
     found: NDArray[np.bool_] = wide | low_or_high
@@ -94,7 +94,7 @@ def outside(places: Floats) -> NDArray[np.bool_]:
 
 
 def _hall(drones: int) -> World:
-    """An empty hall with a cell for each drone, and a standing place in the middle of each."""
+    """Return an empty hall with a cell for each drone, and a spawn in the middle of each."""
     side = math.ceil(math.sqrt(drones))
     half = (side - 1) * CELL_M / 2
     lines = [f'[room]\nsize = [{side * CELL_M + 2}, {side * CELL_M + 2}, 8]\nfloor = "concrete"\nwalls = "plaster"\n']
@@ -110,24 +110,24 @@ Observation = NDArray[np.float32]
 Infos = dict[str, NDArray[Any]]
 
 PERIOD_S: Final = 0.04  #: between two actions
-SPEED_M_S: Final = 1.0  #: of a full action
-TURN_RAD_S: Final = 1.5
-NEAR_M: Final = 0.2  #: within this of the goal counts as there
-FOLLOWED_M: Final = 1.5  #: the distance from which a target is to be followed
+SPEED_M_S: Final = 1.0  #: at a full action
+TURN_RAD_S: Final = 1.5  #: at a full action
+NEAR_M: Final = 0.2  #: distance from the goal that counts as reached
+FOLLOWED_M: Final = 1.5  #: the desired distance from a followed target
 GATES: Final = 4
 GATE_RADIUS_M: Final = 0.5
 _GATE_RING_M: Final = 1.8  #: the gates stand on a circle of this radius
-_FOLLOWING_M: Final = 0.3  #: within this of the distance, and …
-_FOLLOWING_RAD: Final = 0.35  #: … with the target this near to the middle, it is followed
-_SPREAD: Final = (2.0, 2.0, 0.8)  #: goals and starts: this far from the middle of a cell [m] …
+_FOLLOWING_M: Final = 0.3  #: tolerance of the distance and …
+_FOLLOWING_RAD: Final = 0.35  #: … of the target's bearing within which it counts as followed
+_SPREAD: Final = (2.0, 2.0, 0.8)  #: goals and starts: up to this far from the middle of a cell [m] …
 _HEIGHT: Final = 2.0  #: … whose middle is this high
-_WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there
-_WALK_RAD_S: Final = 0.18  #: and how fast, at most: 0.3 m/s
-_FAILURE: Final = -5.0
+_WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there [m]
+_WALK_RAD_S: Final = 0.18  #: angular rate of the walk, for at most 0.3 m/s
+_FAILURE: Final = -5.0  #: reward for leaving the cell or falling
 _FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
-#: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to the wanted heading, sine, cosine
+#: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to desired heading: sine, cosine
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
-MOTION: Final = slice(3, 8)  #: the part of an observation that is the drone's own: velocity, roll, pitch
+MOTION: Final = slice(3, 8)  #: the drone's own motion within an observation: velocity, roll, pitch
 
 ACTIONS: Final = spaces.Box(-1.0, 1.0, (4,), np.float32)
 OBSERVATIONS: Final = spaces.Box(-_HIGHEST, _HIGHEST, dtype=np.float32)
@@ -135,7 +135,7 @@ MOTIONS: Final = spaces.Box(-_HIGHEST[MOTION], _HIGHEST[MOTION], dtype=np.float3
 
 
 class Reaching:
-    """Fly to a place and stay there, at a heading. Base of the other tasks."""
+    """Fly to a position and stay there, at a heading. Base of the other tasks."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         if not (1.0 <= seconds <= 600.0):
@@ -158,30 +158,30 @@ class Reaching:
     def arena(self) -> Arena:
         """The drones. Raises :class:`UsageError` before :meth:`begin`."""
         if self._arena is None:
-            raise UsageError("the environment was not reset yet: call reset() first")
+            raise UsageError("the environment has not been reset yet: call reset() first")
         return self._arena
 
     @property
     def begun(self) -> bool:
-        """Whether there are drones."""
+        """Whether :meth:`begin` was called."""
         return self._arena is not None
 
     def begin(self, seed: int) -> None:
-        """A new world from this seed, all drones hovering."""
+        """Make a new world from this seed, with all drones hovering."""
         self._arena = Arena(
             self.drones, seed, gusts_m_s=self.gusts_m_s, period_s=PERIOD_S, vehicle=VEHICLES[self.vehicle]
         )
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
-        """Another start and another goal for these drones."""
-        self.age[which] = 0  # before they are placed: of a task that moves its goals that depends on the age
+        """Choose another start and another goal for these drones."""
+        self.age[which] = 0  # before placing them: in a task with moving goals, these depend on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)
         self._before[which] = 0.0
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Rewards, which are over for good, which are at the end of their time, and what there is to know of each."""
+        """Return rewards, terminated episodes, truncated episodes, and further values for each drone."""
         bounded = np.minimum(np.maximum(np.where(np.isnan(actions), 0.0, actions), -1.0), 1.0)
         self.arena.step(bounded * _FULL)
         self.age += 1
@@ -194,12 +194,12 @@ class Reaching:
         return rewards - 0.002 * jerk + _FAILURE * failed, failed | done, self.age >= self.steps, infos
 
     def infos(self) -> Infos:
-        """What there is to know of each drone now, as :meth:`step` returns it."""
+        """Return the further values for each drone, as in :meth:`step`."""
         places, _, angles = self.arena.state()
         return self._judge(places, angles[:, 2])[2]
 
     def observe(self) -> Observation:
-        """The observation, shape (n, 10)."""
+        """Return the observation, shape (n, 10)."""
         places, velocities, angles = self.arena.state()
         east, north, up = (self.goals - places).T
         roll, pitch, yaw = angles.T
@@ -216,10 +216,10 @@ class Reaching:
         return np.maximum(seen, -_HIGHEST, out=seen)
 
     def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
-        """What to draw of the task: centre in the cell, normal (None: faces the camera), radius [m]."""
+        """Return the task's goals to draw: centre in the cell, normal (None: faces the camera), radius [m]."""
         return [(self.goals[drone], None, 0.2)]
 
-    # What the tasks differ in -----------------------------------------------------------------------------------
+    # For subclasses ---------------------------------------------------------------------------------------------
 
     def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
         """Choose a goal; return the start in the cell and its heading."""
@@ -229,7 +229,7 @@ class Reaching:
         return start, heading
 
     def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others need it
-        """Rewards, which tasks are done, and what there is to know."""
+        """Return rewards, completed tasks and further values."""
         distances = np.linalg.norm(self.goals - places, axis=1)
         rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
         infos: Infos = {"distance_m": distances, "is_success": distances < NEAR_M}
@@ -240,7 +240,7 @@ class Reaching:
 
 
 class Hovering(Reaching):
-    """Stay where it is, at the heading that it has, whatever the gusts."""
+    """Stay at the starting position and heading, whatever the gusts."""
 
     def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
         start = rng.uniform(-1, 1, 3) * _SPREAD + [0, 0, _HEIGHT]
@@ -250,7 +250,7 @@ class Hovering(Reaching):
 
 
 class Following(Reaching):
-    """Follow a target that walks about: at a distance, with the target in the middle of the picture."""
+    """Follow a walking target at a distance, with the target in the middle of the picture."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         super().__init__(drones, seconds, gusts_m_s, vehicle)
@@ -258,7 +258,7 @@ class Following(Reaching):
         self._rates = np.zeros((drones, 3))
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """As for every task, after the targets have gone on."""
+        """Do a step of the base class after the targets have moved."""
         self._walk(self.age + 1)
         return super().step(actions)
 
@@ -267,7 +267,7 @@ class Following(Reaching):
         self._rates[drone] = rng.uniform(0.5, 1.0, 3) * _WALK_RAD_S * rng.choice([-1.0, 1.0], 3)
         self._walk(self.age)
         target = self.goals[drone]
-        bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # starts on the side of the middle
+        bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # towards the middle
         away = float(rng.uniform(1.2, 2.2))
         start = target + np.array([away * math.cos(bearing), away * math.sin(bearing), 0.0])
         return start, bearing + math.pi + float(rng.uniform(-0.3, 0.3))
@@ -302,7 +302,7 @@ class Racing(Reaching):
         self._places = np.zeros((drones, 3))
 
     def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
-        """The gates that are still to be passed, the next one first."""
+        """Return the remaining gates, the next one first."""
         rest = range(int(self.passed[drone]), GATES)
         return [(self._gates[drone, gate], self._normals[drone, gate], GATE_RADIUS_M) for gate in rest]
 
@@ -320,21 +320,21 @@ class Racing(Reaching):
         return start, float(self.headings[drone])
 
     def _aim(self) -> None:
-        """The goal of each drone is the middle of its next gate, and its heading the way through."""
+        """Set each drone's goal to the middle of its next gate, with the heading of the passage."""
         rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
         self.goals = self._gates[rows, following]
         normals = self._normals[rows, following]
         self.headings = np.arctan2(normals[:, 1], normals[:, 0])
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """As for every task; a reward of 1 for each gate, and for coming nearer to the next one."""
+        """Do a step of the base class, with a reward of 1 for each gate, and for approaching the next one."""
         before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
         rewards, done, over, infos = super().step(actions)
         nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)
         return rewards + nearer + 1.0 * (self.passed - counts), done, over, infos
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
-        """Another course for these drones."""
+        """Choose another course for these drones."""
         super().restart(which, rng)
         self._places[which] = self.arena.state()[0][which]
 

@@ -1,8 +1,8 @@
-"""The former address of the part of :mod:`skyloop.recording` that reads files: programs may still import from here."""
+"""The former import path of :mod:`skyloop.recording`'s file readers, kept for existing programs."""
 
 import sys
 from importlib import import_module
 
-# Their modules are these under another name, so that classes are the same by both.
+# Alias the modules, so that classes are identical under both names.
 for _name in ("layout", "pictures", "reader"):
     sys.modules[f"{__name__}.{_name}"] = globals()[_name] = import_module(f"skyloop.recording.{_name}")

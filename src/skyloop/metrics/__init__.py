@@ -1,6 +1,6 @@
-"""What proxies, the cockpit and routers count, for Prometheus: read when it is asked for, never on the way of a sample.
+"""Metrics of proxies, the cockpit and routers for Prometheus: collected on each scrape, never on a sample's path.
 
-Any thread may read; no lock is taken that a command waits for. Needs the extra ``metrics``.
+Any thread can read them; reading takes no lock that a command waits for. Needs the extra ``metrics``.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Metrics that are one of the proxy's counters: absent ones are 0, except those of a network that is not served.
+#: Metrics that are counters of the proxy: absent ones are 0, except those of a network that is not served.
 _COUNTERS: Final = {
     "skyloop_feedback_published_total": "feedback.published",
     "skyloop_feedback_selected_total": "feedback.selected",
@@ -43,7 +43,7 @@ _NETWORK: Final = {
     "skyloop_network_strays_total": "network.strays",
     "skyloop_network_turned_away_total": "network.turned_away",
 }
-#: Counters with a label in their name: how they begin, and how they end.
+#: Counters with a label in their name: the parts before and after it.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
     "skyloop_events_total": ("events.of.", ""),
@@ -73,11 +73,11 @@ def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoin
     """Serve the metrics of the proxies of this process.
 
     Args:
-        proxies: Returns those that there are; called for each scrape, on the endpoint's thread.
+        proxies: Returns the current proxies; called on the endpoint's thread for each scrape.
         where: ``[HOST:]PORT``; see :func:`serve`.
 
     Raises:
-        UsageError: ``where`` is no address, or can't be listened on.
+        UsageError: ``where`` is not an address, or can't be listened on.
         MissingExtraError: The extra ``metrics`` is not installed.
     """
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
@@ -86,11 +86,11 @@ def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoin
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return what :func:`skyloop.proxy.serve.run` enters to serve the metrics of its proxies while it runs.
+    """Return a context for :func:`skyloop.proxy.serve.run` that serves the metrics of its proxies.
 
     Args:
         where: ``[HOST:]PORT``; see :func:`serve`.
-        announce: Called with a line for people: where the metrics are.
+        announce: Called with a line for people that says where the metrics are.
     """
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
@@ -102,7 +102,7 @@ def serving_beside(
 
 
 def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
-    """Yield all that is to be known of one proxy, its vehicle and its applications."""
+    """Yield all metrics of one proxy, its vehicle and its applications."""
     name, now_ns, publisher, handler = proxy.name, proxy.clock(), proxy.publisher, proxy.handler
     own = (name,)
     yield Reading("skyloop_vehicle_info", 1.0, (name, proxy.capabilities.vehicle))
@@ -143,11 +143,11 @@ def proxy_readings(proxy: Proxy) -> Iterator[Reading]:
 
 
 def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
-    """Yield what a client knows of its connection to one proxy. Asks the proxy for nothing."""
+    """Yield a client's metrics of its connection to one proxy, without a request to the proxy."""
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
     for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
-            continue  # forms of video are as many as pages ask for, and an observer sends no commands
+            continue  # pages create any number of video streams, and an observer sends no commands
         labels = (name, channel)
         yield Reading("skyloop_client_received_total", float(stats.count), labels)
         yield Reading("skyloop_client_lost_total", float(stats.lost), labels)
@@ -177,6 +177,6 @@ def router_readings(session: Callable[[], Session]) -> Source:
 
 
 def _states(metric: str, labels: tuple[str, ...], current: Enum, states: type[Enum]) -> Iterator[Reading]:
-    """Yield 1 for the present state and 0 for each other one."""
+    """Yield 1 for the current state and 0 for each other."""
     for state in states:
         yield Reading(metric, float(state is current), (*labels, str(state.value)))

@@ -1,6 +1,6 @@
-"""Every metric that there is, as ``docs/operations.md`` lists them, and the HTTP endpoint that Prometheus reads.
+"""All metrics, as ``docs/operations.md`` lists them, and the HTTP endpoint for Prometheus.
 
-The endpoint has threads of its own: who reads it, or stops reading, delays nothing else.
+The endpoint has its own threads: a slow or stalled reader delays nothing else.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Family:
 
 
 class Reading(NamedTuple):
-    """One value of a metric now."""
+    """The current value of a metric."""
 
     name: str
     value: float
@@ -52,30 +52,30 @@ _CHANNEL: Final = ("vehicle", "channel")
 FAMILIES: Final[dict[str, Family]] = {
     family.name: family
     for family in (
-        # Of each proxy; the label `vehicle` is the proxy's name.
-        Family("skyloop_vehicle_info", "info", ("vehicle", "family"), "which family each vehicle is of"),
-        Family("skyloop_vehicle_state", "gauge", ("vehicle", "state"), "1 for the present flight state, else 0"),
+        # For each proxy; the label `vehicle` is the proxy's name.
+        Family("skyloop_vehicle_info", "info", ("vehicle", "family"), "the vehicle's family"),
+        Family("skyloop_vehicle_state", "gauge", ("vehicle", "state"), "1 for the current flight state, else 0"),
         Family(
             "skyloop_vehicle_link_state",
             "gauge",
             ("vehicle", "state"),
-            "1 for the present state of the link between proxy and vehicle, else 0",
+            "1 for the current state of the link between proxy and vehicle, else 0",
         ),
-        Family("skyloop_vehicle_battery_ratio", "gauge", _VEHICLE, "charge left, 0 to 1; absent while not known"),
-        Family("skyloop_vehicle_battery_volts", "gauge", _VEHICLE, "voltage of the battery; absent while not known"),
-        Family("skyloop_failsafe", "gauge", ("vehicle", "step"), "1 for the failsafe's step in force, else 0"),
-        Family("skyloop_feedback_age_seconds", "gauge", _VEHICLE, "since the vehicle's newest state was captured"),
+        Family("skyloop_vehicle_battery_ratio", "gauge", _VEHICLE, "charge left, 0 to 1; absent while unknown"),
+        Family("skyloop_vehicle_battery_volts", "gauge", _VEHICLE, "voltage of the battery; absent while unknown"),
+        Family("skyloop_failsafe", "gauge", ("vehicle", "step"), "1 for the failsafe's current step, else 0"),
+        Family("skyloop_feedback_age_seconds", "gauge", _VEHICLE, "age of the vehicle's newest state"),
         Family("skyloop_feedback_published_total", "counter", _VEHICLE, "samples of feedback published"),
-        Family("skyloop_feedback_selected_total", "counter", _VEHICLE, "samples published in forms with less in them"),
-        Family("skyloop_feedback_missed_total", "counter", _VEHICLE, "samples that did not fit into a subscriber"),
-        Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands that came"),
+        Family("skyloop_feedback_selected_total", "counter", _VEHICLE, "samples published in reduced forms"),
+        Family("skyloop_feedback_missed_total", "counter", _VEHICLE, "samples that a subscriber had no room for"),
+        Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands received"),
         Family("skyloop_commands_applied_total", "counter", _VEHICLE, "commands handed to the vehicle"),
         Family("skyloop_commands_clamped_total", "counter", _VEHICLE, "commands lowered to a limit"),
         Family(
             "skyloop_commands_superseded_total",
             "counter",
             _VEHICLE,
-            "commands that waited, and made way for newer ones",
+            "waiting commands replaced by newer ones",
         ),
         Family("skyloop_commands_refused_total", "counter", ("vehicle", "reason"), "commands refused, by reason"),
         Family(
@@ -88,42 +88,42 @@ FAMILIES: Final[dict[str, Family]] = {
             "skyloop_command_age_seconds",
             "gauge",
             _VEHICLE,
-            "since the pilot's newest valid command; absent while nobody has the authority",
+            "since the pilot's newest valid command; absent while no application has the authority",
         ),
         Family("skyloop_authority_held", "gauge", _VEHICLE, "1 while an application has the authority, else 0"),
-        Family("skyloop_authority_priority", "gauge", _VEHICLE, "its priority, 0 the highest; absent while none has"),
-        Family("skyloop_authority_waiting", "gauge", _VEHICLE, "applications that wait for the authority"),
+        Family("skyloop_authority_priority", "gauge", _VEHICLE, "its priority, 0 the highest; absent without one"),
+        Family("skyloop_authority_waiting", "gauge", _VEHICLE, "applications waiting for the authority"),
         Family("skyloop_authority_leases_total", "counter", _VEHICLE, "how often the authority was granted"),
         Family("skyloop_applications", "gauge", _VEHICLE, "applications connected"),
-        Family("skyloop_requests_total", "counter", _VEHICLE, "requests that came"),
+        Family("skyloop_requests_total", "counter", _VEHICLE, "requests received"),
         Family("skyloop_requests_refused_total", "counter", _VEHICLE, "requests refused"),
         Family("skyloop_packets_malformed_total", "counter", _VEHICLE, "packets that could not be decoded"),
         Family("skyloop_packets_refused_total", "counter", _VEHICLE, "packets that the sender's keys do not allow"),
         Family("skyloop_events_total", "counter", ("vehicle", "kind"), "events published, by kind"),
-        Family("skyloop_events_missed_total", "counter", _VEHICLE, "events that did not fit into a subscriber"),
-        Family("skyloop_driver_errors_total", "counter", _VEHICLE, "calls of the driver that failed"),
-        Family("skyloop_frames_received_total", "counter", ("vehicle", "camera"), "frames that the vehicle gave"),
+        Family("skyloop_events_missed_total", "counter", _VEHICLE, "events that a subscriber had no room for"),
+        Family("skyloop_driver_errors_total", "counter", _VEHICLE, "failed calls of the driver"),
+        Family("skyloop_frames_received_total", "counter", ("vehicle", "camera"), "frames received from the vehicle"),
         Family("skyloop_frames_published_total", "counter", ("vehicle", "camera"), "frames published"),
-        Family("skyloop_frames_missed_total", "counter", ("vehicle", "camera"), "frames that passed a subscriber by"),
+        Family("skyloop_frames_missed_total", "counter", ("vehicle", "camera"), "frames missed by a subscriber"),
         Family(
             "skyloop_network_dropped_total",
             "counter",
             _VEHICLE,
-            "packets to single applications that were given up",
+            "dropped packets to single applications",
         ),
-        Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that gives no right to them"),
-        Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries of nobody that is connected"),
-        Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for want of a place"),
-        # Of the cockpit, as a client of each proxy.
+        Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
+        Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
+        Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),
+        # For the cockpit, as a client of each proxy.
         Family(
             "skyloop_client_link_state",
             "gauge",
             ("vehicle", "state"),
-            "1 for the present state of the link to the proxy, else 0",
+            "1 for the current state of the link to the proxy, else 0",
         ),
         Family("skyloop_client_received_total", "counter", _CHANNEL, "samples received"),
         Family("skyloop_client_lost_total", "counter", _CHANNEL, "samples missing by the gaps in their numbers"),
-        Family("skyloop_client_dropped_total", "counter", _CHANNEL, "samples that newer ones overtook here"),
+        Family("skyloop_client_dropped_total", "counter", _CHANNEL, "samples overtaken by newer ones here"),
         Family("skyloop_client_malformed_total", "counter", _CHANNEL, "samples that could not be decoded"),
         Family(
             "skyloop_client_delay_seconds",
@@ -131,13 +131,13 @@ FAMILIES: Final[dict[str, Family]] = {
             ("vehicle", "channel", "statistic"),
             "from publishing to receiving, of the last 1024 samples: median, p99, max",
         ),
-        Family("skyloop_client_age_seconds", "gauge", _CHANNEL, "since the newest sample was captured"),
-        Family("skyloop_cockpit_unreachable", "gauge", (), "proxies that were found and could not be connected to"),
-        Family("skyloop_cockpit_pilots", "gauge", _VEHICLE, "pages that have, or wait for, the authority, or may stop"),
-        # Of a router.
+        Family("skyloop_client_age_seconds", "gauge", _CHANNEL, "age of the newest sample"),
+        Family("skyloop_cockpit_unreachable", "gauge", (), "discovered proxies that can't be connected to"),
+        Family("skyloop_cockpit_pilots", "gauge", _VEHICLE, "pages that have or await the authority, or may stop"),
+        # For a router.
         Family("skyloop_router_links", "gauge", ("kind",), "links to others: router, peer (a proxy), client"),
         Family("skyloop_router_shut_out", "gauge", (), "linked nodes whose keys were revoked or changed"),
-        # Of every endpoint.
+        # For every endpoint.
         Family("skyloop_scrape_errors_total", "counter", (), "readings that failed and are missing, see the log"),
     )
 }
@@ -145,10 +145,10 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: at a time; for a further connection the one is closed that has taken longest without asking
-ANSWER_S: Final = 1.0  #: a scrape that takes no longer to be answered makes way for nobody
-DEADLINE_S: Final = 10.0  #: for one connection, from its first byte to its last
-_POLL_S: Final = 0.1
+MAX_SCRAPES: Final = 8  #: at a time; a further connection closes the one that has waited longest without a request
+ANSWER_S: Final = 1.0  #: a scrape is never closed for a new connection before this time
+DEADLINE_S: Final = 10.0  #: longest duration of a connection, from its first byte to its last
+_POLL_S: Final = 0.1  # how often the server thread checks whether to stop
 _log = logging.getLogger(__name__)
 
 #: Reads the values of one thing now.
@@ -159,12 +159,12 @@ def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: fl
     """Serve metrics over HTTP until the endpoint is closed.
 
     Args:
-        sources: Returns what there is to read; called for each scrape, and each of them too, on the endpoint's threads.
-        where: ``[HOST:]PORT``; the host is 127.0.0.1 if it is left out, and port 0 takes a free one.
-        deadline_s: How long one connection may take, at most :data:`MAX_SCRAPES` at a time [s].
+        sources: Returns the sources; it and they are called on the endpoint's threads for each scrape.
+        where: ``[HOST:]PORT``; the host defaults to 127.0.0.1, and port 0 takes a free one.
+        deadline_s: How long a connection may take [s]; at most :data:`MAX_SCRAPES` are open at a time.
 
     Raises:
-        UsageError: ``where`` is no address, or can't be listened on.
+        UsageError: ``where`` is not an address, or can't be listened on.
         MissingExtraError: The extra ``metrics`` is not installed.
     """
     return Endpoint(sources, parse_where(where), deadline_s)
@@ -174,19 +174,19 @@ def parse_where(where: str) -> tuple[str, int]:
     """Return host and port of ``[HOST:]PORT``; IPv6 addresses are in brackets.
 
     Raises:
-        UsageError: It is not of that form.
+        UsageError: The text has another form.
     """
     host, colon, port = where.rpartition(":")
     if not (port.isascii() and port.isdigit() and int(port) <= 65535) or (colon and not host):
-        raise UsageError(f"{where!r:.80} is no place for metrics: give a port, 0 to 65535, or HOST:PORT")
+        raise UsageError(f"{where!r:.80} is not an address for metrics: give a port, 0 to 65535, or HOST:PORT")
     return (host.removeprefix("[").removesuffix("]") if colon else LOOPBACK), int(port)
 
 
 class Endpoint:
-    """Metrics over HTTP, made by :func:`serve`; a context manager that ends it."""
+    """Metrics over HTTP, created by :func:`serve`; a context manager that closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
-        """Listen, and answer from now on; see :func:`serve`."""
+        """Listen and answer from now on; see :func:`serve`."""
         self._server = _Server(where, _registry(sources), deadline_s)
         self._thread = threading.Thread(
             target=self._server.serve_forever, args=(_POLL_S,), name="skyloop-metrics", daemon=True
@@ -200,18 +200,18 @@ class Endpoint:
 
     @property
     def url(self) -> str:
-        """Where Prometheus finds the metrics."""
+        """Address of the metrics for Prometheus."""
         host = str(self._server.server_address[0])
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{PATH}"
 
     @property
     def announcement(self) -> str:
-        """A line for people: where the metrics are, and who can read them."""
-        open_to = "" if self._server.own else " (WARNING: whoever reaches this address can read them)"
+        """A line for people: where the metrics are and who can read them."""
+        open_to = "" if self._server.own else " (WARNING: anyone who reaches this address can read them)"
         return f"metrics: {self.url}{open_to}"
 
     def close(self) -> None:
-        """Answer no more. Idempotent."""
+        """Stop answering. Idempotent."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -226,9 +226,9 @@ class Endpoint:
 
 
 class Collector:
-    """Reads all sources when it is asked, in the form of ``prometheus_client``.
+    """Reads all sources on request, in the format of ``prometheus_client``.
 
-    A source that fails is left out, counted and logged; the others are served all the same.
+    A source that fails is skipped, counted and logged; the others are still served.
     """
 
     def __init__(self, sources: Callable[[], Iterable[Source]]) -> None:
@@ -237,7 +237,7 @@ class Collector:
         self._lock = threading.Lock()
 
     def collect(self) -> Iterator[Metric]:
-        """Yield all metrics that have a value now."""
+        """Yield all metrics that currently have a value."""
         from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 
         made: dict[str, Any] = {}
@@ -264,7 +264,7 @@ class Collector:
                 with self._lock:
                     self._errors += 1
                 _log.exception("metrics can't be read")
-            time.sleep(0)  # lets a thread go first that carries a command
+            time.sleep(0)  # lets a thread with a command go first
         yield Reading("skyloop_scrape_errors_total", float(self._errors))
 
 
@@ -298,10 +298,10 @@ class _Server(ThreadingHTTPServer):
         self.own = is_loopback(str(self.server_address[0]))
         self._deadline_s = deadline_s
         self._lock = threading.Lock()
-        self._open: dict[Any, float] = {}  # connections, and until when each makes way for nobody; the oldest first
+        self._open: dict[Any, float] = {}  # connections, each protected until a time; oldest first
 
     def server_bind(self) -> None:
-        # Not HTTPServer's, which looks up this machine's name in the network.
+        # Not HTTPServer's, which looks up this machine's name on the network.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -312,7 +312,7 @@ class _Server(ThreadingHTTPServer):
             now_s = time.monotonic()
             if len(self._open) >= MAX_SCRAPES:
                 idle = next((one for one, until_s in self._open.items() if until_s <= now_s), None)
-                if idle is not None:  # its thread ends with the next that it reads or writes
+                if idle is not None:  # its thread ends with its next read or write
                     del self._open[idle]
                     _hang_up(idle)
             admitted = len(self._open) < MAX_SCRAPES
@@ -324,13 +324,13 @@ class _Server(ThreadingHTTPServer):
             self.shutdown_request(request)
 
     def asked(self, request: Any) -> None:
-        """Note that a whole request has come over a connection."""
+        """Note that a connection has sent a whole request."""
         with self._lock:
             if request in self._open:
                 self._open[request] = time.monotonic() + ANSWER_S
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        # A limit for the whole connection, as one for each read would let a byte now and then hold it for ever.
+        # Limit the whole connection: with a limit per read, a byte now and then could hold it forever.
         guard = threading.Timer(self._deadline_s, _hang_up, (request,))
         guard.daemon = True
         guard.start()
@@ -353,8 +353,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.server.asked(self.connection)
         if self.server.own and not _names_loopback(self.headers.get("Host", "")):
-            # A page of another site whose name leads here: its script could read the answer.
-            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for this by its address\n")
+            # DNS rebinding: a script of another site whose name resolves here could read the answer.
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"use this machine's address\n")
         elif self.path.partition("?")[0] != PATH:
             self._answer(HTTPStatus.NOT_FOUND, "text/plain", f"the metrics are at {PATH}\n".encode())
         else:
@@ -383,5 +383,5 @@ def _names_loopback(host: str) -> bool:
 
 
 def _hang_up(request: socket.socket) -> None:
-    with suppress(OSError):  # it is gone already
+    with suppress(OSError):  # already gone
         request.shutdown(socket.SHUT_RDWR)

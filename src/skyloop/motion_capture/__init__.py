@@ -23,21 +23,21 @@ __all__ = [
 
 
 def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -> MotionCapture:
-    """Connect to a motion capture system, and wait for its first frame.
+    """Connect to a motion capture system and wait for its first frame.
 
     Positions are in metres, in world axes with z up.
 
     Args:
         address: ``vicon://HOST``, ``optitrack://HOST`` or ``qualisys://HOST`` (extra ``[mocap]``), ``vrpn://HOST``, or
             ``sim://`` for the true poses of simulated drones.
-        bodies: Names of drones to the names that the system gives their bodies, ``{"alpha": "alpha_body"}``. With
-            VRPN those are trackers, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
+        bodies: Names of drones, mapped to the system's names of their bodies, ``{"alpha": "alpha_body"}``. With VRPN,
+            a body is a tracker, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
         timeout_s: How long to wait for the first frame [s].
 
     Raises:
-        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none was named.
+        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none is named.
         UnknownNameError: There is no such system or option.
-        LinkError: No frame comes within ``timeout_s``.
+        LinkError: No frame arrives within ``timeout_s``.
         MissingExtraError: The extra ``[mocap]`` is not installed.
         UnsupportedError: A simulated drone does not report its true pose.
     """

@@ -22,9 +22,9 @@ from skyloop.motion_capture.source import RawFrame, System
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-LOOK_S: Final = 0.05  #: period of the check whether a body is lost
-EVENT_DEPTH: Final = 256  #: how many events wait for a slow callback
-MAX_UNKNOWN: Final = 1000  #: limit of the names of unrequested bodies that are remembered
+LOOK_S: Final = 0.05  #: period of the check for lost bodies
+EVENT_DEPTH: Final = 256  #: how many events can wait for a slow callback
+MAX_UNKNOWN: Final = 1000  #: limit of remembered names of unrequested bodies
 T = TypeVar("T")
 _log = logging.getLogger("skyloop")
 
@@ -34,7 +34,7 @@ class TrackEvent:
     """A change of a body's tracking, or trouble with the system."""
 
     at_ns: int  #: on this host's monotonic clock
-    body: str  #: empty where the event is about the system
+    body: str  #: empty if the event is about the system
     state: TrackState
     text: str
 
@@ -44,27 +44,27 @@ OnEvent = Callable[[TrackEvent], object]
 
 
 class Source(Protocol):
-    """Where frames come from."""
+    """A source of frames."""
 
     def start(self, timeout_s: float) -> None: ...
     def close(self) -> None: ...
 
 
-#: Creates a source from a system, the bodies' names in it, and callbacks for frames and for troubles (in words).
+#: Creates a source from a system, its names of the bodies, and callbacks for frames and for problems (as text).
 MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callable[[str], None]], Source]
 
 
 class MotionCapture:
     """Poses of the bodies that a motion capture system tracks. A context manager; created by :func:`skyloop.mocap`.
 
-    Every method may be called from any thread. Callbacks have a thread of their own; with ``inline=True`` they run on
-    the receiving thread (events also on a thread that checks for lost bodies) and must be quick. One that raises is
-    counted and logged and does not affect the others.
+    Methods can be called from any thread. Callbacks have their own thread; with ``inline=True`` they run on the
+    receiving thread (events also on the thread that checks for lost bodies) and must be quick. A callback that raises
+    is counted and logged and does not affect the others.
 
     Attributes:
         system: The system.
         bodies: Names of drones to the system's names of their bodies.
-        latency_ns: Age of a pose on arrival, as given in the address.
+        latency_ns: Age of a pose on arrival, from the address.
         unknown: Bodies that the system sees but ``bodies`` does not name.
     """
 
@@ -82,7 +82,7 @@ class MotionCapture:
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
             raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
-            raise UsageError(f"bodies is {bodies!r}: two names for one body")
+            raise UsageError(f"bodies is {bodies!r} and must not give one body two names")
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
@@ -90,9 +90,9 @@ class MotionCapture:
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
-        self._troubled = ""  # the trouble that was told last, until a frame comes
+        self._troubled = ""  # the last reported problem, until a frame arrives
         self._calibrations: dict[str, Calibration] = {}
-        self._measured: dict[str, list[BodyPose]] = {}  # as the system sees them, for a calibration in progress
+        self._measured: dict[str, list[BodyPose]] = {}  # uncalibrated poses, for a calibration in progress
         self._poses: Channel[BodyPose] = Channel()
         self._events: Channel[TrackEvent] = Channel()
         self._listeners: list[Listener[Any]] = []
@@ -104,15 +104,15 @@ class MotionCapture:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def _open(self, timeout_s: float = 5.0) -> Self:
-        """Connect, and wait for the first frame.
+        """Connect and wait for the first frame.
 
         Args:
             timeout_s: How long to wait.
 
         Raises:
-            LinkError: No frame came within that time.
+            LinkError: No frame arrived within that time.
             MissingExtraError: The extra ``[mocap]`` is not installed.
-            UsageError: A VRPN tracker has several sensors and none was named.
+            UsageError: A VRPN tracker has several sensors and none is named.
             UnsupportedError: A simulated drone does not report its true pose.
         """
         self._source.start(timeout_s)
@@ -125,7 +125,7 @@ class MotionCapture:
             return
         self._ended.set()
         self._source.close()
-        if self._watch.ident is not None and self._watch is not threading.current_thread():  # of an inline callback
+        if self._watch.ident is not None and self._watch is not threading.current_thread():  # by an inline callback
             self._watch.join()
         for listener in list(self._listeners):
             listener.cancel()
@@ -145,14 +145,14 @@ class MotionCapture:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def pose(self, name: str) -> BodyPose | None:
-        """Return the newest pose of a body while it is tracked; None while it is not, never an old one.
+        """Return the newest pose of a body while it is tracked; None otherwise, never an old pose.
 
         Raises:
             UnknownNameError: ``bodies`` has no such name.
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns() - self.latency_ns)  # the watching thread may be late
+            track.look(monotonic_ns() - self.latency_ns)  # the watching thread may lag behind
             return track.pose
 
     def state(self, name: str) -> TrackState:
@@ -164,14 +164,14 @@ class MotionCapture:
         return self._track(name).state
 
     def wait(self, name: str, timeout_s: float = 5.0) -> BodyPose:
-        """Wait until a body is tracked, and return its pose.
+        """Wait until a body is tracked and return its pose.
 
         Args:
             name: One of ``bodies``.
             timeout_s: How long to wait.
 
         Raises:
-            NoAnswerError: It is not tracked within that time; the text lists what the system sees instead.
+            NoAnswerError: It is not tracked within that time; the message lists the bodies that the system sees.
             ClosedError: This motion capture was closed.
             UnknownNameError: ``bodies`` has no such name.
         """
@@ -189,13 +189,13 @@ class MotionCapture:
     def on_pose(self, function: OnPose, *, depth: int = 1, inline: bool = False) -> Listener[BodyPose]:
         """Call ``function`` with the newest pose of any body.
 
-        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`, whose ``cancel()`` or end
-        of its ``with`` block ends it.
+        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`; its ``cancel()``, or the
+        end of its ``with`` block, stops the calls.
 
         Args:
-            function: Called on a thread of its own; poses that newer ones overtake are dropped and counted.
-            depth: How many poses may wait for it, such as one for each body.
-            inline: Call it on the receiving thread instead, with every pose. It must be quick and must not wait.
+            function: Called on a separate thread; poses overtaken by newer ones are dropped and counted.
+            depth: Number of poses that can wait for it, such as one per body.
+            inline: Call it on the receiving thread instead, with every pose. It must be quick and must not block.
 
         Raises:
             UsageError: The function can't be called, or ``depth`` is less than 1.
@@ -206,11 +206,11 @@ class MotionCapture:
     def on_event(self, function: OnEvent, *, inline: bool = False) -> Listener[TrackEvent]:
         """Call ``function`` whenever a body is found or lost, or the system has trouble.
 
-        Returns and raises as :meth:`on_pose`.
+        Returns and raises like :meth:`on_pose`.
 
         Args:
-            function: Called on a thread of its own; up to 256 events wait for it.
-            inline: Call it on the thread that found the change instead.
+            function: Called on a separate thread; up to 256 events wait for it.
+            inline: Call it on the thread that detected the change instead.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 
@@ -219,7 +219,7 @@ class MotionCapture:
     ) -> Listener[T]:
         self._check_open()
         if not callable(function):
-            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+            raise UsageError(f"{function!r:.80} can't be called: give a function with one argument")
         if isinstance(depth, bool) or not isinstance(depth, int) or depth < 1:
             raise UsageError(f"depth is {depth!r} and must be a whole number of at least 1")
         listener = Listener(
@@ -243,12 +243,12 @@ class MotionCapture:
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
         """Log a drone's poses with the drone, so that recorders write them and the cockpit shows them.
 
-        Loss of tracking is logged too.
+        Loss of tracking is also logged.
 
         Args:
             drone: Its proxy's name must be one of ``bodies``.
             max_hz: Greatest rate of the logged poses, 1 to 1000.
-            to_vehicle: Whether to send the poses to the vehicle too (:meth:`Drone.send_external_pose`), which may fly
+            to_vehicle: Whether to also send the poses to the vehicle (:meth:`Drone.send_external_pose`), which may fly
                 by them.
 
         Returns:
@@ -256,7 +256,7 @@ class MotionCapture:
 
         Raises:
             UnknownNameError: ``bodies`` has no such name.
-            UsageError: ``max_hz`` is out of its range.
+            UsageError: ``max_hz`` is out of range.
         """
         self._track(drone.name)
         return Linked(self, drone, max_hz, to_vehicle)
@@ -272,13 +272,13 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between the tracked body's axes and the drone's, while it stands at rest on the ground.
+        """Measure the rotation between the tracked body's axes and the drone's, at rest on the ground.
 
-        From then on the poses of that body are the drone's; until it is found an earlier calibration stays in force.
+        Afterwards the poses of that body are the drone's; until then an earlier calibration stays in force.
 
         Args:
             drone: Its proxy's name must be one of ``bodies``.
-            heading: Of its nose in the world [rad], counter-clockwise from x.
+            heading: Heading of the drone's nose in the world [rad], counter-clockwise from x.
             seconds: How long to collect poses.
 
         Raises:
@@ -289,7 +289,7 @@ class MotionCapture:
         name = drone.name
         self.wait(name)
         if drone.feedback().state.airborne:
-            raise UsageError(f"{name} flies: a calibration needs it at rest on the ground")
+            raise UsageError(f"{name} is flying: a calibration needs it at rest on the ground")
         poses = self._measured[name] = []
         try:
             if self._ended.wait(seconds):
@@ -303,7 +303,7 @@ class MotionCapture:
         self._calibrations[name] = found
         return found
 
-    # What the source calls -------------------------------------------------------------------------------------
+    # Called by the source -------------------------------------------------------------------------------------
 
     def _take(self, frame: RawFrame) -> None:
         """Handle a frame of the system."""
@@ -333,7 +333,7 @@ class MotionCapture:
             self._poses.publish(pose)
 
     def _trouble(self, text: str) -> None:
-        if text != self._troubled:  # a source tries again all the time, and fails for the same reason
+        if text != self._troubled:  # a source retries all the time and fails for the same reason
             self._troubled = text
             self._publish_event("", TrackState.LOST, text)
 
@@ -341,16 +341,16 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # a pose that comes now is as old as that
+                    track.look(monotonic_ns() - self.latency_ns)  # a pose that arrives now is this old
                 self._report(track)
 
     def _report(self, track: Track) -> None:
-        """Emit an event once for each change of a body's state."""
+        """Emit one event for each change of a body's state."""
         with self._changed:
             before, state = self._reported[track.body], track.state
             self._reported[track.body] = state
         if state is TrackState.LOST and before is not state:
-            self._publish_event(track.body, state, f"{track.body} is not tracked any more")
+            self._publish_event(track.body, state, f"{track.body} is no longer tracked")
         elif state is TrackState.TRACKED and before is not state:
             again = "again" if before is TrackState.LOST else "now"
             self._publish_event(track.body, state, f"{track.body} is tracked {again}")
@@ -370,11 +370,11 @@ class MotionCapture:
 
 
 def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
-    """Add nothing to what a listener logs: a motion capture has no events for programs' errors."""
+    """Do nothing: the listener's log suffices, because motion capture has no events for program errors."""
 
 
 class Linked:
-    """Logs each pose of a drone with the drone, until closed. See :meth:`MotionCapture.link`."""
+    """Logs each pose of a drone on the drone until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
         """Initialise; the ``with`` block starts the logging.
@@ -409,11 +409,11 @@ class Linked:
     def _pose(self, pose: BodyPose) -> None:
         if pose.body != self._drone.name or pose.captured_ns < self._due_ns:
             return
-        # Accept poses a quarter of a period early: else a rate near the system's own would be halved.
+        # Accept poses a quarter of a period early: a rate near the system's own would otherwise be halved.
         self._due_ns = pose.captured_ns + self._period_ns * 3 // 4
         values = (*pose.position_m, *pose.quaternion, *(pose.velocity_m_s or ()))
         at_ns = pose.captured_ns + self._drone.clock_offset_ns
-        if self._to_vehicle:  # first, as the vehicle flies by it
+        if self._to_vehicle:  # first, because the vehicle flies by it
             self._drone.send_external_pose(pose.position_m, pose.quaternion, at_ns=at_ns)
         self._drone.log.array(MOCAP, values, at_ns=at_ns)
 
@@ -425,13 +425,13 @@ class Linked:
 
 
 def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
-    """Return a position source for controllers: the newest pose of a drone, with its time on the proxy's clock.
+    """Return a position source for controllers: a drone's newest pose, with its time on the proxy's clock.
 
     Raises:
         UnknownNameError: The capture has no body of the drone's name.
     """
     name = drone.name
-    capture.state(name)  # raises now for an unknown name
+    capture.state(name)  # raises here for an unknown name
 
     def newest() -> Fix | None:
         pose = capture.pose(name)

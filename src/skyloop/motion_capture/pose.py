@@ -1,9 +1,9 @@
-"""Poses of bodies from a motion capture system in Skyloop's axes, over time and calibrated. Pure.
+"""Poses of bodies from a motion capture system, in Skyloop's axes, tracked over time and calibrated. Pure.
 
-The calibration is the rotation between a tracked body's axes, as the system defines them, and the drone's. As MAVwork
-did it: the drone stands still for two seconds, the poses are averaged, and the calibration is refused when they are
-spread too much. At rest the drone's own roll and pitch show how it stands; its heading is taken from the way it is put
-down: nose along the world's x axis, or as given by ``heading``.
+The calibration is the rotation between a tracked body's axes, as the system defines them, and the drone's. It follows
+MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if they spread too
+much. The drone's own roll and pitch show its attitude at rest; its heading comes from the way it is put down: nose
+along the world's x axis, or as given by ``heading``.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Quaternion = tuple[float, float, float, float]
 class BodyPose:
     """The pose of a body.
 
-    World axes are those of the capture volume, with z up. Body axes are as the system defines them, or after a
-    calibration those of the drone: x forward, y left, z up (ROS REP 103).
+    World axes are those of the capture volume, with z up. Body axes are defined by the system or, after a calibration,
+    those of the drone: x forward, y left, z up (ROS REP 103).
     """
 
     body: str
@@ -46,7 +46,7 @@ class BodyPose:
 
     @property
     def yaw_rad(self) -> float:
-        """Heading [rad]: of the body's x axis, from the world's x axis, counter-clockwise seen from above."""
+        """Heading of the body's x axis [rad], from the world's x axis, counter-clockwise seen from above."""
         x, y, z, w = self.quaternion
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -72,7 +72,7 @@ class BodyPose:
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Return the Hamilton product of quaternions (x, y, z, w): the rotation ``b``, then ``a``."""
+    """Return the Hamilton product of quaternions (x, y, z, w): rotate by ``b``, then by ``a``."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -86,7 +86,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
     """Convert from axes with y up (x right, y up, z backward, as Motive streams by default) to axes with z up.
 
-    This is a quarter turn about x, of the world and of the body alike, so that an upright body stays upright.
+    Turns both world and body by a quarter about x, so that an upright body stays upright.
 
     Args:
         position: [m]
@@ -98,7 +98,7 @@ def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
 
 
 def plausible(position: Vector, quaternion: Quaternion) -> bool:
-    """Whether this can be a pose: finite, with a quaternion whose length is 1 within 1 %."""
+    """Return whether the values can be a pose: finite, with a quaternion of length 1 within 1 %."""
     if not all(map(math.isfinite, (*position, *quaternion))):
         return False
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
@@ -131,10 +131,10 @@ def scipy_types() -> Any:
     return transform
 
 
-REST_S: Final = 2.0
-MAX_SPREAD_M: Final = 0.005
-MAX_SPREAD_RAD: Final = math.radians(1.0)
-MIN_POSES: Final = 20
+REST_S: Final = 2.0  #: how long poses are collected for a calibration
+MAX_SPREAD_M: Final = 0.005  #: spread of poses at rest: more means motion or poor tracking
+MAX_SPREAD_RAD: Final = math.radians(1.0)  #: the same for their rotation
+MIN_POSES: Final = 20  #: for a calibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +144,11 @@ class Calibration:
     turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: from the drone's axes to the tracked body's; x, y, z, w
     spread_m: float = 0.0  #: root mean square distance of the poses from their mean
     spread_rad: float = 0.0  #: root mean square angle between the poses and their mean
-    poses: int = 0  #: how many were averaged
+    poses: int = 0  #: number of poses averaged
     yaw_offset: float | None = None  #: the drone's own yaw minus its heading in the world [rad], if it reports its yaw
 
     def apply(self, pose: BodyPose) -> BodyPose:
-        """Return the drone's pose for one of the tracked body."""
+        """Return the drone's pose for a pose of the tracked body."""
         return replace(pose, quaternion=multiply(pose.quaternion, self.turn))
 
 
@@ -166,29 +166,27 @@ def calibrate(
 
     Args:
         poses: At least 20.
-        roll: As the drone reports it, averaged over the same time [rad]; right side down is positive.
-        pitch: As the drone reports it [rad]; nose down is positive.
-        yaw: As the drone reports it [rad]; None if it does not.
-        heading: Of its nose in the world [rad], counter-clockwise from x.
+        roll: The drone's reported roll, averaged over the same time [rad]; right side down is positive.
+        pitch: The drone's reported pitch [rad]; nose down is positive.
+        yaw: The drone's reported yaw [rad]; None if it reports none.
+        heading: Heading of its nose in the world [rad], counter-clockwise from x.
         max_spread_m: Greatest root mean square distance of the poses from their mean.
         max_spread_rad: Greatest root mean square angle between the poses and their mean.
 
     Raises:
-        UsageError: There are too few poses, or they are spread more than the limits: the drone moved, or the tracking
-            is poor.
+        UsageError: There are too few poses, or they spread beyond the limits: the drone moved, or the tracking is
+            poor.
     """
     if len(poses) < MIN_POSES:
-        raise UsageError(
-            f"{len(poses)} poses are too few for a calibration, at least {MIN_POSES}: is the body tracked?"
-        )
+        raise UsageError(f"a calibration needs at least {MIN_POSES} poses, got {len(poses)}: is the body tracked?")
     mean = mean_quaternion([pose.quaternion for pose in poses])
     spread_m = _spread(np.array([pose.position_m for pose in poses]))
     angles = [_angle(mean, pose.quaternion) for pose in poses]
     spread_rad = math.sqrt(sum(angle * angle for angle in angles) / len(angles))
     if spread_m > max_spread_m or spread_rad > max_spread_rad:
         raise UsageError(
-            f"the poses are spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
-            f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: let it stand still"
+            f"the poses spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
+            f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: keep the drone still"
         )
     stands = quaternion_from_euler(roll, pitch, heading)
     offset = None if yaw is None else math.remainder(yaw - heading, math.tau)
@@ -204,7 +202,7 @@ def conjugate(quaternion: Quaternion) -> Quaternion:
 def mean_quaternion(quaternions: Sequence[Quaternion]) -> Quaternion:
     """Return the mean rotation, whatever the signs of the quaternions.
 
-    It is the largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
+    The largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
     """
     parts = np.array(quaternions)
     _, vectors = np.linalg.eigh(parts.T @ parts)
@@ -221,14 +219,14 @@ def _spread(places: NDArray[np.float64]) -> float:
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-LOST_AFTER_S: Final = 0.2  #: a body without a pose for so long is lost: ten poses at 50 Hz
-FROZEN_AFTER_S: Final = 0.5  #: a pose that stays the same to the last bit for so long is no measurement
-WINDOW_S: Final = 0.1  #: of the poses from which the velocity is computed
-LEAST_POSES: Final = 4  #: for a velocity
+LOST_AFTER_S: Final = 0.2  #: a body is lost after this long without a pose: ten poses at 50 Hz
+FROZEN_AFTER_S: Final = 0.5  #: a pose identical to the last bit for this long is not a measurement
+WINDOW_S: Final = 0.1  #: time window of the poses from which the velocity is computed
+LEAST_POSES: Final = 4  #: poses needed for a velocity
 
 
 class TrackState(StrEnum):
-    """Whether a body's pose can be relied on."""
+    """Whether a body's pose is reliable."""
 
     WAITING = "waiting"  #: not seen yet
     TRACKED = "tracked"
@@ -240,24 +238,24 @@ class Track:
     """Poses of one body.
 
     The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
-    by half of the window, and has far less noise than a difference of two poses.
+    by half the window and has much less noise than a difference of two poses.
 
     Attributes:
         body: The body's name.
-        state: Whether it is tracked.
-        pose: The newest one while it is tracked, else None.
+        state: Whether the body is tracked.
+        pose: The newest pose while the body is tracked, else None.
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body that was not seen yet.
+        """Initialise a body not seen yet.
 
         Args:
             body: Its name.
-            may_freeze: Whether the same pose for long is possible, as from a simulator without noise.
+            may_freeze: Whether an unchanging pose is possible, as from a simulator without noise.
         """
         self.body = body
         self.state = TrackState.WAITING
-        self.pose: BodyPose | None = None  #: the newest one while it is tracked, else None
+        self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, else None
         self._may_freeze = may_freeze
         self._recent: deque[tuple[int, Vector]] = deque()
         self._seen_ns = 0
@@ -268,7 +266,7 @@ class Track:
         """Update with a new pose.
 
         Args:
-            captured_ns: When it was captured.
+            captured_ns: Time of the capture.
             position: [m]
             quaternion: x, y, z, w.
 
@@ -299,7 +297,7 @@ class Track:
         return True
 
     def end(self) -> None:
-        """End the track: no pose will come any more."""
+        """End the track: no more poses will arrive."""
         self.state, self.pose = TrackState.ENDED, None
 
     def _velocity(self) -> Vector | None:

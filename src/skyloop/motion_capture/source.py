@@ -1,8 +1,8 @@
 """Addresses of motion capture systems, and the child process that receives from one: :func:`main`.
 
 The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
-process it can block nobody, and can be killed whatever it waits for. Each frame is written to standard output as a
-msgpack array, preceded by its length: when it was received, and position and quaternion of each body that is seen.
+process it can block nothing else and can be killed at any time. Each frame goes to standard output as a msgpack array,
+preceded by its length: time of reception, and position and quaternion of each visible body.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 
-#: By scheme of the address: the system's name in the ``motioncapture`` package, and its default axis that points up.
-#: VRPN has a client of its own here.
+#: By scheme of the address: the system's name in the ``motioncapture`` package, and its default up axis. VRPN has its
+#: own client here.
 SYSTEMS: Final = {
     "vicon": ("vicon", "z"),
     "optitrack": ("optitrack", "y"),  # Motive streams with y up by default
@@ -42,11 +42,11 @@ SYSTEMS: Final = {
 VRPN: Final = "vrpn"
 SIM: Final = "sim"
 OPTIONS: Final = {
-    "up": "the axis that points up in what the system sends: y or z",
-    "latency": "how old a pose is when it arrives [s], from exposure to here",
-    "interface": "address of the network interface that the system is on (OptiTrack)",
-    "port": "of the system's command channel (OptiTrack; default 1510)",
-    "sensor": "of trackers whose name in bodies has none (VRPN): a number from 0",
+    "up": "the up axis of the system's data: y or z",
+    "latency": "age of a pose on arrival [s], from exposure to here",
+    "interface": "address of the network interface of the system (OptiTrack)",
+    "port": "port of the system's command channel (OptiTrack; default 1510)",
+    "sensor": "sensor of trackers whose name in bodies gives none (VRPN): a number from 0",
 }
 
 
@@ -55,13 +55,13 @@ class System:
     """A parsed address of a motion capture system."""
 
     address: str
-    kind: str  #: as the ``motioncapture`` package names it, or ``sim``
+    kind: str  #: name in the ``motioncapture`` package, or ``sim``
     host: str
     up: str = "z"
     latency_s: float = 0.0
     settings: tuple[tuple[str, str], ...] = ()  #: further settings for the package
-    port: int | None = None  #: after the host in the address
-    sensor: int | None = None  #: of VRPN's trackers where the body's name has none
+    port: int | None = None  #: port after the host in the address
+    sensor: int | None = None  #: sensor of VRPN trackers whose body name gives none
 
     @property
     def configuration(self) -> dict[str, str]:
@@ -83,19 +83,19 @@ def parse_system(address: str) -> System:
     """
     parts = urlsplit(address) if isinstance(address, str) else urlsplit("")
     if not parts.scheme or "://" not in address:
-        raise UsageError(f"{address!r} is no motion capture system: give one such as vicon://192.168.0.10 or sim://")
+        raise UsageError(f"{address!r} is not a motion capture system: give one such as vicon://192.168.0.10 or sim://")
     options = dict(parse_qsl(parts.query, keep_blank_values=True))
     for name in options:
         if name not in OPTIONS:
             raise UnknownNameError(f"option of {parts.scheme}://", name, OPTIONS)
     if parts.scheme == SIM:
         if options or parts.netloc:
-            raise UsageError(f"{address!r}: sim:// takes no host and no options; the bodies name the drones")
+            raise UsageError(f"{address!r}: sim:// takes neither host nor options; the bodies name the drones")
         return System(address, SIM, "")
     if parts.scheme not in SYSTEMS:
         raise UnknownNameError("motion capture system", parts.scheme, [*SYSTEMS, SIM])
     if not parts.hostname:
-        raise UsageError(f"{address!r} names no host: {parts.scheme}://192.168.0.10")
+        raise UsageError(f"{address!r} has no host: give {parts.scheme}://192.168.0.10")
     kind, up = SYSTEMS[parts.scheme]
     up = options.get("up", up)
     if up not in ("y", "z"):
@@ -111,11 +111,11 @@ def parse_system(address: str) -> System:
     if sensor is not None and not (sensor.isascii() and sensor.isdigit() and len(sensor) <= 9):
         raise UsageError(f"{address!r}: sensor is {sensor!r} and must be a whole number from 0")
     if kind == VRPN and parts.path.strip("/"):
-        raise UsageError(f"{address!r}: the tracker is named in bodies, as {{'alpha': {parts.path.strip('/')!r}}}")
+        raise UsageError(f"{address!r}: name the tracker in bodies, as {{'alpha': {parts.path.strip('/')!r}}}")
     port = _port_of_host(address, parts)
     if port is not None and kind == "optitrack":
-        raise UsageError(f"{address!r}: the port of OptiTrack's command channel is an option, ?port={port}")
-    if port is not None and kind == "qualisys":  # which takes its base port by itself
+        raise UsageError(f"{address!r}: give the port of OptiTrack's command channel as an option, ?port={port}")
+    if port is not None and kind == "qualisys":  # the package adds its base port
         settings.append(("port", str(port)))
         port = None
     latency_s = _latency(address, options)
@@ -150,17 +150,17 @@ def _port(address: str, options: dict[str, str]) -> str | None:
 
 
 LENGTH: Final = struct.Struct("<I")
-MAX_FRAME: Final = 1 << 20  #: bytes; a system with thousands of bodies stays below
-MISSING: Final = 3  #: exit code where the package is missing
+MAX_FRAME: Final = 1 << 20  #: bytes; enough for thousands of bodies
+MISSING: Final = 3  #: exit code if the package is missing
 
 Seen = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 
 class RawFrame(msgspec.Struct, frozen=True, array_like=True):
-    """What a system saw at one time, in its own axes."""
+    """The bodies seen by a system at one time, in its own axes."""
 
     received_ns: int  #: ``time.monotonic_ns`` of this host
-    bodies: dict[str, Seen]  #: position [m] and quaternion (x, y, z, w) of each body that is tracked
+    bodies: dict[str, Seen]  #: position [m] and quaternion (x, y, z, w) of each tracked body
 
 
 def read(stream: BinaryIO) -> RawFrame | None:
@@ -170,7 +170,7 @@ def read(stream: BinaryIO) -> RawFrame | None:
         The frame; None at the end of the stream.
 
     Raises:
-        msgspec.DecodeError: The data are no frame.
+        msgspec.DecodeError: The data are not a frame.
     """
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
@@ -200,7 +200,7 @@ def seen(bodies: Any) -> dict[str, Seen]:
 
 
 def open_output() -> BinaryIO:
-    """Return standard output for frames alone, and redirect what native code prints to standard error."""
+    """Reserve standard output for frames, and redirect native code's prints to standard error."""
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     return output
@@ -214,7 +214,7 @@ def main(kind: str, settings: str) -> int:
         settings: JSON object of strings, for its ``connect``.
 
     Returns:
-        The exit code: 0 when the reader is gone, :data:`MISSING` without the package, 1 for any other error.
+        Exit code: 0 when the reader is gone, :data:`MISSING` without the package, 1 for any other error.
     """
     try:
         import motioncapture
@@ -235,14 +235,14 @@ def main(kind: str, settings: str) -> int:
 
 
 class TruthSource:
-    """Observes the proxies of simulated drones, and reads the true poses from their native telemetry."""
+    """Observes the proxies of simulated drones and reads the true poses from their native telemetry."""
 
     def __init__(self, proxies: Iterable[str], take: Callable[[RawFrame], None]) -> None:
         """Initialise without connecting.
 
         Args:
             proxies: Names of the drones' proxies.
-            take: Called with each frame, on the thread that receives feedback.
+            take: Called on the thread that receives feedback with each frame.
         """
         self._proxies = tuple(proxies)
         self._take = take
@@ -252,11 +252,11 @@ class TruthSource:
         """Connect to all proxies.
 
         Args:
-            timeout_s: How long to wait for each.
+            timeout_s: How long to wait for each connection.
 
         Raises:
             UnsupportedError: A vehicle does not report its true pose.
-            SkyloopError: As of :func:`skyloop.connect`.
+            SkyloopError: As for :func:`skyloop.connect`.
         """
         from skyloop.client import connect
 
@@ -286,7 +286,7 @@ class TruthSource:
 def true_pose(
     feedback: Feedback,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
-    """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None without them."""
+    """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None if missing."""
     native = feedback.native or {}
     try:
         x, y, z, roll, pitch, yaw = (
@@ -298,21 +298,21 @@ def true_pose(
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Not ``-m``: the package imports this module, of which Python would warn in each child.
+#: Not ``-m``: the package imports this module, and Python would warn about that in each child.
 WORKER: Final = (
     sys.executable,
     "-c",
     "import sys; from skyloop.motion_capture.source import main; sys.exit(main(*sys.argv[1:]))",
 )
-AGAIN_S: Final = 0.5  #: pause before a child that ended is restarted
-SILENT_S: Final = 3.0  #: a child that sends nothing for so long is killed: its system may have been restarted
+AGAIN_S: Final = 0.5  #: pause before restarting a child that ended
+SILENT_S: Final = 3.0  #: a child silent for this long is killed: its system may have restarted
 FIRST_S: Final = 10.0  #: the same before its first frame
 
 
 class ChildSource:
-    """Runs :func:`main` in a child process for a system and passes each frame on, on its own thread.
+    """Runs :func:`main` in a child process and forwards each frame on a separate thread.
 
-    A child that ends or falls silent is replaced until :meth:`close`.
+    Replaces a child that ends or falls silent, until :meth:`close`.
     """
 
     def __init__(
@@ -327,8 +327,8 @@ class ChildSource:
 
         Args:
             system: The system to connect to.
-            take: Called with each frame, on the reading thread.
-            trouble: Called with a description when the child fails, on one of its threads.
+            take: Called on the reading thread with each frame.
+            trouble: Called with a description when the child fails, on one of this object's threads.
             command: The child's command line, before kind and settings.
         """
         self._system = system
@@ -337,7 +337,7 @@ class ChildSource:
         self._received_s = 0.0
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._last_words = ""  # the end of the last child's standard error
+        self._last_words = ""  # end of the last child's standard error
         settings = msgspec.json.encode(system.configuration).decode()
         self._runner = RestartingChild(
             [*command, system.kind, settings],
@@ -345,7 +345,7 @@ class ChildSource:
             read=self._read,
             ended=self._child_ended,
             started=self._child_started,
-            silent=lambda: time.monotonic() - self._received_s > SILENT_S,  # its native code would wait for ever
+            silent=lambda: time.monotonic() - self._received_s > SILENT_S,  # its native code would wait forever
             keep_errors=True,
         )
 
@@ -355,10 +355,10 @@ class ChildSource:
         return None if self._runner.child is None else self._runner.child.pid
 
     def start(self, timeout_s: float) -> None:
-        """Start the child, and wait for the first frame.
+        """Start the child and wait for the first frame.
 
         Raises:
-            LinkError: No frame came within that time.
+            LinkError: No frame arrived within that time.
             MissingExtraError: The ``motioncapture`` package is not installed.
         """
         self._runner.start()

@@ -1,23 +1,23 @@
 """VRPN, the Virtual-Reality Peripheral Network, as a source of frames: its protocol, and a client over TCP.
 
-Server and client each send a cookie of 24 bytes that names the protocol's version. Everything from then on is a
-message: a header of 24 bytes, then the payload, padded to a multiple of 8 bytes. The length in the header counts the
-header and the payload without its padding. All numbers are big endian.
+Server and client each send a cookie of 24 bytes that names the protocol version. Everything after it is a message: a
+header of 24 bytes, then the payload, padded to a multiple of 8 bytes. The length in the header counts the header and
+the payload without its padding. All numbers are big endian.
 
 ======  =====  ====================================================================================
 offset  type   meaning
 ======  =====  ====================================================================================
 0       u32    length
 4       u32    time of the report, seconds; then microseconds at 8
-12      i32    sender: number of a tracker, by the server's descriptions
-16      i32    type: number of a kind of message, by the server's descriptions; negative: of the protocol itself
+12      i32    sender: number of a tracker, from the server's descriptions
+16      i32    type: number of a message type, from the server's descriptions; negative: protocol messages
 20      u32    sequence number, for sniffers only
 ======  =====  ====================================================================================
 
-A description (type -1: of a sender, -2: of a type) has the number in the sender's place, and as payload the length of
-the name (u32, with the NUL at its end) and the name. A tracker's pose has the type that is described as
-``vrpn_Tracker Pos_Quat``, and as payload the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the
-quaternion x, y, z, w (7 doubles).
+A description (type -1: of a sender, -2: of a type) has the number in the sender field, and as payload the length of the
+name (u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``,
+and as payload the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
+
 
 A client that never sends a UDP port gets everything over TCP.
 
@@ -41,14 +41,14 @@ from skyloop.motion_capture.source import RawFrame, Seen, System
 
 DEFAULT_PORT: Final = 3883
 COOKIE_SIZE: Final = 24
-COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: 0: no logging on the other side is asked for
+COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: 0: request no logging by the server
 SENDER_DESCRIPTION: Final = -1
 TYPE_DESCRIPTION: Final = -2
 DISCONNECT: Final = -5
 POS_QUAT: Final = "vrpn_Tracker Pos_Quat"
 MAX_PAYLOAD: Final = 64_000  #: bytes; the reference implementation's buffer
-MAX_NAMES: Final = 2_000  #: of senders, and of types, as in the reference implementation
-MAX_NAME: Final = 100  #: bytes of a name with its NUL
+MAX_NAMES: Final = 2_000  #: senders, and types, as in the reference implementation
+MAX_NAME: Final = 100  #: bytes of a name, including the NUL
 
 _HEADER: Final = struct.Struct(">IIIiiI")
 _NAME_LENGTH: Final = struct.Struct(">I")
@@ -58,7 +58,7 @@ _SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
 
 @dataclass(frozen=True, slots=True)
 class TrackerPose:
-    """Where a tracker's sensor is, in the server's own axes. The numbers may be NaN or infinite."""
+    """The pose of a tracker's sensor in the server's own axes. Values may be NaN or infinite."""
 
     tracker: str
     sensor: int
@@ -67,9 +67,9 @@ class TrackerPose:
 
 
 class Decoder:
-    """Decodes what a server sends, from its cookie on, however it is cut into pieces.
+    """Decodes a server's stream, cookie first, however it is cut into pieces.
 
-    Holds at most one message that is not complete yet, and the names that the server has described.
+    Holds at most one incomplete message, and the names that the server has described.
     """
 
     def __init__(self) -> None:
@@ -81,10 +81,10 @@ class Decoder:
         """Decode the next bytes of the stream.
 
         Returns:
-            The poses that are complete now, in the order in which they were sent; everything else is skipped.
+            The poses completed by these bytes, in the order sent; everything else is skipped.
 
         Raises:
-            DecodeError: These bytes are not VRPN, or the server ends the connection. The decoder is unusable then.
+            DecodeError: The bytes are not VRPN, or the server ends the connection. The decoder is then unusable.
         """
         self._pending += data
         if not self._greeted:
@@ -132,13 +132,13 @@ class Decoder:
 
 
 def encode_message(sender: int, kind: int, payload: bytes, *, seconds: int = 0, microseconds: int = 0) -> bytes:
-    """Encode one message, with its padding; the time is that of the report, since 1970."""
+    """Encode one message with its padding; the time is that of the report, since 1970."""
     head = _HEADER.pack(_HEADER.size + len(payload), seconds, microseconds, sender, kind, 0)
     return head + payload + bytes(-len(payload) % 8)
 
 
 def encode_description(kind: int, number: int, name: str) -> bytes:
-    """Encode what a sender (``SENDER_DESCRIPTION``) or a type (``TYPE_DESCRIPTION``) of this number is called."""
+    """Encode the name of a sender (``SENDER_DESCRIPTION``) or type (``TYPE_DESCRIPTION``) of this number."""
     text = name.encode() + b"\0"
     return encode_message(number, kind, _NAME_LENGTH.pack(len(text)) + text)
 
@@ -153,8 +153,8 @@ def encode_pose(
     seconds: int = 0,
     microseconds: int = 0,
 ) -> bytes:
-    """Encode a pose; ``kind`` is the number that was described as ``vrpn_Tracker Pos_Quat``."""
-    payload = _POSE.pack(sensor, sensor, *position, *quaternion)  # twice, as the reference does for its padding
+    """Encode a pose; ``kind`` is the number described as ``vrpn_Tracker Pos_Quat``."""
+    payload = _POSE.pack(sensor, sensor, *position, *quaternion)  # twice: the reference pads with it
     return encode_message(sender, kind, payload, seconds=seconds, microseconds=microseconds)
 
 
@@ -171,36 +171,36 @@ def _decode_name(payload: bytes) -> str:
     return name if name.isprintable() else name.encode("unicode_escape").decode()
 
 
-CONNECT_S: Final = 1.0  #: how long a server may take to accept
+CONNECT_S: Final = 1.0  #: how long a server can take to accept
 AGAIN_S: Final = 0.5  #: pause before the next attempt to connect
-SILENT_S: Final = 3.0  #: a connection without a pose for so long is given up: the server may have been restarted
-SETTLE_S: Final = 0.3  #: how long other sensors of a tracker have to report before its sensor 0 is taken for the body
-POLL_S: Final = 0.1  #: how often a reader that receives nothing checks whether it is to end
-CHUNK: Final = 65_536  #: bytes that are received at a time
-MAX_SENSORS: Final = 1_000  #: of a tracker that are remembered
+SILENT_S: Final = 3.0  #: drop a connection without a pose for this long: the server may have restarted
+SETTLE_S: Final = 0.3  #: how long to wait for other sensors of a tracker before taking its sensor 0 for the body
+POLL_S: Final = 0.1  #: how often an idle reader checks whether to end
+CHUNK: Final = 65_536  #: bytes received at a time
+MAX_SENSORS: Final = 1_000  #: sensors remembered per tracker
 
 
 class SensorSelection:
     """Decides which sensor of which tracker belongs to which body. Pure: the time is an argument.
 
-    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor that the address names. Where neither names one,
-    it is sensor 0, as long as no other sensor of that tracker has ever reported. If another one has, it is unknown
-    which is meant, and the body has no pose.
+    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor named in the address. If neither names one, it is
+    sensor 0, as long as no other sensor of that tracker has ever reported. Otherwise the choice is ambiguous, and the
+    body has no pose.
     """
 
     def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
         """Initialise the selection.
 
         Args:
-            names: Of the bodies.
-            sensor: Of bodies whose name has none; None if the address names none.
+            names: Names of the bodies.
+            sensor: Sensor of bodies whose name gives none; None if the address names none.
 
         Raises:
             UsageError: Two names mean the same sensor.
         """
         self._bodies: dict[tuple[str, int], str] = {}
         self._unnamed: set[str] = set()  # trackers without a named sensor
-        self._reported: dict[str, tuple[int, set[int]]] = {}  # of those: since when, and which sensors
+        self._reported: dict[str, tuple[int, set[int]]] = {}  # of those: first report, and sensors seen
         for name in names:
             tracker, named = split_name(name)
             number = sensor if named is None else named
@@ -217,11 +217,11 @@ class SensorSelection:
         """Return the newest pose of each body.
 
         Args:
-            poses: In the order in which they arrived.
+            poses: Poses in order of arrival.
             now_ns: The time of their arrival.
 
         Returns:
-            Poses by name of the body; a sensor that belongs to no body is named ``TRACKER:SENSOR``.
+            Poses by body name; a sensor that belongs to no body is named ``TRACKER:SENSOR``.
         """
         poses = list(poses)
         for pose in poses:
@@ -234,7 +234,7 @@ class SensorSelection:
             name = self._bodies.get((pose.tracker, pose.sensor))
             if name is None:
                 name = f"{pose.tracker}:{pose.sensor}"
-                if name in self._wanted:  # it coincides with the name of another body
+                if name in self._wanted:  # it collides with another body's name
                     continue
             elif name in self._unnamed and not self._certain(name, now_ns):
                 continue
@@ -242,14 +242,14 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Whether it is known, for every tracker that reports, if its sensor must be named."""
+        """Return whether it is known for every reporting tracker if its sensor must be named."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property
     def refused(self) -> dict[str, str]:
-        """Trackers whose sensor must be named and is not, each with the reason and the remedy."""
+        """Return the trackers whose sensor must be named but is not, with reason and remedy."""
         return {
-            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and which one is the body is not given: name it "
+            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and the body's is not named: name it "
             f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
             for tracker, (_, sensors) in self._reported.items()
             if sensors != {0}
@@ -261,10 +261,10 @@ class SensorSelection:
 
 
 class VrpnSource:
-    """Receives from a VRPN server and passes each frame on, on its own thread.
+    """Receives from a VRPN server and forwards each frame on a separate thread.
 
-    A connection that ends, falls silent or carries other data than VRPN is replaced until :meth:`close`. What has piled
-    up in the socket counts as one frame: the newest pose of each body.
+    Replaces a connection that ends, falls silent or carries data other than VRPN, until :meth:`close`. Backlog in the
+    socket counts as one frame: the newest pose of each body.
     """
 
     def __init__(
@@ -274,9 +274,9 @@ class VrpnSource:
 
         Args:
             system: The server's address.
-            names: Of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
-            take: Called with each frame, on the reading thread.
-            trouble: Called with a description of each trouble, on the reading thread.
+            names: Names of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
+            take: Called on the reading thread with each frame.
+            trouble: Called on the reading thread with a description of each problem.
 
         Raises:
             UsageError: Two names mean the same sensor.
@@ -285,18 +285,18 @@ class VrpnSource:
         self._selection = SensorSelection(names, system.sensor)
         self._take = take
         self._trouble = trouble
-        self._refused: dict[str, str] = {}  # as the selection's, for other threads
+        self._refused: dict[str, str] = {}  # copy of the selection's, for other threads
         self._failure = ""  # why the last connection ended
         self._ended = threading.Event()
-        self._ready = threading.Event()  # poses arrive, or are refused
+        self._ready = threading.Event()  # set once poses arrive or are refused
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Connect, and wait for the first frame.
+        """Connect and wait for the first frame.
 
         Raises:
-            LinkError: No frame comes.
-            UsageError: A tracker has several sensors, and which one is meant is not given.
+            LinkError: No frame arrives.
+            UsageError: A tracker has several sensors, and none is named.
         """
         self._reader.start()
         ready = self._ready.wait(timeout_s)
@@ -311,7 +311,7 @@ class VrpnSource:
         """Close the connection. Idempotent."""
         self._ended.set()
         if self._reader.ident is not None and self._reader is not threading.current_thread():
-            self._reader.join(CONNECT_S + 1.0)  # looking a name up may take longer, and ends by itself
+            self._reader.join(CONNECT_S + 1.0)  # a name lookup may take longer, but it ends
 
     # --- reader thread ---
 
@@ -340,7 +340,7 @@ class VrpnSource:
                     data = connection.recv(CHUNK)
                 except TimeoutError:
                     continue
-                except ConnectionResetError:  # how a server ends that did not read all that it was sent
+                except ConnectionResetError:  # a server that ends with unread data resets the connection
                     data = b""
                 received_ns = monotonic_ns()
                 if not data:
@@ -362,7 +362,7 @@ class VrpnSource:
 
 
 def split_name(name: str) -> tuple[str, int | None]:
-    """Split a body's name into tracker and sensor; the sensor is None for a name without a number after a colon."""
+    """Split a body's name into tracker and sensor; the sensor is None if no number follows a colon."""
     tracker, _, number = name.rpartition(":")
     if tracker and number.isascii() and number.isdigit() and len(number) <= 9:
         return tracker, int(number)

@@ -1,4 +1,4 @@
-"""Processors: classes that process frames on any host and publish what they find. See docs/processors.md."""
+"""Processors: classes that process frames on any host and publish their results. See docs/processors.md."""
 
 from skyloop.processing.loading import Code, load_processor
 from skyloop.processing.worker import Output, Settings, Status, Worker

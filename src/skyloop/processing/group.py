@@ -1,4 +1,4 @@
-"""Several workers on this host, each a process of its own; one that dies is restarted."""
+"""Several workers on this host, each in its own process; a worker that dies is restarted."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from skyloop.child_process import GRACE_S, ChildProcess, RestartingChild, on_par
 from skyloop.processing.worker import Status, together
 
 _PAUSE_S: Final = 1.0  #: time before a worker that died is restarted
-USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all; it prints why
+USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all; it prints the reason
 
 
 class Worker:
-    """The process of one worker, started again when it dies.
+    """The process of one worker, restarted when it dies.
 
     Args:
-        number: Of the worker, from 1, for people.
-        command: Its command line; it prints a :class:`Status` as JSON on a line of standard output now and then.
-        report: Called with a text for people when it dies, on its thread.
-        pause_s: Time before it is started again [s].
+        number: Number of the worker, from 1, for people.
+        command: Its command line; it prints a :class:`Status` as a JSON line on standard output from time to time.
+        report: Called on its thread with a text for people when the worker dies.
+        pause_s: Time before a restart [s].
     """
 
     def __init__(self, number: int, command: Sequence[str], report: Callable[[str], None], pause_s: float) -> None:
         self.status: Status | None = None
-        self.code: int | None = None  #: exit code, once it has ended by itself or can't work at all
+        self.code: int | None = None  #: exit code, once it has exited for good or can't run at all
         self._number = number
         self._report = report
         self._pause_s = pause_s
@@ -40,7 +40,7 @@ class Worker:
 
     def _read(self, child: ChildProcess) -> None:
         for text in child.stdout:
-            with contextlib.suppress(msgspec.DecodeError):  # the user's code may print there too
+            with contextlib.suppress(msgspec.DecodeError):  # the user's code may also print to standard output
                 self.status = msgspec.json.decode(text, type=Status)
 
     def _ended(self, child: ChildProcess | None, ending: str) -> float | None:
@@ -50,7 +50,7 @@ class Worker:
             return None
         self.status = None
         if not self.process.stopping:
-            self._report(f"worker {self._number} {ending}: the others have its share until it is restarted")
+            self._report(f"worker {self._number} {ending}: the others process its share until it restarts")
         return self._pause_s
 
 
@@ -63,27 +63,27 @@ class Group:
         """Start the children.
 
         Args:
-            command: Command line of each.
-            count: How many.
-            tell: Called with a text for people when a child dies, on that child's thread.
-            pause_s: Time before a child that died is restarted [s].
+            command: Command line of each child.
+            count: Number of children.
+            tell: Called on a child's thread with a text for people when that child dies.
+            pause_s: Time before a dead child is restarted [s].
         """
         self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
 
     @property
     def status(self) -> Status | None:
-        """Statistics of all children together; None until one has reported."""
+        """Combined statistics of all children; None until one has reported."""
         return together(worker.status for worker in self._workers if worker.status is not None)
 
     @property
     def pids(self) -> list[int]:
-        """Process ids of the children that run."""
+        """Process ids of the running children."""
         children = [worker.process.child for worker in self._workers]
         return [child.pid for child in children if child is not None and child.code is None]
 
     @property
     def code(self) -> int | None:
-        """Exit code once all have ended by themselves, or one has reported that it can't work; None before."""
+        """Exit code once all have exited, or one has reported that it can't run; None before."""
         codes = [worker.code for worker in self._workers]
         if USAGE_ERROR in codes:
             return USAGE_ERROR
@@ -104,19 +104,19 @@ class Group:
 
 
 def end_with_parent(stop: Callable[[], None]) -> None:
-    """Call ``stop`` in this child process when its standard input ends, and exit if it is still running 2 s later.
+    """Call ``stop`` in this child process when its standard input closes, and exit if it still runs 2 s later.
 
-    ``stop`` runs on a thread of its own.
+    ``stop`` runs on a separate thread.
     """
 
     def end() -> None:
         stop()
         time.sleep(GRACE_S / 2)
-        os._exit(1)  # the user's code hangs, and the parent can't end this process any more
+        os._exit(1)  # the user's code hangs, and the parent can no longer end this process
 
     on_parent_end(end)
 
 
 def child_command(arguments: Sequence[str]) -> list[str]:
-    """Return the command line that runs this program with these arguments."""
+    """Return the command line that runs this program with the given arguments."""
     return [sys.executable, "-m", "skyloop", *arguments]

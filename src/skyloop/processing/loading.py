@@ -1,4 +1,4 @@
-"""Loads the user's processor from a module or a file, with errors that name the place and the problem."""
+"""Load the user's processor from a module or a file, with errors that name the place and the problem."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from skyloop.control.loading import load_module
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 
 _WANTED: Final = "a class with a method process(self, frame)"
-_DIGITS: Final = 16  #: of the hash of the code
+_DIGITS: Final = 16  #: digits of the code's hash
 
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """The class of a processor, and a mark that distinguishes it from other code of the same name."""
+    """The class of a processor, and a mark that distinguishes it from other code of that name."""
 
     kind: type[Any]
     mark: str  #: name of the class and a hash of the file that defines it
@@ -30,7 +30,7 @@ class Code:
         """Return the code of a class.
 
         Raises:
-            UsageError: If it has no plain method ``process(self, frame)``.
+            UsageError: It has no plain method ``process(self, frame)``.
         """
         _check(kind)
         digits = hashlib.sha256(_source(kind)).hexdigest()[:_DIGITS]
@@ -42,10 +42,10 @@ class Code:
         return self.kind.__name__.lower()[:64]
 
     def make(self) -> Any:
-        """Return an instance.
+        """Create an instance.
 
         Raises:
-            UsageError: If the class needs arguments.
+            UsageError: The class needs arguments.
         """
         try:
             inspect.signature(self.kind).bind()
@@ -59,13 +59,13 @@ def load_processor(target: str) -> Code:
     """Load a processor's class.
 
     Args:
-        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if that has only one processor. Modules are searched
+        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if it has only one processor. Modules are searched
             in the current directory too.
 
     Raises:
-        UsageError: If ``target`` names no processor, there is no such module, or the class is none.
-        UnknownNameError: If there is no such class.
-        FileFormatError: If loading it fails, or the file has no processor.
+        UsageError: ``target`` names no processor, there is no such module, or the class is not a processor.
+        UnknownNameError: There is no such class.
+        FileFormatError: Loading fails, or the file has no processor.
     """
     place, colon, class_name = target.rpartition(":")
     if not colon:
@@ -75,7 +75,7 @@ def load_processor(target: str) -> Code:
     elif colon and place:
         module = _import(place)
     else:
-        raise UsageError(f"{target!r} names no processor: give module:Class, file.py:Class or file.py")
+        raise UsageError(f"{target!r} is not a processor: give module:Class, file.py:Class or file.py")
     return Code.of(_choose(module, class_name, place))
 
 
@@ -87,7 +87,7 @@ def _import(name: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name is not None and (name == error.name or name.startswith(f"{error.name}.")):
             raise UsageError(
-                f"there is no module {name} here or where Python looks: give module:Class, or file.py:Class"
+                f"there is no module {name} here or on Python's path: give module:Class, or file.py:Class"
             ) from None
         raise FileFormatError(f"module {name}: {error}") from error
     except Exception as error:
@@ -95,7 +95,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """The class of that name, else the only class with a method ``process``."""
+    """Return the class of that name, or else the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -117,7 +117,7 @@ def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
 def _check(kind: type[Any]) -> None:
     process = getattr(kind, "process", None)
     if not callable(process):
-        raise UsageError(f"{kind.__name__} is no processor: it has no method process(self, frame)")
+        raise UsageError(f"{kind.__name__} is not a processor: it has no method process(self, frame)")
     if inspect.iscoroutinefunction(process):
         raise UsageError(f"{kind.__name__}.process must be a plain function, not a coroutine")
     try:
@@ -127,7 +127,7 @@ def _check(kind: type[Any]) -> None:
 
 
 def _source(kind: type[Any]) -> bytes:
-    """Contents of the file that defines the class; where there is none, as in a notebook, the compiled code."""
+    """Return the source file of a class; without one, as in a notebook, its compiled code."""
     try:
         return Path(inspect.getsourcefile(kind) or "").read_bytes()
     except (TypeError, OSError):

@@ -1,4 +1,4 @@
-"""One worker of a processor: takes its share of the frames, calls the user's class, and publishes what that returns."""
+"""One worker of a processor: takes its share of the frames, calls the user's class and publishes the results."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from skyloop.extend import join_processor, video_channel
 from skyloop.messages import ProcessorShare, Severity
 from skyloop.messages.relayed import MAX_LOG_TEXT, Shape
 
-_LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame comes
+_LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
-_KEPT: Final = 1024  #: newest results and frames that are kept for rates and ages
-#: Summed over several workers.
+_KEPT: Final = 1024  #: newest results and frames kept for rates and ages
+#: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
 
@@ -41,8 +41,8 @@ class Output:
         """Combine a value with shapes.
 
         Args:
-            value: The result; None publishes none.
-            shapes: In the frame's pixels.
+            value: The result; None publishes nothing.
+            shapes: Shapes in the frame's pixels.
         """
         self.value = value
         self.shapes = tuple(shapes)
@@ -50,19 +50,19 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a processor is run.
+    """Options of a processor's run.
 
     Raises:
-        UsageError: If a name, an age or a limit is out of range.
+        UsageError: A name, an age or a limit is out of range.
     """
 
     name: str  #: name of the processor and of its results
-    code: str  #: identifies the code that runs, the same for all workers
+    code: str  #: identifies the code, the same for all workers
     camera: str | None = None  #: name of the camera; None: the vehicle's first
-    shared: bool = True  #: each frame goes to one worker; if False, each worker gets all
-    max_age_s: float | None = 1.0  #: older frames are left out when their turn comes; None: none are
-    max_fps: float | None = None  #: most frames a second for this worker; None: all
-    stuck_s: float = 2.0  #: a call of ``process`` that takes longer gives this worker's share to the others
+    shared: bool = True  #: each frame goes to one worker; if False, each worker gets all frames
+    max_age_s: float | None = 1.0  #: skip frames older than this at their turn; None: skip none
+    max_fps: float | None = None  #: frame rate limit of this worker; None: no limit
+    stuck_s: float = 2.0  #: a longer call of ``process`` gives this worker's share to the others
 
     def __post_init__(self) -> None:
         checked_name(self.name)
@@ -76,23 +76,23 @@ class Worker:
     """Runs a processor on a drone's frames: ``Worker(drone, Detector(), settings).run()``.
 
     Exceptions of ``process`` and results that can't be sent are counted and reported through ``drone.log`` and
-    ``tell``; the worker goes on with the next frame.
+    ``tell``; the worker then continues with the next frame.
     """
 
     def __init__(
         self, drone: Drone, processor: Any, settings: Settings, tell: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Join the processor's workers; no frame is taken before :meth:`run`.
+        """Join the processor's workers; frames are processed only in :meth:`run`.
 
         Args:
-            drone: Where frames come from and results go to.
-            processor: Has a method ``process(frame)``, called on the thread of :meth:`run`.
-            settings: How it is run.
-            tell: Called with each report, a text for people, on the thread of :meth:`run`.
+            drone: Source of the frames, and destination of the results.
+            processor: Object with a method ``process(frame)``, called on the thread of :meth:`run`.
+            settings: Options of the run.
+            tell: Called on the thread of :meth:`run` with each report, a text for people.
 
         Raises:
-            NameTakenError: If another application runs other code under this name.
-            SkyloopError: Whatever else :func:`skyloop.extend.join_processor` raises.
+            NameTakenError: Another application runs other code under this name.
+            SkyloopError: Any other error of :func:`skyloop.extend.join_processor`.
         """
         self.settings = settings
         self._drone = drone
@@ -111,14 +111,14 @@ class Worker:
         self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)
 
     def run(self, seconds: float | None = None) -> None:
-        """Process frames until :meth:`stop` or the drone's end, then leave the processor's workers.
+        """Process frames until :meth:`stop` is called or the drone closes, then leave the processor's workers.
 
         Args:
-            seconds: For how long at most [s]; None: no limit.
+            seconds: Longest duration [s]; None: no limit.
 
         Raises:
-            NameTakenError: If other code took over the name meanwhile, as it can while the proxy is away.
-            RefusedError: If the proxy refuses this worker for another reason.
+            NameTakenError: Other code took the name meanwhile, as it can while the proxy is away.
+            RefusedError: The proxy refuses this worker for another reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
         try:
@@ -127,17 +127,17 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # returns its memory to the proxy while this waits for the next one
+                    del arrival  # returns its memory to the proxy while waiting for the next
         finally:
             self.membership.close()
 
     def stop(self) -> None:
-        """End :meth:`run` after the call that is under way. Any thread."""
+        """End :meth:`run` after the current call. Any thread."""
         self._stopped.set()
 
     @property
     def status(self) -> Status:
-        """Present statistics. Any thread."""
+        """Current statistics. Any thread."""
         membership = self.membership
         return self._tally.status(membership.processor, membership.camera, membership.share, self._frames.dropped)
 
@@ -165,11 +165,11 @@ class Worker:
             stuck = not self._ready()
             self._busy_since_s = None
             if stuck:
-                self.membership.renew()  # the proxy gives its share back
+                self.membership.renew()  # asks the proxy for a share again
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Whether it can take frames: not while a call of ``process`` takes longer than ``stuck_s``."""
+        """Return whether the worker can take frames: not while a call of ``process`` exceeds ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -191,9 +191,9 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._reported_refusal:  # further results are most likely of the same type
+        if not self._reported_refusal:  # further results probably have the same type
             self._reported_refusal = True
-            self._emit(f"{self.settings.name}: {error}. Further ones are counted and not reported.")
+            self._emit(f"{self.settings.name}: {error}. Further ones are counted but not reported.")
 
     def _failed(self, error: Exception) -> None:
         self._tally.errors += 1
@@ -211,9 +211,9 @@ class Worker:
 
 
 class Frames:
-    """The newest frame of a worker's share that it has not taken yet. A context manager: subscribed while open.
+    """The newest unprocessed frame of a worker's share. A context manager: subscribed while open.
 
-    Only frames of the share are requested, again whenever it changes, so that no others travel over a network.
+    Requests only the share's frames, and follows changes of the share, so that no others travel over a network.
     """
 
     def __init__(
@@ -222,20 +222,20 @@ class Frames:
         """Prepare to subscribe.
 
         Args:
-            drone: Where the frames come from.
-            membership: Knows the share.
-            came: Called with each frame of the share, on the receiving thread.
-            max_fps: Most frames a second; None: all.
+            drone: Source of the frames.
+            membership: The membership with the share.
+            came: Called on the receiving thread with each frame of the share.
+            max_fps: Frame rate limit; None: no limit.
         """
         self._drone = drone
         self._membership = membership
         self._came = came
         self._max_fps = max_fps
         self._usual = video_channel(drone, membership.camera)
-        self._channel: VideoChannel | None = None  # subscribed now
+        self._channel: VideoChannel | None = None  # the current subscription
         self._buffer: Mailbox[Arrival] = Mailbox()
         self._sink = self._arrived
-        self._lock = threading.Lock()  # guards the change from one channel to another
+        self._lock = threading.Lock()  # guards the change of channels
 
     def __enter__(self) -> Self:
         self._membership.changed = self._follow
@@ -255,14 +255,14 @@ class Frames:
         return self._buffer.dropped
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """Take the newest frame; None if none comes within ``timeout_s`` [s]."""
+        """Take the newest frame; None if none arrives within ``timeout_s`` [s]."""
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
-        """Decode the frame; None, and counted by its channel, if it can't be decoded."""
+        """Decode the frame; None if that fails, which its channel counts."""
         return (self._channel or self._usual).picture(arrival)
 
-    # On the receiving thread, except on entering --------------------------------------------------------------
+    # On the receiving thread, except while entering --------------------------------------------------------------
 
     def _follow(self, share: ProcessorShare) -> None:
         part, fps = (share.part, share.parts), self._max_fps
@@ -280,7 +280,7 @@ class Frames:
                 before.remove(self._sink)
 
     def _arrived(self, arrival: Arrival) -> None:
-        share = self._membership.share  # the frame may be of an earlier share
+        share = self._membership.share  # the frame may belong to an earlier share
         if share is not None and share.parts and arrival.header.seq % share.parts == share.part:
             self._came()
             self._buffer.put(arrival)
@@ -289,22 +289,22 @@ class Frames:
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Statistics of one worker, or of several of one processor together.
 
-    Counts are since the start; rates and ages are of the last second.
+    Counts are since the start; rates and ages cover the last second.
     """
 
     processor: str
     camera: str
     processes: int = 1  #: workers that these statistics cover
-    part: int = 0  #: which part of the frames it takes; 0 for several workers
-    parts: int = 0  #: of how many parts, 0: none now; for several workers: how many of them take a part
-    workers: int = 0  #: of this processor and camera that the proxy knows
-    frames: int = 0  #: frames of its part
+    part: int = 0  #: index of the worker's part of the frames; 0 for several workers
+    parts: int = 0  #: number of parts, 0: none now; for several workers: how many of them have a part
+    workers: int = 0  #: workers of this processor and camera known to the proxy
+    frames: int = 0  #: frames of the worker's part
     results: int = 0
-    dropped: int = 0  #: frames that newer ones replaced before it was ready
-    stale: int = 0  #: frames that were too old when their turn came
+    dropped: int = 0  #: frames replaced by newer ones before the worker was ready
+    stale: int = 0  #: frames too old at their turn
     errors: int = 0  #: calls of ``process`` that raised
     refused: int = 0  #: results that can't be sent
-    unsent: int = 0  #: results that could not be handed to the transport
+    unsent: int = 0  #: results that the transport did not accept
     frames_hz: float = 0.0
     results_hz: float = 0.0
     age_s: float | None = None  #: median time from a frame's capture to its result
@@ -314,7 +314,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     def __str__(self) -> str:
         share = f"part {self.part + 1} of {self.parts}" if self.parts else "no part now"
         if self.processes > 1:
-            share = f"{self.parts} of {self.processes} processes at work"
+            share = f"{self.parts} of {self.processes} processes working"
         age = "–" if self.age_s is None or self.age_max_s is None else f"{_ms(self.age_s)} (max {_ms(self.age_max_s)})"
         parts = [
             f"{self.processor} {self.camera}",
@@ -325,16 +325,16 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
             f"dropped {self.dropped}",
             f"too old {self.stale}",
             f"errors {self.errors}",
-            *([f"not sendable {self.refused}"] if self.refused else []),
-            *([f"not sent {self.unsent}"] if self.unsent else []),
+            *([f"unsendable {self.refused}"] if self.refused else []),
+            *([f"unsent {self.unsent}"] if self.unsent else []),
         ]
         return "  ".join(parts)
 
 
 def together(found: Iterable[Status]) -> Status | None:
-    """Combine the statistics of several workers of one processor; None for none.
+    """Combine the statistics of several workers of one processor; None if there are none.
 
-    Counts and rates are summed. Ages are the worst of all.
+    Counts and rates are summed; ages are the worst.
     """
     each = list(found)
     if len(each) < 2:
@@ -355,37 +355,37 @@ def together(found: Iterable[Status]) -> Status | None:
 
 
 class Tally:
-    """Counts what one worker does. One thread counts frames, one results; any may read."""
+    """Counters of one worker. One thread counts frames, another results; any thread can read."""
 
     def __init__(self, clock: Clock) -> None:
         self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0
         self._clock = clock
         self._came: deque[int] = deque(maxlen=_KEPT)
-        self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # when, age [s], took [s]
+        self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # time, age [s], duration [s]
 
     def came(self) -> None:
-        """Count a frame of its part; on the receiving thread."""
+        """Count a frame of the worker's part; on the receiving thread."""
         self.frames += 1
         self._came.append(self._clock())
 
     def made(self, age_s: float, took_s: float) -> None:
-        """Count a result that was published.
+        """Count a published result.
 
         Args:
-            age_s: From the frame's capture until now [s].
+            age_s: Time since the frame's capture [s].
             took_s: Duration of ``process`` [s].
         """
         self.results += 1
         self._made.append((self._clock(), age_s, took_s))
 
     def status(self, processor: str, camera: str, share: ProcessorShare | None, dropped: int) -> Status:
-        """Return the present statistics.
+        """Return the current statistics.
 
         Args:
             processor: Name of the processor.
             camera: Name of the camera.
-            share: Share of the frames; None while it is not known.
-            dropped: Frames that newer ones replaced.
+            share: Share of the frames; None while unknown.
+            dropped: Frames replaced by newer ones.
         """
         since_ns = self._clock() - NS_PER_S
         made = [one for one in self._made.copy() if one[0] > since_ns]

@@ -1,4 +1,4 @@
-"""Received samples that are not written yet: bounded; when it is full, frames are dropped first, then feedback."""
+"""A bounded backlog of samples not written yet; when full, it drops frames first, then feedback."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any, Final
 
 from skyloop.recording.options import MB
 
-RESERVE: Final = 64 * MB  #: bytes, beyond the limit, for what must not be dropped
+RESERVE: Final = 64 * MB  #: bytes beyond the limit, for samples that must not be dropped
 
 
 class Rank(IntEnum):
-    """What is dropped first has the highest rank."""
+    """Drop order: the highest rank is dropped first."""
 
-    KEPT = 0  #: commands, events, parameters, logs: dropped only when the reserve is full as well
+    KEPT = 0  #: commands, events, parameters, logs: dropped only when the reserve is full, too
     STATE = 1  #: feedback, annotations
     FRAME = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A sample to write: of :mod:`skyloop.messages` or of the layout, or an encoded frame."""
+    """A sample to write: from :mod:`skyloop.messages` or the layout, or an encoded frame."""
 
-    drone: int  #: its index in the recording
-    channel: str  #: its name in the counts: ``feedback``, ``video.front`` …
+    drone: int  #: the drone's index in the recording
+    channel: str  #: the channel's name in the counts: ``feedback``, ``video.front`` …
     rank: Rank
     received_ns: int  #: on this process's monotonic clock
     sample: Any
@@ -42,11 +42,11 @@ class Backlog:
     """A bounded queue in order of arrival, for any number of producers and one consumer.
 
     Attributes:
-        dropped: How many items were dropped.
+        dropped: Counts of dropped items.
     """
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
-        """Limit frames and feedback to so many bytes, and what is dropped last to so many more."""
+        """Limit frames and feedback to ``limit`` bytes, and the rest to ``reserve`` bytes more."""
         self.dropped: Counts = Counter()
         self._limit = limit
         self._ceiling = limit + reserve
@@ -57,7 +57,7 @@ class Backlog:
 
     @property
     def size(self) -> int:
-        """Bytes that wait."""
+        """Bytes waiting."""
         return self._size
 
     def put(self, item: Item) -> None:
@@ -70,7 +70,7 @@ class Backlog:
                 self._make_room()
 
     def put_back(self, items: Iterable[Item]) -> None:
-        """Put items that were taken last, and could not be written, back to the front, in their order."""
+        """Return the items taken last, which could not be written, to the front, in order."""
         with self._lock:
             first = self._first()
             for number, item in enumerate(reversed(list(items)), 1):
@@ -79,7 +79,7 @@ class Backlog:
             self._make_room()
 
     def take(self, size: int) -> list[Item]:
-        """Remove the oldest items, until they make up this size [bytes], in order of arrival. Does not wait."""
+        """Remove and return the oldest items up to this size [bytes], in order of arrival. Does not wait."""
         taken: list[Item] = []
         with self._lock:
             while size > 0:
@@ -93,7 +93,7 @@ class Backlog:
         return taken
 
     def count(self, item: Item) -> None:
-        """Count an item that was dropped elsewhere."""
+        """Count an item dropped elsewhere."""
         with self._lock:
             self.dropped[item.drone, item.channel] += 1
 
@@ -104,6 +104,6 @@ class Backlog:
         kept, state, frames = self._queues
         for queue, limit in ((frames, self._limit), (state, self._limit), (kept, self._ceiling)):
             while self._size > limit and queue:
-                _, item = queue.popleft()  # the oldest, so that the newer ones stay without a gap
+                _, item = queue.popleft()  # the oldest, so that the newer ones have no gap
                 self._size -= item.size
                 self.dropped[item.drone, item.channel] += 1

@@ -1,4 +1,4 @@
-"""The recorder within a process: subscriptions to drones, a backlog, and the thread that writes it."""
+"""The recorder within a process: subscriptions to drones, a backlog and the writing thread."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Engine:
 
         Raises:
             UsageError: Two drones have the same name.
-            UnknownNameError: No drone has a camera that the options name.
+            UnknownNameError: The options name a camera that no drone has.
         """
         check_names(drones, "recording")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
@@ -60,11 +60,11 @@ class Engine:
         self._reported: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
 
     def start(self) -> None:
-        """Open the file, and start recording.
+        """Open the file and start recording.
 
         Raises:
             UsageError: The file can't be written.
-            SkyloopError: A drone can't be subscribed to; the file is closed then.
+            SkyloopError: A drone can't be subscribed to; the file is then closed.
         """
         self._writer.start()
         try:
@@ -76,11 +76,11 @@ class Engine:
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Leave the file to the parent process; in a child made by ``os.fork``."""
+        """In a child made by ``os.fork``: leave the file to the parent process."""
         self._ended_ns = time.monotonic_ns()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what was received, and close the file. Idempotent."""
+        """Write all received samples and close the file. Idempotent."""
         if self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()
@@ -90,7 +90,7 @@ class Engine:
 
     @property
     def status(self) -> Status:
-        """The present status. May be read from any thread."""
+        """The current status. Can be read from any thread."""
         writer = self._writer
         return Status(
             writer.state,
@@ -116,7 +116,7 @@ class Engine:
         self._on_event(RecorderEvent(text, severity))
 
     def _publish_to(self, tap: Tap, text: str, severity: Severity) -> None:
-        """Write an event to the file, and log it with the drone."""
+        """Write an event to the file and log it on the drone."""
         tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
         tap.drone.log.text(text, name="recording", severity=severity)
 
@@ -125,7 +125,7 @@ class Engine:
         unwritable = writer.unwritable > self._reported_unwritable
         self._reported_unwritable = writer.unwritable
         for tap in self._taps:
-            tap.look()
+            tap.check_streams()
             now = (tap.dropped(), tap.missed())
             before, self._reported[tap] = self._reported[tap], now
             if now == before:

@@ -1,4 +1,4 @@
-"""Messages for viewers, in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
+"""Messages for viewers in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
 
 Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.recording.layout`.
 """
@@ -57,7 +57,7 @@ Vector = tuple[float, float, float]
 
 
 def schema(message: type[Message]) -> bytes:
-    """Return the file descriptor set of a message with all its dependencies, as MCAP requires it."""
+    """Return the file descriptor set of a message with all its dependencies, as MCAP requires."""
     found = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -82,7 +82,7 @@ def timestamp(unix_ns: int) -> Timestamp:
 
 
 def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) -> bytes:
-    """Encode an image, a file of the format ``jpeg`` or ``png``, that was captured at this Unix time."""
+    """Encode an image file (``jpeg`` or ``png``) captured at this Unix time."""
     message = CompressedImage(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
     )
@@ -115,7 +115,7 @@ def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, in
 
 
 def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
-    """Return as many coefficients as the viewers' model has: 4 for a fisheye, 5 for a pinhole."""
+    """Return the coefficients of the viewers' model: 4 for a fisheye, 5 for a pinhole."""
     wanted = 4 if intrinsics.model == "fisheye" else 5
     given = intrinsics.distortion
     return given if len(given) > wanted else (*given, *[0.0] * (wanted - len(given)))
@@ -125,9 +125,9 @@ def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
 
 
 def pose(feedback: Feedback) -> Pose | None:
-    """Return the vehicle's pose in world axes; None while the attitude is not known.
+    """Return the vehicle's pose in world axes; None while the attitude is unknown.
 
-    Without a position it is above the origin at its altitude, so that attitude and height can still be seen.
+    Without a position, place it above the origin at its altitude, so that attitude and height still show.
     """
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None
@@ -165,7 +165,7 @@ def world_to_drone(drone: str, at_ns: int, place: Pose) -> bytes:
 
 
 def drone_to_camera(drone: str, camera: CameraInfo, at_ns: int) -> bytes | None:
-    """Encode where a camera is mounted; None if that is not known."""
+    """Encode a camera's mounting; None if it is unknown."""
     if camera.rotation is None:
         return None
     import numpy as np
@@ -191,7 +191,7 @@ def _transform(parent: str, child: str, at_ns: int, translation: Vector3, rotati
 
 
 def drawing(annotation: Annotation, captured_ns: int) -> bytes:
-    """Encode what was drawn on a frame captured at this Unix time."""
+    """Encode the drawing on a frame captured at this Unix time."""
     message = ImageAnnotations()
     at = timestamp(captured_ns)
     for shape in annotation.shapes:

@@ -1,6 +1,6 @@
-"""What Foxglove's viewers may do: which web pages may connect, and the drones' parameters.
+"""Access of Foxglove's viewers: which web pages can connect, and reading and writing the drones' parameters.
 
-Those are read by everybody, and written under a lease that is held for that moment.
+Any viewer can read parameters; a write briefly acquires a lease.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from skyloop.errors import ParameterError, SkyloopError, UnknownNameError
 from skyloop.messages import Event, Parameter, ParameterType, Value
 from skyloop.recording.taps import Parameters
 
-LOOKS_ONLY: Final = "this view only looks on: start it with --write to write parameters"
+LOOKS_ONLY: Final = "this view is read-only: start it with --write to write parameters"
 
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """What became of a parameter that was to be written."""
+    """The result of writing a parameter."""
 
-    name: str  #: with its drone's
-    value: Value | None  #: in force now; None: that could not be read
+    name: str  #: including the drone's name
+    value: Value | None  #: the current value; None if it can't be read
     refused: str = ""  #: why it was not written
 
 
-class ParameterDesk:
-    """Reads and writes parameters by names such as ``alpha/limits.tilt``. May be used from any thread."""
+class ParameterAccess:
+    """Reads and writes parameters by names such as ``alpha/limits.tilt``. Can be used from any thread."""
 
     def __init__(
         self,
@@ -49,19 +49,19 @@ class ParameterDesk:
         """Initialise without a request.
 
         Args:
-            drones: Observed ones, with different names.
-            priority: Of whom writes, 0 (the highest) to 31; None: nobody does.
-            on_change: Called with the name and value of each parameter at first, and again when it has changed, from
-                :meth:`follow` on, on a thread of its own.
+            drones: Observed drones, with different names.
+            priority: Priority of writes, 0 (the highest) to 31; None forbids writing.
+            on_change: Called with the name and value of each parameter at first and after each change, once
+                :meth:`follow` was called, on a separate thread.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
         self._on_change = on_change
-        self._lock = threading.Lock()  # one write after the other, and one start
+        self._lock = threading.Lock()  # serialises writes, and the start
         self._following: list[tuple[Parameters, Listener[Event]]] = []
 
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
-        """Return the values of these parameters, or of all. Waits up to 2 s for a drone that does not answer.
+        """Return the values of these parameters, or of all. Wait up to 2 s for a drone that does not answer.
 
         Raises:
             SkyloopError: A drone does not answer.
@@ -77,7 +77,7 @@ class ParameterDesk:
         return {name: value for name, value in found.items() if not wanted or name in wanted}
 
     def write(self, name: str, value: object) -> Written:
-        """Write a parameter, and return what is in force then."""
+        """Write a parameter and return its resulting value."""
         refused = ""
         with self._lock:
             try:
@@ -87,7 +87,7 @@ class ParameterDesk:
             return Written(name, self._present(name), refused)
 
     def follow(self) -> None:
-        """Report every parameter, and from then on each that has changed. Idempotent."""
+        """Report every parameter, and then each change. Idempotent."""
         with self._lock:
             if self._following:
                 return
@@ -97,7 +97,7 @@ class ParameterDesk:
                 followed.start()
 
     def close(self) -> None:
-        """End what :meth:`follow` began."""
+        """Stop following changes."""
         for followed, listener in self._following:
             listener.cancel()
             followed.stop()
@@ -137,59 +137,59 @@ def _typed(parameter: Parameter, value: object) -> object:
     return value
 
 
-# The door -------------------------------------------------------------------------------------------------------
+# Origins --------------------------------------------------------------------------------------------------------
 
 
 MAX_HEAD: Final = 16_384  #: bytes of a request's head
-HEAD_S: Final = 5.0  #: for it to come
+HEAD_S: Final = 5.0  #: time limit for receiving it
 _CHUNK: Final = 1 << 16
 _ORIGIN: Final = re.compile(rb"^origin[ \t]*:[ \t]*(.*?)[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
 _FOXGLOVE: Final = "foxglove.dev"
 _REFUSED: Final = (
     b"HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
-    b"pages of other origins are not let in while parameters can be written\n"
+    b"pages of other origins can't connect while parameters are writable\n"
 )
 
 
 def is_trusted(origin: str) -> bool:
-    """Return whether a page may connect: Foxglove's, in a browser or as an application, or one of this machine."""
+    """Return whether a page may connect: Foxglove's, in a browser or as an application, or a local one."""
     parts = urlsplit(origin)
     name = parts.hostname or ""
     if parts.scheme == "https" and (name == _FOXGLOVE or name.endswith(f".{_FOXGLOVE}")):
         return True
     if parts.scheme in ("http", "https"):
         return is_loopback(name)
-    return parts.scheme == "file"  # the application's own; "null" may be any page's
+    return parts.scheme == "file"  # the application's own; "null" can be any page
 
 
 def hidden_host() -> str:
-    """Return an address of this machine's loopback that a page can't find by trying ports."""
+    """Return a random loopback address that a page can't find by trying ports."""
     if sys.platform != "linux":
         return "127.0.0.1"
     return str(ipaddress.IPv4Address((127 << 24) + random.SystemRandom().randrange(1 << 16, 1 << 24)))
 
 
-class OriginDoor:
-    """Listens from its construction to :meth:`close`, and hands on the connections of those who are trusted.
+class OriginGuard:
+    """Listens until :meth:`close` and forwards connections of trusted origins to the server.
 
     Args:
         host: Address to listen on.
-        port: To listen on; 0 takes a free one.
+        port: Port to listen on; 0 takes a free one.
 
     Attributes:
         port: The port.
-        behind: Address and port of the server behind it; set before anybody is told of the door.
+        behind: Address and port of the server; set before the port is announced.
 
     Raises:
-        OSError: It can't be listened on.
+        OSError: The address can't be listened on.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        door = self
+        guard = self
 
         class Visitor(socketserver.BaseRequestHandler):
             def handle(self) -> None:
-                door._let_in(self.request)
+                guard._accept(self.request)
 
         class Server(socketserver.ThreadingTCPServer):
             address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -203,17 +203,17 @@ class OriginDoor:
         self._server = Server((host, port), Visitor)
         self.port = int(self._server.server_address[1])
         self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-door", daemon=True
+            target=self._server.serve_forever, args=(0.1,), name="skyloop-foxglove-guard", daemon=True
         )
         self._thread.start()
 
     def close(self) -> None:
-        """Let nobody in any more. Connections end with the server behind the door."""
+        """Stop accepting connections. Existing ones end with the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
-    def _let_in(self, visitor: socket.socket) -> None:
+    def _accept(self, visitor: socket.socket) -> None:
         visitor.settimeout(HEAD_S)
         head = b""
         while b"\r\n\r\n" not in head and len(head) < MAX_HEAD:
@@ -228,14 +228,14 @@ class OriginDoor:
         with socket.create_connection(self.behind, timeout=HEAD_S) as server:
             server.settimeout(None)
             server.sendall(head)
-            back = threading.Thread(target=_pump, args=(server, visitor), name="skyloop-foxglove-door", daemon=True)
+            back = threading.Thread(target=_pump, args=(server, visitor), name="skyloop-foxglove-guard", daemon=True)
             back.start()
             _pump(visitor, server)
             back.join()
 
 
 def _pump(source: socket.socket, target: socket.socket) -> None:
-    """Copy bytes until either end is gone, and let both know then."""
+    """Copy bytes until either end closes, then shut down both."""
     with contextlib.suppress(OSError):
         while data := source.recv(_CHUNK):
             target.sendall(data)

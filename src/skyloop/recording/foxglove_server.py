@@ -1,7 +1,7 @@
-"""A WebSocket server for Foxglove: the topics and schemas of recordings, live, and the drones' parameters.
+"""A WebSocket server for Foxglove: live topics in the schemas of recordings, and the drones' parameters.
 
-The protocol is that of https://github.com/foxglove/ws-protocol, spoken by the ``foxglove-sdk``, which sends on threads
-of its own and drops the oldest messages of a viewer that does not read them.
+It uses the protocol of https://github.com/foxglove/ws-protocol from the ``foxglove-sdk``, which sends on its own
+threads and drops the oldest messages of a viewer that does not read.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skyloop.messages.frame import H264, Chain
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
-from skyloop.recording.foxglove_access import OriginDoor, ParameterDesk, Written, hidden_host
+from skyloop.recording.foxglove_access import OriginGuard, ParameterAccess, Written, hidden_host
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, Topic
 from skyloop.recording.options import VIDEO
 from skyloop.recording.output import Message, Schema
@@ -30,8 +30,8 @@ from skyloop.recording.taps import check_names
 from skyloop.recording.translation import Picture, Translator
 from skyloop.recording.view import Source
 
-PORT: Final = 8765  #: that Foxglove asks for by itself
-WAITING: Final = 512  #: messages that may wait for a viewer; then its oldest are dropped
+PORT: Final = 8765  #: Foxglove's default
+WAITING: Final = 512  #: messages that can wait for a viewer before its oldest are dropped
 
 
 class FoxgloveServer:
@@ -40,24 +40,24 @@ class FoxgloveServer:
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
     ) -> None:
-        """Start to listen.
+        """Start listening.
 
         Args:
-            drones: Connected ones, with different names.
+            drones: Connected drones, with different names.
             host: Address to listen on.
-            port: To listen on; 0 takes a free one.
-            priority: Of a viewer that writes parameters, 0 (the highest) to 31; None: none does.
+            port: Port to listen on; 0 takes a free one.
+            priority: Priority of viewers' parameter writes, 0 (the highest) to 31; None forbids writing.
 
         Raises:
-            UsageError: Two drones have the same name, or other machines could write parameters.
+            UsageError: Two drones have the same name, or other machines would be able to write parameters.
             LinkError: The address can't be listened on.
             MissingExtraError: The extra ``[foxglove]`` is not installed.
         """
         check_names(drones, "view")
         if priority is not None and not is_loopback(host):
             raise UsageError(
-                f"parameters can't be written from beyond this machine, and {host} is open to others: Foxglove's "
-                "protocol knows no passwords. Leave out --write, or --host and reach it through ssh -L"
+                f"parameters can be written only from this machine, but {host} is open to others: Foxglove's "
+                "protocol has no passwords. Leave out --write, or --host and reach it through ssh -L"
             )
         self._sdk = _sdk()
         clock = ClockPair.now()
@@ -65,63 +65,63 @@ class FoxgloveServer:
             Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
             for drone in drones
         ]
-        self._lock = threading.Lock()  # guards what viewers' threads change: the next three
-        self._viewers: Counter[str] = Counter()  # by topic
-        self._began: set[str] = set()  # topics that somebody has just subscribed to
-        self._starts: set[str] = set()  # topics that nobody was subscribed to before
+        self._lock = threading.Lock()  # guards the next three attributes, which viewers' threads change
+        self._viewers: Counter[str] = Counter()  # number of viewers by topic
+        self._began: set[str] = set()  # topics with a new subscription
+        self._starts: set[str] = set()  # topics with their first subscription
         self._known: dict[str, tuple[ViewTopic, tuple[Source, ...]]] = {}
         for number, drone in enumerate(drones):
             for topic in topics(drone.name, drone.capabilities, far=Known(drone).is_far):
                 before = self._known[topic.name][1] if topic.name in self._known else ()
                 self._known[topic.name] = topic, (*before, *((number, channel) for channel in topic.channels))
-        self._chains: dict[str, Chain] = {}  # H.264 that viewers were given, by topic
-        self._ready = threading.Event()  # viewers may be there before the server is known here
+        self._chains: dict[str, Chain] = {}  # H.264 sent to viewers, by topic
+        self._ready = threading.Event()  # set once self._server exists: viewers may connect before
         self._context = self._sdk.Context()
         self._channels = {name: self._channel(topic) for name, (topic, _) in self._known.items() if topic.at_once}
-        self._desk = ParameterDesk(drones, priority, self._parameter_changed)
-        self._door: OriginDoor | None = None  # before a server that takes orders: anybody's page could give them
+        self._parameters = ParameterAccess(drones, priority, self._parameter_changed)
+        self._guard: OriginGuard | None = None  # before a server that writes parameters: any web page could connect
         hidden = hidden_host()
         try:
             if priority is not None:
-                self._door = OriginDoor(host, port)
+                self._guard = OriginGuard(host, port)
             self._server = self._sdk.start_server(
                 name=f"skyloop: {', '.join(drone.name for drone in drones)}",
-                host=host if self._door is None else hidden,
-                port=port if self._door is None else 0,
+                host=host if self._guard is None else hidden,
+                port=port if self._guard is None else 0,
                 capabilities=[self._sdk.Capability.Parameters],
                 server_listener=_Listener(self),
                 context=self._context,
                 message_backlog_size=WAITING,
             )
         except (RuntimeError, OSError) as error:
-            if self._door is not None:
-                self._door.close()
+            if self._guard is not None:
+                self._guard.close()
             raise LinkError(f"can't listen on {host}:{port}: {error}; choose another --port, or 0 for any") from None
-        # It would tell Python's logging with locks of its own held, and then no thread of this process may go on: one
-        # waits for such a lock while it holds the interpreter's.
+        # The SDK would log to Python while holding its own locks, which deadlocks: another thread may wait for such a
+        # lock while it holds the interpreter's.
         self._sdk._foxglove_py.disable_logging()
         self.host = host
         self.port: int = self._server.port
-        if self._door is not None:
-            self._door.behind, self.port = (hidden, self._server.port), self._door.port
+        if self._guard is not None:
+            self._guard.behind, self.port = (hidden, self._server.port), self._guard.port
         self._ready.set()
 
     @property
     def url(self) -> str:
-        """What Foxglove connects to."""
+        """The address for Foxglove to connect to."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"ws://{host}:{self.port}"
 
     @property
     def viewers(self) -> dict[str, int]:
-        """How many viewers have subscribed, by topic. May be read from any thread."""
+        """Number of subscribed viewers by topic. Can be read from any thread."""
         with self._lock:
             return {topic: count for topic, count in self._viewers.items() if count > 0}
 
     # On the view's thread --------------------------------------------------------------------------------------
 
     def wanted(self) -> frozenset[Source]:
-        """Return what the topics that viewers have subscribed to are made of."""
+        """Return the sources of the topics that viewers have subscribed to."""
         with self._lock:
             found = {source for topic, count in self._viewers.items() if count > 0 for source in self._known[topic][1]}
             began, self._began = self._began, set()
@@ -133,30 +133,30 @@ class FoxgloveServer:
         return frozenset(found)
 
     def show(self, item: Item) -> None:
-        """Send a sample's messages to those who have subscribed."""
+        """Send a sample's messages to the subscribed viewers."""
         for message in self._translators[item.drone].messages(item):
             if isinstance(item.sample, Picture) and not self._decodable(message, item.sample):
                 continue
             self._send(message)
 
     def close(self) -> None:
-        """Stop listening, and disconnect the viewers."""
-        if self._door is not None:
-            self._door.close()
+        """Stop listening and disconnect the viewers."""
+        if self._guard is not None:
+            self._guard.close()
         self._server.stop()
-        self._desk.close()
+        self._parameters.close()
         for channel in self._channels.values():
             channel.close()
 
     def _show_known(self, began: set[str]) -> None:
-        """Send what is known already to who has just subscribed: parameters, mountings, calibrations."""
+        """Send new subscribers the known state: parameters, mountings, calibrations."""
         for translator in self._translators:
             for message in translator.prelude(monotonic_ns()):
                 if message.topic in began:
                     self._send(message)
 
     def _decodable(self, message: Message, picture: Picture) -> bool:
-        """Whether viewers can decode a message after those that they were given, beginning with a key picture."""
+        """Return whether viewers can decode a message after those already sent, starting with a key frame."""
         record = picture.record
         if record.format != H264 or message.kind is not CompressedVideo:
             return True
@@ -167,7 +167,7 @@ class FoxgloveServer:
 
     def _send(self, message: Message) -> None:
         channel = self._channels.get(message.topic)
-        if channel is None:  # pictures in another form than was expected
+        if channel is None:  # images in an unexpected format
             known = self._known.get(message.topic)
             if known is None:
                 return
@@ -193,27 +193,27 @@ class FoxgloveServer:
                 self._starts.add(topic)
 
     def unsubscribed(self, topic: str) -> None:
-        """Note that a viewer has unsubscribed, or is gone."""
+        """Note that a viewer has unsubscribed, or disconnected."""
         with self._lock:
             self._viewers[topic] -= 1
 
     def read_parameters(self, names: Sequence[str]) -> list[Any]:
-        """Return the parameters of these names, or all."""
+        """Return the parameters with these names, or all."""
         self._ready.wait()
-        self._desk.follow()
+        self._parameters.follow()
         try:
-            found = self._desk.read(names)
+            found = self._parameters.read(names)
         except SkyloopError as error:
             self._report(f"the parameters can't be read: {error.reason}", "parameters")
             return []
         return [self._parameter(name, value) for name, value in found.items()]
 
     def write_parameters(self, wanted: Sequence[Any]) -> list[Any]:
-        """Write parameters, and return what is in force then."""
+        """Write parameters and return their resulting values."""
         self._ready.wait()
         found = []
         for each in wanted:
-            written = self._desk.write(each.name, each.get_value())
+            written = self._parameters.write(each.name, each.get_value())
             self._report_written(written)
             if written.value is not None:
                 found.append(self._parameter(written.name, written.value))
@@ -222,7 +222,7 @@ class FoxgloveServer:
     def follow_parameters(self) -> None:
         """Report changes from now on."""
         self._ready.wait()
-        self._desk.follow()
+        self._parameters.follow()
 
     def _report_written(self, written: Written) -> None:
         if written.refused:
@@ -241,7 +241,7 @@ class FoxgloveServer:
 
 
 class _Listener:
-    """What the SDK calls, on its threads. An error in it would only be a line of its log."""
+    """The SDK's callbacks, on its threads. The SDK only logs their exceptions."""
 
     def __init__(self, server: FoxgloveServer) -> None:
         self._server = server
@@ -280,26 +280,26 @@ def _sdk() -> Any:
 # Topics ---------------------------------------------------------------------------------------------------------
 
 
-_OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # a topic for each camera; of files alone
+_OTHERS: Final = (Channel.FRAMES, Channel.DROPS)  # one topic per camera; only in files
 
 
 @dataclass(frozen=True, slots=True)
 class ViewTopic:
-    """A topic that can be subscribed to."""
+    """A topic that viewers can subscribe to."""
 
     name: str
-    kind: type[Any]  #: the class of its messages, of :class:`skyloop.recording.output.Message`
-    channels: tuple[str, ...]  #: what its drone is subscribed to for it; empty for what is known before
-    at_once: bool = True  #: whether it is announced before there is a message
+    kind: type[Any]  #: class of its messages, see :class:`skyloop.recording.output.Message`
+    channels: tuple[str, ...]  #: the drone's channels that it needs; empty for state known in advance
+    at_once: bool = True  #: whether it is announced before its first message
 
     @property
     def shared(self) -> bool:
-        """Whether it is one topic for all drones."""
+        """Whether all drones share it."""
         return self.name in (layout.TF, layout.LOG)
 
 
 def topics(drone: str, capabilities: Capabilities, *, far: bool) -> Iterator[ViewTopic]:
-    """Yield the topics of a drone, whose frames are encoded for the way if it is far."""
+    """Yield a drone's topics; frames of a ``far`` drone are encoded for the network."""
     for channel, kind in layout.TYPES.items():
         if channel not in _OTHERS:
             yield ViewTopic(str(Topic(drone, channel)), kind, (channel.value,))

@@ -1,4 +1,4 @@
-"""The layout of a recording: topics, schemas and times, encoding and decoding. The page is docs/recording.md.
+"""The layout of a recording: topics, schemas and times, encoding and decoding. See docs/recording.md.
 
 Pure, and without the MCAP library. Skyloop's own samples are JSON objects, encoded by :func:`encode` and decoded by
 :func:`decode`; messages for viewers are in :mod:`skyloop.recording.foxglove`.
@@ -62,8 +62,8 @@ __all__ = [
 
 T = TypeVar("T")
 
-PROFILE: Final = "skyloop"  #: of the MCAP header
-VERSION: Final = 2  #: of this layout; files of layout 1, with the names of before, are read too
+PROFILE: Final = "skyloop"  #: profile in the MCAP header
+VERSION: Final = 2  #: version of this layout; files of layout 1, with older names, are also read
 JSON: Final = "json"  #: message encoding of Skyloop's own samples
 JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of Skyloop's own samples
 PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers
@@ -71,7 +71,7 @@ PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers
 # Names of the metadata records. All their values are texts; see :class:`ClockPair` and :class:`Start`.
 META_CLOCK: Final = "skyloop.clock"
 META_RECORDING: Final = "skyloop.recording"
-META_END: Final = "skyloop.end"  #: missing in a file that was not closed
+META_END: Final = "skyloop.end"  #: missing in a file not closed
 
 LOG: Final = "/log"  #: foxglove.Log of all drones: events and logged texts
 TF: Final = "/tf"  #: foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
@@ -85,16 +85,16 @@ _LAST_UNIX_NS: Final = 2**63 - 1  #: in the year 2262
 
 
 class ClockPair(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.clock``: one moment on the recorder's two clocks.
+    """Metadata ``skyloop.clock``: the same moment on the recorder's two clocks.
 
-    ``log_time`` of a message is when it was received, ``publish_time`` when it was captured (sent, published), both as
-    Unix time [ns] by this pair. Times *within* Skyloop's samples are on the proxy's monotonic clock, unchanged.
+    A message's ``log_time`` is its reception, ``publish_time`` its capture (sending, publishing), both as Unix time
+    [ns] by this pair. Times *within* Skyloop's samples stay on the proxy's monotonic clock.
     """
 
     monotonic_ns: int
     unix_ns: int
     pid: int
-    boot: str = ""  #: of the host: another one means that monotonic times can't be compared
+    boot: str = ""  #: boot id of the host: monotonic times of another boot can't be compared
 
     @classmethod
     def now(cls) -> ClockPair:
@@ -106,7 +106,7 @@ class ClockPair(msgspec.Struct, frozen=True):
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
         """Convert a monotonic time to Unix time [ns]; ``offset_ns`` is its clock minus the recorder's.
 
-        The result is limited to what a file can hold, so that a sample with an absurd time breaks no file.
+        The result is clamped to the range of a file, so that a sample with an absurd time breaks no file.
         """
         return min(max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns), _LAST_UNIX_NS)
 
@@ -124,7 +124,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
     name: str
     uri: str = ""
     capabilities: dict[str, Any] = {}  #: :class:`Capabilities`, converted by :func:`to_plain`
-    clock_offset_ns: int = 0  #: the proxy's clock minus the recorder's, as known at the start
+    clock_offset_ns: int = 0  #: the proxy's clock minus the recorder's, as of the start
 
     @property
     def described(self) -> Capabilities:
@@ -142,23 +142,23 @@ class Start(msgspec.Struct, frozen=True):
     layout: int
     skyloop: str  #: version of Skyloop
     drones: tuple[DroneRecord, ...]
-    started_unix_ns: int  #: of the whole recording; the same in all of its files
+    started_unix_ns: int  #: start of the whole recording; the same in all its files
     file: int = 1  #: number of this file within the recording, from 1
-    options: dict[str, Any] = {}  #: of the recorder: channels, encoding, quality
+    options: dict[str, Any] = {}  #: recorder options: channels, encoding, quality
 
 
 class End(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.end``, written last in a file that was closed. All counts are since the recording started."""
+    """Metadata ``skyloop.end``, written last in a closed file. All counts are since the start of the recording."""
 
-    reason: str  #: ``closed``, or ``rotated`` with another file to follow
+    reason: str  #: ``closed``, or ``rotated`` if another file follows
     ended_unix_ns: int
-    written: dict[str, int]  #: messages of *this file*, by topic
-    dropped: dict[str, dict[str, int]] = {}  #: by drone and channel: received, and left out by the recorder
-    missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received, by gaps in the numbers
+    written: dict[str, int]  #: messages in *this file*, by topic
+    dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
+    missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel, from gaps in their numbers
 
 
 def to_metadata(record: msgspec.Struct) -> dict[str, str]:
-    """Convert a metadata record to strings: a string as it is, all else as JSON."""
+    """Convert a metadata record to strings: strings unchanged, everything else as JSON."""
     fields = msgspec.to_builtins(record)
     return {
         key: value if isinstance(value, str) else msgspec.json.encode(value).decode() for key, value in fields.items()
@@ -169,7 +169,7 @@ def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
     """Convert strings back to a metadata record.
 
     Raises:
-        FileFormatError: They do not fit the record.
+        FileFormatError: The strings do not fit the record.
     """
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
@@ -183,7 +183,7 @@ def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
         }
         return msgspec.convert(fields, kind)
     except (msgspec.ValidationError, FileFormatError, ValueError) as error:
-        raise FileFormatError(f"metadata that can't be understood as {kind.__name__}: {error}") from None
+        raise FileFormatError(f"metadata can't be read as {kind.__name__}: {error}") from None
 
 
 # Skyloop's own samples -----------------------------------------------------------------------------------------
@@ -204,15 +204,15 @@ class Channel(StrEnum):
 
 
 class FrameRecord(msgspec.Struct, frozen=True):
-    """A recorded frame; its image is a message of its own, with the same sequence and times.
+    """A recorded frame; its image is a separate message with the same sequence and times.
 
-    That is on :func:`image_topic`, or for H.264 on :func:`video_topic`.
+    The image is on :func:`image_topic`, or for H.264 on :func:`video_topic`.
     """
 
     header: FrameHeader  #: as received
     received_ns: int  #: on the recorder's monotonic clock
-    format: str  #: of the image in the file: ``jpeg``, ``png``, ``h264``
-    key: bool = True  #: whether it can be decoded alone, as all but some of ``h264`` can
+    format: str  #: format of the image in the file: ``jpeg``, ``png``, ``h264``
+    key: bool = True  #: whether it can be decoded alone, as everything but some ``h264`` frames can
 
 
 class ResultRecord(msgspec.Struct, frozen=True):
@@ -222,18 +222,18 @@ class ResultRecord(msgspec.Struct, frozen=True):
     worker: int
     number: int
     camera: str
-    seq: int  #: of the frame
-    captured_ns: int  #: of the frame
-    made_ns: int  #: when the result was ready, on the proxy's clock
+    seq: int  #: sequence number of the frame
+    captured_ns: int  #: capture of the frame
+    made_ns: int  #: completion of the result, on the proxy's clock
     took_ns: int
     value: Any = None
 
 
 class Drops(msgspec.Struct, frozen=True):
-    """Totals by channel (``feedback``, ``video.front``) since the recording started, written when one has changed."""
+    """Totals by channel (``feedback``, ``video.front``) since the start of the recording, written after each change."""
 
     at_ns: int  #: on the recorder's monotonic clock
-    dropped: dict[str, int]  #: received, and left out because the disk or the encoder was slower
+    dropped: dict[str, int]  #: received but dropped because the disk or the encoder was too slow
     missed: dict[str, int]  #: never received: dropped by the proxy for a slow recorder, or lost in transport
 
 
@@ -253,7 +253,7 @@ TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One of Skyloop's own topics, in its parts."""
+    """The parts of one of Skyloop's own topics."""
 
     drone: str
     channel: Channel
@@ -281,7 +281,7 @@ def image_topic(drone: str, camera: str) -> str:
 
 
 def video_topic(drone: str, camera: str) -> str:
-    """Return the topic of a camera's H.264 as the vehicle sent it, foxglove.CompressedVideo."""
+    """Return the topic of a camera's H.264 as sent by the vehicle, foxglove.CompressedVideo."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/video"
 
 
@@ -306,7 +306,7 @@ def mocap_topic(drone: str) -> str:
 
 
 def path_topic(drone: str) -> str:
-    """Return the topic of where the drone has been since the recording started, foxglove.PosesInFrame."""
+    """Return the topic of the drone's path since the start of the recording, foxglove.PosesInFrame."""
     return f"/{_quoted(drone)}/path"
 
 

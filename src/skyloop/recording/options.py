@@ -1,4 +1,4 @@
-"""What to record and how, validated before anything is opened; the next file's name; the status of a recorder."""
+"""Recording options, checked before anything is opened; the next file's name; the status of a recorder."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ VideoEncoding = Literal["auto", "jpeg", "png"]
 
 MB: Final = 1_000_000
 VIDEO: Final = "video"
-#: What can be chosen; ``video.CAMERA`` is one camera.
+#: Channels to choose from; ``video.CAMERA`` is one camera.
 CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, Channel.DROPS)), VIDEO)
 
 
 class Options(msgspec.Struct, frozen=True):
-    """How to record; see :func:`skyloop.record` for each of them.
+    """Recording options; see :func:`skyloop.record` for each.
 
     Raises:
-        UsageError: A value is out of its range.
+        UsageError: A value is out of range.
     """
 
     channels: tuple[str, ...] = CHOICES
@@ -42,7 +42,7 @@ class Options(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if self.encoding not in ("auto", "jpeg", "png"):
-            known = '"auto", "jpeg" or, without any loss, "png"'
+            known = '"auto", "jpeg" or, lossless, "png"'
             raise UsageError(f"encoding is {self.encoding!r} and must be {known}")
         if not isinstance(self.quality, int) or not 1 <= self.quality <= 100:
             raise UsageError(f"quality is {self.quality!r} and must be a whole number from 1 to 100 (best)")
@@ -71,7 +71,7 @@ class Options(msgspec.Struct, frozen=True):
         return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
-        """Check the cameras that were chosen.
+        """Check the chosen cameras.
 
         Raises:
             UnknownNameError: No drone has a camera of that name.
@@ -91,7 +91,7 @@ def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
 
     Raises:
         UnknownNameError: There is no such channel.
-        UsageError: No channel was named.
+        UsageError: No channel is named.
     """
     if names is None:
         return CHOICES
@@ -117,20 +117,20 @@ def numbered(path: Path, number: int) -> Path:
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Return the path to record to: a file (``.mcap`` by default), or one in a folder, named by drones and time.
+    """Return the path to record to: the given file (``.mcap`` by default), or one in a folder named by drones and time.
 
     Raises:
-        UsageError: The file exists already, or its folder does not.
+        UsageError: The file already exists, or its folder does not.
     """
     if path.is_dir():
         path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
     if not path.suffix:
         path = path.with_suffix(".mcap")
     if not path.parent.is_dir():
-        raise UsageError(f"{path.parent} is no folder: make it first")
+        raise UsageError(f"{path.parent} is not a folder: create it first")
     first = numbered(path, 1) if options.rotates else path
     if first.exists() and not options.overwrite:
-        raise UsageError(f"{first} exists already: choose another name, or allow it to be overwritten")
+        raise UsageError(f"{first} already exists: choose another name, or allow overwriting")
     return path
 
 
@@ -138,13 +138,13 @@ def first_path(path: Path, drones: list[str], options: Options) -> Path:
 
 
 class RecorderState(StrEnum):
-    """Whether a recorder records."""
+    """The state of a recorder."""
 
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  #: the disk can't be written; what must not be lost waits, and writing is retried each second
+    PAUSED = "paused"  #: the disk can't be written; essential samples wait, and writing is retried each second
     CLOSED = "closed"  #: closed on purpose; the file is complete
-    FAILED = "failed"  #: its process was killed, or its thread ended by an error; what was written is in the file
+    FAILED = "failed"  #: its process was killed, or an error ended its thread; data already written is in the file
 
 
 class Status(msgspec.Struct, frozen=True):
@@ -152,38 +152,38 @@ class Status(msgspec.Struct, frozen=True):
 
     state: RecorderState = RecorderState.STARTING
     reason: str = ""  #: why it is paused or has failed
-    path: str = ""  #: the file that is written, or that was written last
-    files: tuple[str, ...] = ()  #: all of them, oldest first
-    seconds: float = 0.0  #: since it started
+    path: str = ""  #: the current or last file
+    files: tuple[str, ...] = ()  #: all files, oldest first
+    seconds: float = 0.0  #: time since the start
     bytes: int = 0  #: in all files
     messages: int = 0
-    waiting: int = 0  #: bytes received and not written yet
-    dropped: dict[str, dict[str, int]] = {}  #: by drone and channel: received, and left out
-    missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received
+    waiting: int = 0  #: bytes received but not written yet
+    dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
+    missed: dict[str, dict[str, int]] = {}  #: samples never received, by drone and channel
 
 
 class RecorderEvent(msgspec.Struct, frozen=True):
-    """Something that happened to a recording, for people and applications."""
+    """An event of a recording, for people and applications."""
 
     text: str
     severity: Severity = Severity.INFO
 
 
 class Room(StrEnum):
-    """What is still written when the disk fills up."""
+    """Samples still written as the disk fills up."""
 
     ALL = "all"
     NO_FRAMES = "no frames"
     NOTHING = "nothing"
 
 
-_MARGIN: Final = 1.25  #: factor of a limit that must be free again before more is written
+_MARGIN: Final = 1.25  #: factor above a limit that must be free before more is written again
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:
-    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it.
+    """Decide what to write: everything above the floor, no frames below it, nothing below a quarter of it.
 
-    To write more than ``before`` again, there must be a margin above the limit.
+    Writing more than ``before`` again needs a margin above the limit.
     """
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:

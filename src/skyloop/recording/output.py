@@ -1,4 +1,4 @@
-"""One MCAP file of a recording. What was committed stays readable, whatever happens later."""
+"""One MCAP file of a recording. Committed data stays readable in any event."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CHUNK: Final = MB  #: bytes after which a chunk is closed, unless :meth:`Recordi
 
 
 class Target(Protocol):
-    """An unbuffered file that is open for writing."""
+    """An unbuffered file open for writing."""
 
     def write(self, data: Any, /) -> int | None: ...
     def truncate(self, size: int | None = None, /) -> int: ...
@@ -38,14 +38,14 @@ def open_target(path: Path, overwrite: bool) -> Target:
     """Open a file without a buffer.
 
     Raises:
-        OSError: It exists, or can't be written.
+        OSError: The file exists, or can't be written.
     """
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message of the file. ``kind`` is the class of one of Skyloop's samples, or a protobuf class."""
+    """One message of the file. ``kind`` is the class of a Skyloop sample, or a protobuf class."""
 
     topic: str
     kind: type[msgspec.Struct | Protobuf]
@@ -57,10 +57,10 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """How messages of a kind are described to a program that does not know them."""
+    """The description of a kind of messages for programs that do not know it."""
 
     name: str
-    encoding: str  #: of the description
+    encoding: str  #: encoding of the description
     data: bytes
     message_encoding: str
 
@@ -75,29 +75,29 @@ class Schema:
 
 
 class Output:
-    """The stream of the MCAP writer: nothing reaches the file before :meth:`flush`, and then all of it or nothing."""
+    """The MCAP writer's stream: nothing reaches the file before :meth:`flush`, then everything or nothing."""
 
     def __init__(self, target: Target) -> None:
         self.committed = 0  #: bytes in the file, up to the end of a record
-        self.waiting = 0  #: bytes that are not in the file yet
+        self.waiting = 0  #: bytes not in the file yet
         self._target = target
         self._pieces: list[bytes] = []
 
     def write(self, data: bytes) -> int:
-        """Append to what waits; return the number of bytes."""
+        """Append to the waiting data; return the number of bytes."""
         self._pieces.append(data)
         self.waiting += len(data)
         return len(data)
 
     def tell(self) -> int:
-        """Return the size of the file with what waits [bytes]."""
+        """Return the size of the file including waiting data [bytes]."""
         return self.committed + self.waiting
 
     def flush(self) -> None:
-        """Write what waits to the file.
+        """Write the waiting data to the file.
 
         Raises:
-            OSError: The disk fails; the file then ends where it ended before.
+            OSError: The disk fails; the file then keeps its previous end.
         """
         try:
             for piece in self._pieces:
@@ -115,14 +115,14 @@ class Output:
 
 
 class RecordingFile:
-    """An MCAP file that is written; messages are in the file after :meth:`commit`.
+    """An MCAP file being written; messages are in the file after :meth:`commit`.
 
-    Every method raises ``OSError`` when the disk fails; then only :meth:`abandon` may be called.
+    Every method raises ``OSError`` when the disk fails; after that, call only :meth:`abandon`.
 
     Attributes:
         path: The file.
-        written: Messages by topic.
-        count: All messages.
+        written: Number of messages by topic.
+        count: Number of all messages.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class RecordingFile:
             raise MissingExtraError("recording", "record", cause=str(error)) from None
         self.path = path
         self.written: Counter[str] = Counter()
-        self.count = 0  #: messages
+        self.count = 0  #: number of all messages
         self._target = opener(path, overwrite)
         self._output = Output(self._target)
         self._writer = Writer(cast(IO[Any], self._output), chunk_size=CHUNK, compression=CompressionType.LZ4)
@@ -157,12 +157,12 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Bytes, including those that wait."""
+        """Bytes, including waiting ones."""
         return self._output.tell()
 
     @property
     def lost(self) -> bool:
-        """Whether the file was deleted. One that was moved is still written."""
+        """Whether the file was deleted. A moved file is still written."""
         try:
             return os.fstat(self._target.fileno()).st_nlink == 0
         except OSError:
@@ -192,7 +192,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Close the file as it is: readable up to what was committed, without a summary. An empty one is removed."""
+        """Close the file as it is: readable up to the last commit, without a summary. Remove an empty file."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
-"""A recorded frame, and its pixels: JPEG, PNG, or H.264, whose frames build on one another and are decoded on demand.
+"""A recorded frame and its pixels: JPEG, PNG, or H.264, whose frames depend on one another and are decoded on demand.
 
-The image is the field ``data`` of a foxglove.CompressedImage, or where the vehicle's H.264 was kept of a
+The image is the field ``data`` of a foxglove.CompressedImage or, if the vehicle's H.264 was kept, of a
 foxglove.CompressedVideo, extracted from its Protocol Buffers encoding
 (https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image,
 …/compressed-video).
@@ -23,9 +23,9 @@ from skyloop.recording.layout import FrameRecord
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-_DATA: Final = 2  #: number of the field with the compressed image,
-_VIDEO_DATA: Final = 3  #: and of the one with H.264
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: kinds of field
+_DATA: Final = 2  #: field number of the compressed image
+_VIDEO_DATA: Final = 3  #: field number of H.264
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: wire types of fields
 _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
 
 
@@ -35,8 +35,8 @@ class Picture:
 
     camera: str
     record: FrameRecord
-    log_ns: int  #: when it was received, Unix time [ns]
-    publish_ns: int  #: when it was captured, Unix time [ns]
+    log_ns: int  #: time of reception, Unix time [ns]
+    publish_ns: int  #: time of capture, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
     group: tuple[Group, int] | None = None  #: for H.264 that can be decoded: its group, and its index in it
 
@@ -56,23 +56,23 @@ class Picture:
 
     @property
     def can_be_decoded(self) -> bool:
-        """Whether the images that it builds on are known: false for H.264 without the key frame before it."""
+        """Whether the images that it depends on are known: false for H.264 without its key frame."""
         return self.record.format != H264 or self.group is not None
 
     def pixels(self) -> NDArray[np.uint8]:
         """Decode the frame: BGR, shape (height, width, 3), uint8.
 
         Raises:
-            FileFormatError: It can't be decoded.
+            FileFormatError: The frame can't be decoded.
             MissingExtraError: OpenCV, or for H.264 PyAV, is not installed.
         """
         return self._decoded(grey=False)
 
     def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
-        """Decode the frame in the encoding in which the vehicle sent it if that was raw, else as BGR.
+        """Decode the frame in the vehicle's encoding if that was raw, else as BGR.
 
         Raises:
-            FileFormatError: It can't be decoded.
+            FileFormatError: The frame can't be decoded.
             MissingExtraError: OpenCV, or for H.264 PyAV, is not installed.
         """
         grey = self.header.encoding is Encoding.MONO8
@@ -86,7 +86,7 @@ class Picture:
         if self.record.format != H264:
             return decode_image(self.compressed, what, grey=grey)
         if self.group is None:
-            raise FileFormatError(f"{what} can't be decoded: frames that it builds on are missing")
+            raise FileFormatError(f"{what} can't be decoded: frames that it depends on are missing")
         group, place = self.group
         return group.pixels(place, what)
 
@@ -104,7 +104,7 @@ def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
     """Decode JPEG or PNG to BGR, shape (height, width, 3), or grey (height, width), uint8.
 
     Raises:
-        FileFormatError: It can't be decoded.
+        FileFormatError: The data can't be decoded.
         MissingExtraError: OpenCV is not installed.
     """
     try:
@@ -124,7 +124,7 @@ def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
 
 
 def _field(message: bytes, number: int) -> bytes:
-    """Return a field of bytes of an encoded message; empty if it is not there."""
+    """Return a bytes field of an encoded message; empty if missing."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
@@ -144,7 +144,7 @@ def _field(message: bytes, number: int) -> bytes:
 
 
 def _varint(message: bytes, at: int) -> tuple[int, int]:
-    """Decode a number of seven bits per byte; return it and where it ends."""
+    """Decode a varint (seven bits per byte); return it and its end."""
     number = shift = 0
     while at < len(message) and shift < 64:
         byte = message[at]
@@ -160,13 +160,13 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
 
 
 class Group:
-    """A key frame and the frames that follow it, in order of capture. Decoding continues where it stopped before."""
+    """A key frame and its followers, in order of capture. Decoding continues where it last stopped."""
 
     def __init__(self) -> None:
         self._units: list[bytes] = []
         self._context: VideoCodecContext | None = None
-        self._done = 0  # units that were decoded
-        self._image: Any = None  # the picture of the last of them
+        self._done = 0  # units decoded so far
+        self._image: Any = None  # image of the last of them
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -180,21 +180,21 @@ class Group:
         """Decode one frame to BGR, shape (height, width, 3), uint8.
 
         Raises:
-            FileFormatError: The frame is damaged, or no H.264.
+            FileFormatError: The frame is damaged, or not H.264.
             MissingExtraError: PyAV is not installed.
         """
         if self._context is None or index < self._done - 1:
             self._context, self._done = _decoder(), 0
-        while self._done <= index and (self._done == 0 or self._image is not None):  # so are those after damage
+        while self._done <= index and (self._done == 0 or self._image is not None):  # after damage all fail
             self._image = _decode(self._context, self._units[self._done])
             self._done += 1
         if self._image is None:
-            raise FileFormatError(f"{what} can't be decoded: it is no H.264, or it is damaged")
+            raise FileFormatError(f"{what} can't be decoded: it is not H.264, or it is damaged")
         return np.ascontiguousarray(self._image.to_ndarray(format="bgr24"), dtype=np.uint8)
 
 
 class Groups:
-    """Sorts the frames of one camera, in their order, into groups."""
+    """Sorts the frames of one camera, in order, into groups."""
 
     def __init__(self) -> None:
         self._chain = Chain()
@@ -204,7 +204,7 @@ class Groups:
         """Add a frame.
 
         Returns:
-            The group and the index in it; None for a frame that can't be decoded, because one before it is missing.
+            The group and the index in it; None for a frame that can't be decoded because an earlier one is missing.
         """
         if not self._chain.follows(number, key=key):
             return None

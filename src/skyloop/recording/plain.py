@@ -1,7 +1,7 @@
-"""Skyloop's own samples as JSON objects with a schema, and back; when they were known. Pure, without MCAP's library.
+"""Skyloop's own samples as JSON objects with a schema, and back; and their times. Pure, without the MCAP library.
 
-The keys are the fields of a sample's class. What is not known is absent; a number that is not finite is null; the
-members of a union are distinguished by a key of their own (``action``, ``shape``).
+The keys are the fields of a sample's class. Unknown values are absent; numbers that are not finite are null; an extra
+key (``action``, ``shape``) distinguishes the members of a union.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from skyloop.messages import (
 
 T = TypeVar("T")
 
-MAX_DEPTH: Final = 64  #: of lists and objects in a sample; a processor's results have a handful
+MAX_DEPTH: Final = 64  #: nesting of lists and objects in a sample; a processor's results have a handful
 MIN_INT: Final = -(1 << 63)
 MAX_INT: Final = (1 << 63) - 1
 
@@ -46,7 +46,7 @@ def decode(data: bytes | memoryview, kind: type[T]) -> T:
     """Decode a sample from JSON.
 
     Raises:
-        FileFormatError: The data are no sample of that kind.
+        FileFormatError: The data are not a sample of that kind.
     """
     return from_plain(from_json(data), kind)
 
@@ -55,12 +55,12 @@ def from_json(data: bytes | memoryview | str) -> Any:
     """Decode any JSON.
 
     Raises:
-        FileFormatError: The data are no JSON, or nested too deeply.
+        FileFormatError: The data are not JSON, or nested too deeply.
     """
     try:
         return msgspec.json.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError(f"a message that is not JSON: {error}") from None
+        raise FileFormatError(f"a message is not JSON: {error}") from None
 
 
 #: How the members of a union are distinguished in JSON: key and value.
@@ -72,7 +72,7 @@ _TAGS: Final[dict[type, tuple[str, str]]] = {
 }
 
 
-#: Names of fields in recordings of layout 1, by those of today.
+#: Field names in recordings of layout 1, by current name.
 _FORMER: Final[dict[type, dict[str, str]]] = {
     Feedback: {
         "roll_rad": "roll",
@@ -113,17 +113,17 @@ def from_plain(plain: Any, kind: type[T]) -> T:
     """Convert plain values back to a sample.
 
     Raises:
-        FileFormatError: The values are no sample of that kind.
+        FileFormatError: The values are not a sample of that kind.
     """
     restore = _restorer(kind)  # type: ignore[arg-type]
     try:
         return msgspec.convert(restore(plain), kind)
     except (msgspec.ValidationError, TypeError, ValueError, LookupError, AttributeError, RecursionError) as error:
-        raise FileFormatError(f"a message that can't be understood as {kind.__name__}: {error!r:.300}") from None
+        raise FileFormatError(f"a message can't be read as {kind.__name__}: {error!r:.300}") from None
 
 
 def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
-    """Return a JSON value unchanged if others can work with it, nested at most ``depth`` deep.
+    """Return a JSON value unchanged if other programs can read it, nested at most ``depth`` deep.
 
     Raises:
         ValueError: A whole number has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
@@ -144,7 +144,7 @@ _Restore = Callable[[Any], Any]
 
 @cache
 def _restorer(kind: Any) -> _Restore:
-    """Return a function from a JSON value to what ``msgspec.convert`` takes for this type."""
+    """Return a function that prepares a JSON value for ``msgspec.convert`` to this type."""
     return _restore_type(inspect.type_info(kind))
 
 
@@ -219,7 +219,7 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
             return structs[value[key]][1](value)
         if only is not None:
             restored = only(value)
-            # A vector that is not known in one part is not known; our own samples hold no numbers that are not finite.
+            # A vector with an unknown part is unknown; our own samples hold only finite numbers.
             unknown = nothing is None and isinstance(restored, list) and any(one != one for one in restored)
             return None if unknown else restored
         return (
@@ -239,10 +239,10 @@ def schema_name(kind: type[msgspec.Struct]) -> str:
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """Return the JSON schema of a sample, in the subset that viewers understand: no references, no choice of types.
+    """Return the JSON schema of a sample, in the subset that viewers understand: no references and no unions.
 
-    (Foxglove's and Lichtblick's readers want "type": "object" at the root and one type for each property and item.)
-    A property that may be of several types, such as a parameter's value, is therefore not listed: others are allowed.
+    (Foxglove's and Lichtblick's readers want "type": "object" at the root and one type for each property and item.) A
+    property with several possible types, such as a parameter's value, is therefore not listed: others are allowed.
     The description is the first line of the class's docstring.
     """
     info = inspect.type_info(kind)
@@ -260,7 +260,7 @@ _SIMPLE: Final = (
 
 
 def _schema_of(info: inspect.Type) -> dict[str, Any]:
-    """Return the schema of a type; empty for one that can't be described."""
+    """Return the schema of a type; empty if it can't be described."""
     if isinstance(info, inspect.Metadata):
         return _schema_of(info.type)
     for kind, name in _SIMPLE:
@@ -284,13 +284,13 @@ def _schema_of(info: inspect.Type) -> dict[str, Any]:
 
 
 def _array(items: dict[str, Any]) -> dict[str, Any]:
-    if items.get("type") == "array":  # viewers know no arrays of arrays: points are shown as they are drawn, elsewhere
+    if items.get("type") == "array":  # viewers can't show arrays of arrays; points appear as drawings instead
         return {}
     return {"type": "array", "items": items} if items else {}
 
 
 def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
-    """One object with the properties of all of them."""
+    """Return one object with the properties of all structs."""
     properties: dict[str, Any] = {}
     for struct in structs:
         if struct.cls in _TAGS:
@@ -302,21 +302,21 @@ def _object(structs: list[inspect.StructType]) -> dict[str, Any]:
     return {"type": "object", "properties": properties}
 
 
-# Their times ----------------------------------------------------------------------------------------------------
+# Times ----------------------------------------------------------------------------------------------------------
 #
-# When a sample was known to the proxy, on the proxy's own clock: the time axis of a flight. The times of the file are
-# the recorder's, and those of a file that recorded a replay in step with its application are unrelated to the flight.
+# A sample's time is when the proxy knew it, on the proxy's own clock: the time axis of a flight. The file's times are
+# the recorder's; in a recording of a replay in step with its application they are unrelated to the flight.
 
 
-_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is farther before the newest one than this,
-_AHEAD_NS: Final = 3600 * NS_PER_S  #: or farther ahead of it
+_BACK_NS: Final = 10 * NS_PER_S  #: ignore a sample's time that is more than this before the newest
+_AHEAD_NS: Final = 3600 * NS_PER_S  #: or more than this ahead of it
 
 
 _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns", "made_ns")
 
 
 def reported_ns(value: Any) -> int | None:
-    """Return when the proxy received or published a sample; None for one without a time."""
+    """Return the time when the proxy received or published a sample; None if it has none."""
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
     if isinstance(value, Applied):
@@ -325,15 +325,15 @@ def reported_ns(value: Any) -> int | None:
         return value.at_ns
     if isinstance(value, Annotation):
         return value.captured_ns
-    made_ns = getattr(value, "made_ns", None)  # of a result's record
+    made_ns = getattr(value, "made_ns", None)  # from a result's record
     if made_ns is not None:
         return int(made_ns)
-    header = getattr(value, "header", None)  # of a frame's record or picture
+    header = getattr(value, "header", None)  # from a frame's record or picture
     return None if header is None else int(header.published_ns)
 
 
 def shifted(value: Any, shift_ns: int) -> Any:
-    """Return a sample with its times on a clock that is ahead of its own by ``shift_ns``."""
+    """Return a sample with its times moved ahead by ``shift_ns``."""
     names = [name for name in _TIMES if getattr(value, name, 0)]
     if names:
         return msgspec.structs.replace(value, **{name: getattr(value, name) + shift_ns for name in names})
@@ -346,25 +346,25 @@ def shifted(value: Any, shift_ns: int) -> Any:
 class Course:
     """The time along a recording, sample by sample: it never runs backwards, and ignores a single wrong time.
 
-    Where the clock of the proxy begins anew, because its computer has started again, time goes on from where it was, by
-    as much as the recorder's clock does.
+    When the proxy's clock restarts because its computer rebooted, time continues from the last value, advanced by as
+    much as the recorder's clock.
 
     Attributes:
         first_ns: Time of the first sample that has one.
         newest_ns: Time of the newest sample.
-        shift_ns: What is added to the samples' own times now, since the proxy's clock began anew.
+        shift_ns: Current offset added to the samples' own times, after restarts of the proxy's clock.
     """
 
     def __init__(self, shift_ns: int = 0) -> None:
-        """Start before the first sample, or with the shift that is in force there."""
+        """Start before the first sample, with a known shift if there is one."""
         self.first_ns: int | None = None
         self.newest_ns = 0
         self.shift_ns = shift_ns
-        self._doubted_ns: int | None = None  # far off: accepted if the next such one agrees
-        self._log_ns = 0  # of the newest sample
+        self._doubted_ns: int | None = None  # an implausible time: accepted if the next one agrees
+        self._log_ns = 0  # log time of the newest sample
 
     def follow(self, value: Any, log_ns: int = 0) -> int:
-        """Return the time of the next sample in the order of the file, recorded at ``log_ns`` (0: not known)."""
+        """Return the time of the next sample in the order of the file, recorded at ``log_ns`` (0: unknown)."""
         own_ns = reported_ns(value)
         if own_ns is None:
             return self.newest_ns
@@ -374,7 +374,7 @@ class Course:
         elif -_BACK_NS < own_ns - self.newest_ns < _AHEAD_NS:
             self.newest_ns = max(self.newest_ns, own_ns)
             self._doubted_ns = None if isinstance(value, Feedback) else self._doubted_ns
-        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # others' times may be those of applications
+        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # other samples' times may come from applications
             agree = self._doubted_ns is not None and abs(own_ns - self._doubted_ns) < _BACK_NS
             self._doubted_ns = own_ns
             if agree and own_ns < self.newest_ns:

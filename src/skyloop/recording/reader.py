@@ -1,4 +1,4 @@
-"""Reading a recording: its drones, and their samples in the order in which they were received; and a folder of them."""
+"""Read a recording: its drones, and their samples in order of reception; and describe a folder of them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from skyloop.recording.scan import (
     scan,
 )
 
-#: Called with the share of a file that has been read, from 0 to 1.
+#: Called with the share of a file read so far, 0 to 1.
 Progress = Callable[[float], object]
 ENDING: Final = ".mcap"
 
@@ -61,18 +61,18 @@ class Entry:
     """One message of the file; times are Unix time [ns]."""
 
     topic: str
-    log_ns: int  #: when it was received
-    publish_ns: int  #: when it was captured
+    log_ns: int  #: time of reception
+    publish_ns: int  #: time of capture
     sequence: int
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One sample of a drone. ``value`` is of the channel's type in ``skyloop.recording.layout.TYPES``."""
+    """One sample of a drone. ``value`` has the channel's type in ``skyloop.recording.layout.TYPES``."""
 
     channel: Channel
-    camera: str  #: of frames; else empty
+    camera: str  #: camera of a frame; else empty
     entry: Entry
     value: Any
 
@@ -83,21 +83,21 @@ class Series:
 
     topic: str
     schema: str
-    own: Topic | None  #: None for viewers' topics and for foreign ones
+    own: Topic | None  #: None for viewers' and foreign topics
 
 
 @dataclass(slots=True)
 class Recording:
-    """An MCAP file that Skyloop recorded. Opening reads its index, or scans it without one; each iteration reads it.
+    """An MCAP file recorded by Skyloop. Opening reads its index or, without one, scans it; each iteration reads it.
 
-    A file that was cut off is read as far as it goes, and ``cut`` holds where it ends. What can't be read in its middle
-    is left out, and ``damaged`` holds where.
+    A truncated file is read up to its end, and ``cut`` says where it ends. Unreadable parts in the middle are skipped,
+    and ``damaged`` says where.
     """
 
     path: Path
     start: Start
     clock: ClockPair
-    end: End | None  #: None for a file that was not closed
+    end: End | None  #: None for a file not closed
     found: Scan
     _bad: Counter[str] = field(default_factory=Counter)
     _complete: bool = False  # whether all channels are known
@@ -108,7 +108,7 @@ class Recording:
 
         Raises:
             UsageError: The file does not exist or can't be read.
-            FileFormatError: It is no MCAP file, or was not recorded by Skyloop.
+            FileFormatError: It is not an MCAP file, or was not recorded by Skyloop.
         """
         found = indexed(path) or scan(path)
         texts = {record.name: record.metadata for record in found.metadata}
@@ -121,12 +121,12 @@ class Recording:
             raise FileFormatError(f"{found.path}: {error}") from None
         if not 1 <= start.layout <= VERSION:
             raise FileFormatError(
-                f"{found.path} has layout {start.layout}, and this version of Skyloop reads layouts 1 to {VERSION}: "
+                f"{found.path} has layout {start.layout}, but this version of Skyloop reads layouts 1 to {VERSION}: "
                 "use the version that recorded it, or a newer one"
             )
         return cls(found.path, start, clock, end, found)
 
-    # What it is ------------------------------------------------------------------------------------------------
+    # Properties ------------------------------------------------------------------------------------------------
 
     @property
     def cut(self) -> str:
@@ -135,7 +135,7 @@ class Recording:
 
     @property
     def damaged(self) -> list[str]:
-        """What could not be read so far, in words."""
+        """The unreadable parts found so far, in words."""
         return [*self.found.damaged, *(f"{count} × {what}" for what, count in self._bad.items())]
 
     @property
@@ -151,7 +151,7 @@ class Recording:
             FileFormatError: The recording has no drone at all.
         """
         if not self.drones:
-            raise FileFormatError(f"{self.path} names no drone")
+            raise FileFormatError(f"{self.path} has no drone")
         if name is None:
             return self.drones[0]
         found = {drone.name: drone for drone in self.drones}
@@ -161,7 +161,7 @@ class Recording:
 
     @property
     def series(self) -> list[Series]:
-        """The channels in the file, sorted by topic. For a file that was cut off, the first access reads all of it."""
+        """The channels in the file, sorted by topic. For a truncated file, the first access reads all of it."""
         if self.found.cut and not self._complete:
             find_channels(self.found)
         self._complete = True
@@ -179,7 +179,7 @@ class Recording:
         )
 
     def cameras(self, drone: str) -> list[str]:
-        """Return the cameras that have frames, in the vehicle's order.
+        """Return the cameras with frames, in the vehicle's order.
 
         Raises:
             UnknownNameError: The recording has no such drone.
@@ -203,7 +203,7 @@ class Recording:
         first, last = self.span_ns
         return (last - first) / NS_PER_S
 
-    # What is in it ---------------------------------------------------------------------------------------------
+    # Content --------------------------------------------------------------------------------------------------
 
     def entries(
         self, topics: Collection[str] | None = None, *, from_ns: int = 0, progress: Progress | None = None
@@ -211,18 +211,18 @@ class Recording:
         """Yield messages in the order of their log time.
 
         Args:
-            topics: Which ones; None yields all.
+            topics: Topics to yield; None yields all.
             from_ns: Log time to start from, Unix time [ns].
-            progress: Called with the share that was read, 0 to 1.
+            progress: Called with the share read so far, 0 to 1.
 
         Raises:
-            UsageError: The file can't be read any more.
+            UsageError: The file can no longer be read.
         """
         wanted = None if topics is None else set(topics)
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with open_file(self.path) as file:
-            # Several threads feed a recorder: a message may come a little before an older one, also of the next piece.
+            # Several threads feed a recorder: a message can precede a slightly older one, even in the next piece.
             held: list[Entry] = []
             for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
@@ -243,13 +243,13 @@ class Recording:
         from_ns: int = 0,
         progress: Progress | None = None,
     ) -> Iterator[Item]:
-        """Yield Skyloop's own samples of a drone. What can't be decoded is left out, and counted in :attr:`damaged`.
+        """Yield Skyloop's own samples of a drone. Skip undecodable ones and count them in :attr:`damaged`.
 
         Args:
             drone: The drone's name.
-            channels: Which ones.
+            channels: Channels to yield.
             from_ns: Log time to start from, Unix time [ns].
-            progress: Called with the share that was read, 0 to 1.
+            progress: Called with the share read so far, 0 to 1.
         """
         topics = self._topics(drone, channels)
         for entry in self.entries(topics, from_ns=from_ns, progress=progress):
@@ -266,19 +266,19 @@ class Recording:
         *,
         from_ns: int = 0,
     ) -> Iterator[Item | Picture]:
-        """Return samples as :meth:`items` does, with each frame as a :class:`Picture`: its record with its image.
+        """Yield samples like :meth:`items`, with each frame as a :class:`Picture`: its record with its image.
 
         Args:
             drone: The drone's name.
-            channels: Which ones.
-            progress: Called with the share that was read, 0 to 1.
+            channels: Channels to yield.
+            progress: Called with the share read so far, 0 to 1.
             from_ns: Log time to start from, Unix time [ns].
         """
         images = _image_topics(drone, self.cameras(drone))
         return self._paired(self._topics(drone, channels), images, progress, from_ns)
 
     def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[Picture]:
-        """Return the frames of one camera.
+        """Yield the frames of one camera.
 
         Raises:
             UnknownNameError: The recording has no such drone or camera.
@@ -291,14 +291,14 @@ class Recording:
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
-        """Decode a message of one of Skyloop's own channels; None, and counted in :attr:`damaged`, if that fails."""
+        """Decode a message of one of Skyloop's own channels; None, counted in :attr:`damaged`, if that fails."""
         try:
             return decode(entry.data, TYPES[channel])
         except FileFormatError as error:
             self._bad[f"{entry.topic}: {error}"] += 1
             return None
 
-    # Inside ----------------------------------------------------------------------------------------------------
+    # Internals -------------------------------------------------------------------------------------------------
 
     def _piece(self, file: IO[bytes], piece: Piece, wanted: Collection[str] | None) -> Iterator[Entry]:
         """Yield the messages of a part of the file, in the file's order."""
@@ -309,14 +309,14 @@ class Recording:
                 continue
             channel = channels.get(record.channel_id)
             if max(record.log_time, record.publish_time) > MAX_TIME_NS:
-                self._bad["a message of a time after the year 2262"] += 1
+                self._bad["a message with a time after the year 2262"] += 1
             elif channel is not None and (wanted is None or channel.topic in wanted):
                 yield Entry(channel.topic, record.log_time, record.publish_time, record.sequence, record.data)
 
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
     ) -> Iterator[Item | Picture]:
-        """Yield samples of some topics, with frames as pictures in place of their records."""
+        """Yield samples of some topics, with frames as pictures instead of records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
             topic = topics.get(entry.topic)
@@ -341,11 +341,11 @@ class Recording:
         }
 
 
-_Kind = tuple[str, bool]  # camera, and whether it is H.264 as the vehicle sent it
+_Kind = tuple[str, bool]  # camera, and whether it is the vehicle's own H.264
 
 
 def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
-    """Whether the time of a piece's first message is known."""
+    """Return whether the time of a piece's first message is known."""
     return piece is not None and piece.start_ns > 0
 
 
@@ -356,7 +356,7 @@ def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
 
 
 class _Pairs:
-    """Combines each frame's record with its image, whichever comes first: both have the same sequence."""
+    """Pairs each frame's record with its image by their sequence number, in either order."""
 
     def __init__(self) -> None:
         self._records: dict[_Kind, tuple[Entry, FrameRecord]] = {}
@@ -381,7 +381,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # without a group, decoding it raises
+            with suppress(FileFormatError):  # decoding a picture without a group raises
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 
@@ -391,25 +391,25 @@ def _foreign(found: Scan) -> str:
     if not found.pieces and found.cut:
         return f"{found.path} ends before its first sample: {found.cut}"
     shown = ", ".join(topics[:5]) + (", …" if len(topics) > 5 else "")
-    return f"{found.path} is an MCAP file, but no recording of Skyloop's (its topics: {shown or 'none'})"
+    return f"{found.path} is an MCAP file, but not a Skyloop recording (its topics: {shown or 'none'})"
 
 
 class Described(msgspec.Struct, frozen=True):
-    """What is in a recording."""
+    """The description of a recording."""
 
-    started: float | None = None  #: Unix time [s]; None if it is not known
+    started: float | None = None  #: Unix time [s]; None if unknown
     drones: tuple[str, ...] = ()
     seconds: float | None = None  #: from the first message to the last
-    problem: str = ""  #: why it can't be read, or why it is incomplete; empty for a complete file
+    problem: str = ""  #: why it is unreadable or incomplete; empty for a complete file
 
 
 def shown_name(path: Path) -> str:
-    """Return a file's name as a text, with bytes that are not UTF-8 in hexadecimal."""
+    """Return a file's name as text, with non-UTF-8 bytes in hexadecimal."""
     return os.fsencode(path.name).decode(errors="backslashreplace")
 
 
 def describe(path: Path) -> Described:
-    """Describe a file without unpacking anything. Never raises because of what is in it."""
+    """Describe a file without unpacking anything. The file's content never makes it raise."""
     try:
         recording = Recording.open(path)
         return Described(

@@ -1,4 +1,4 @@
-"""``skyloop.record``: a recorder for connected drones, or for drones given by their names."""
+"""``skyloop.record``: a recorder for connected drones, or for drones given by name."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from skyloop.recording.options import (
 
 
 class Recorder:
-    """A recording that runs until :meth:`close`, or to the end of its ``with`` block. May be used from any thread."""
+    """A recording that runs until :meth:`close` or the end of its ``with`` block. Can be used from any thread."""
 
     def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
         """Start the recording; applications call :func:`record`.
@@ -46,7 +46,7 @@ class Recorder:
             NoAnswerError: The recorder's process does not start.
         """
         self._listening = [drone for drone in drones if isinstance(drone, Drone)]
-        self._own: list[Drone] = []  # connected by this recorder
+        self._own: list[Drone] = []  # drones connected by this recorder
         self._backend: Engine | RecorderProcess
         if in_process:
             self._backend = self._within(drones, path, options)
@@ -71,22 +71,22 @@ class Recorder:
 
     @property
     def status(self) -> Status:
-        """The present status; some of its parts have properties of their own."""
+        """The current status; some of its parts also have their own properties."""
         return self._backend.status
 
     @property
     def state(self) -> RecorderState:
-        """Whether it records now."""
+        """The current state."""
         return self.status.state
 
     @property
     def reason(self) -> str:
-        """Why it is paused or has failed."""
+        """Why the recording is paused or has failed."""
         return self.status.reason
 
     @property
     def path(self) -> Path:
-        """The file that is written, or that was written last."""
+        """The current or last file."""
         return Path(self.status.path)
 
     @property
@@ -106,16 +106,16 @@ class Recorder:
 
     @property
     def dropped(self) -> dict[str, dict[str, int]]:
-        """By drone and channel: how many samples were received and left out."""
+        """Number of samples received but dropped, by drone and channel."""
         return self.status.dropped
 
     @property
     def missed(self) -> dict[str, dict[str, int]]:
-        """By drone and channel: how many samples never reached the recorder."""
+        """Number of samples that never reached the recorder, by drone and channel."""
         return self.status.missed
 
     def close(self) -> None:
-        """Write what was received, and close the file. Idempotent."""
+        """Write all received samples and close the file. Idempotent."""
         self._backend.stop()
         self._close_own()
 
@@ -153,27 +153,27 @@ def record(
     overwrite: bool = False,
     in_process: bool | None = None,
 ) -> Recorder:
-    """Record one or several drones to an MCAP file; return once the recording runs. Use it as a context manager.
+    """Record one or several drones to an MCAP file; return once the recording runs. Use as a context manager.
 
     Args:
-        drones: Connected ones, or names of running proxies.
-        path: A file, or a folder in which a name is chosen.
-        channels: Of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
+        drones: Connected drones, or names of running proxies.
+        path: A file, or a folder in which to choose a file name.
+        channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
             ``video`` and ``video.CAMERA``; None records all.
-        encoding: Of raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG are kept as such.
-            ``"auto"`` keeps the vehicle's H.264 where it sends that, and else encodes as JPEG.
-        quality: Of JPEG, 1 to 100 (best).
-        rotate_mb: Start a new file after so many megabytes (``flight-0001.mcap``, …), each complete in itself, H.264 at
-            a key frame; None does not.
-        rotate_s: The same after so many seconds.
-        min_free_mb: Space to leave on the disk: below it frames are not recorded, below a quarter of it nothing.
-        buffer_mb: How much may wait for a slow disk before frames are dropped.
-        overwrite: Whether an existing file is replaced.
-        in_process: Whether to record on threads of this process, and not in a separate one; None does so only if a
+        encoding: For raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
+            ``"auto"`` keeps the vehicle's H.264 if it sends that, and otherwise encodes as JPEG.
+        quality: JPEG quality, 1 to 100 (best).
+        rotate_mb: Start a new file after this many megabytes (``flight-0001.mcap``, …), each self-contained, H.264 at a
+            key frame; None does not.
+        rotate_s: The same after this many seconds.
+        min_free_mb: Free space to leave on the disk: below it no frames are recorded, below a quarter of it nothing.
+        buffer_mb: Amount of data that can wait for a slow disk before frames are dropped.
+        overwrite: Whether to replace an existing file.
+        in_process: Whether to record on threads of this process instead of in a separate one; None does so only if a
             drone can't be reached from another process.
 
     Raises:
-        UsageError: An argument is wrong, or the file exists or can't be written.
+        UsageError: An argument is wrong, or the file already exists or can't be written.
         UnknownNameError: There is no such channel or camera.
         LinkError: A drone can't be connected to, or the recorder's process can't record.
         NoAnswerError: The recorder's process does not start.
@@ -204,18 +204,18 @@ def record(
 # The recorder's process -----------------------------------------------------------------------------------------
 
 
-START_S: Final = 20.0
-_END_S: Final = 15.0  # to write what was received, before the child is terminated
-_HARDER_S: Final = 3.0
-_TELL_S: Final = 0.25
-_NICE: Final = 5  # the flight comes first
+START_S: Final = 20.0  #: time for the child to start recording
+_END_S: Final = 15.0  # time to write received samples before the child is terminated
+_HARDER_S: Final = 3.0  # after terminating the child, before killing it
+_TELL_S: Final = 0.25  # period of the child's status reports
+_NICE: Final = 5  # the flight has priority
 _log = logging.getLogger(__name__)
 
 
 class Order(msgspec.Struct, frozen=True):
-    """What a child is to record."""
+    """The parameters of a recording child."""
 
-    targets: tuple[str, ...]  #: the address or name by which each drone is connected
+    targets: tuple[str, ...]  #: address or name of each drone
     path: str
     options: Options
 
@@ -225,8 +225,8 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 
     status: Status | None = None
     event: RecorderEvent | None = None
-    trouble: str = ""  #: why it could not start
-    usage: bool = False  #: whether that was a UsageError
+    trouble: str = ""  #: why the child could not start
+    usage: bool = False  #: whether that is a UsageError
 
 
 # The child -----------------------------------------------------------------------------------------------------
@@ -239,7 +239,7 @@ def run_child(order: Order) -> int:
     on_parent_end(stop.set)
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    # Sent by this thread, so that a parent that does not read never blocks the writing.
+    # This thread sends them, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:
         try:
@@ -274,10 +274,10 @@ def _print(line: Line) -> None:
 
 
 class RecorderProcess:
-    """A child process that records; it ends with :meth:`stop`, and with this process, however that ends."""
+    """A recording child process; it ends with :meth:`stop`, and with this process, however that ends."""
 
     def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
-        """Start the child, and wait until it records; ``on_event`` is called on a thread that reads its events.
+        """Start the child and wait until it records; ``on_event`` is called on the thread that reads its events.
 
         Raises:
             UsageError: The child can't record because of a wrong argument.
@@ -305,11 +305,11 @@ class RecorderProcess:
 
     @property
     def status(self) -> Status:
-        """The newest status that the child reported."""
+        """The newest status reported by the child."""
         return self._status
 
     def stop(self) -> None:
-        """Let the child write what was received and close its file, and wait for its end. Idempotent.
+        """Have the child write all received samples and close its file; wait for its end. Idempotent.
 
         A child that does not end in time is terminated, then killed.
         """
@@ -341,7 +341,7 @@ class RecorderProcess:
             reason = f"the recorder's process {self._how_it_ended()}"
             self._status = msgspec.structs.replace(self._status, state=RecorderState.FAILED, reason=reason)
             with contextlib.suppress(Exception):
-                self._on_event(RecorderEvent(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
+                self._on_event(RecorderEvent(f"{reason}; its data is in {self._status.path}", Severity.ERROR))
         self._bell.notify()
 
     def _take(self, line: Line) -> None:
@@ -357,7 +357,7 @@ class RecorderProcess:
 
 
 def check_installed() -> None:
-    """Check that the extra is installed, so that the error is raised here and not in a child.
+    """Check that the extra is installed, to raise the error here rather than in a child.
 
     Raises:
         MissingExtraError: The extra ``[record]`` is not installed.

@@ -1,10 +1,10 @@
-"""What Rerun is given of drones: their samples as its entities, on the timeline ``capture`` (Unix time).
+"""Drones in Rerun: their samples as Rerun entities, on the timeline ``capture`` (Unix time).
 
 =============================== =====================================================================
 ``world/drones/NAME``           pose and axes
-``world/drones/NAME/CAMERA``    mounting, frustum, pictures, and what was drawn on them
-``world/paths/NAME``            where it was
-``cameras/NAME/CAMERA``         pictures of a camera of which nobody knows where it is mounted
+``world/drones/NAME/CAMERA``    mounting, frustum, images, and drawings on them
+``world/paths/NAME``            path flown
+``cameras/NAME/CAMERA``         images of a camera with unknown mounting
 ``plots/NAME/…``                attitude, velocity, altitude, battery, set-points, logged numbers
 ``log/NAME``                    events and logged texts
 =============================== =====================================================================
@@ -46,9 +46,9 @@ from skyloop.recording.translation import Path as Trail
 
 TIMELINE: Final = "capture"
 APPLICATION: Final = "skyloop"
-_MOST_SERIES: Final = 64  # of logged numbers, and sources of drawings: applications choose their names
-_PATH_EVERY_NS: Final = 1_000_000_000
-_FRUSTUM_M: Final = 0.3
+_MOST_SERIES: Final = 64  # limit of series and drawing sources, because applications choose their names
+_PATH_EVERY_NS: Final = 1_000_000_000  # between points of a path
+_FRUSTUM_M: Final = 0.3  # drawn size of a camera
 _LEVELS: Final = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _STATE: Final[dict[str, tuple[str, ...]]] = {
     "attitude": ("roll [rad]", "pitch [rad]", "yaw [rad]"),
@@ -68,21 +68,21 @@ class Shown:
 
 
 class RerunLog:
-    """One recording of Rerun's. One thread may use it."""
+    """A Rerun recording. Use it from one thread only."""
 
     def __init__(self, drones: Sequence[Shown], recording: str = "") -> None:
-        """Initialise a recording that goes nowhere yet: call :meth:`save` or :meth:`connect` next.
+        """Initialise a recording without a destination: call :meth:`save` or :meth:`connect` next.
 
         Args:
-            drones: Whose samples are added.
-            recording: Name of the recording; the same is the same to Rerun. Empty: one of its own.
+            drones: Drones whose samples are added.
+            recording: Name of the recording; Rerun merges recordings with equal names. Empty: a unique one.
 
         Raises:
             MissingExtraError: The extra ``[rerun]`` is not installed.
         """
         self._rr = rerun_sdk()
         self._stream = self._rr.RecordingStream(APPLICATION, recording_id=recording or str(uuid.uuid4()))
-        self._stream.set_log_time_enabled(False)  # of writing, which for a recording is another day
+        self._stream.set_log_time_enabled(False)  # log time is the time of writing, meaningless for a recording
         self._stream.set_log_tick_enabled(False)
         self._drones = [_Drone(self._rr, self._stream, drone) for drone in drones]
         self._shown = drones
@@ -91,7 +91,7 @@ class RerunLog:
         """Write to a file.
 
         Raises:
-            UsageError: It can't be written.
+            UsageError: The file can't be written.
         """
         try:
             self._stream.save(str(path), default_blueprint=self._blueprint())
@@ -103,24 +103,24 @@ class RerunLog:
         """Send to a viewer or a server, at an address such as ``rerun+http://127.0.0.1:9876/proxy``.
 
         Raises:
-            UsageError: The address makes no sense.
+            UsageError: The address is invalid.
         """
         try:
             self._stream.connect_grpc(url, default_blueprint=self._blueprint())
         except (RuntimeError, ValueError) as error:
-            raise UsageError(f"{url} is no address of a Rerun viewer: {error}") from None
+            raise UsageError(f"{url} is not an address of a Rerun viewer: {error}") from None
         self._begin()
 
     def add(self, drone: int, sample: Any) -> None:
-        """Add a sample of the drone of this index, if it is of a kind that is drawn."""
+        """Add a sample of the drone with this index, if its kind is drawn."""
         self._drones[drone].add(sample)
 
     def add_picture(self, drone: int, record: FrameRecord, data: bytes) -> None:
-        """Add a frame: its image file, or access unit of H.264, of which the first is a key picture."""
+        """Add a frame: its image file, or H.264 access unit; the first must be a key frame."""
         self._drones[drone].picture(record, data)
 
     def taken(self, timeout_s: float) -> bool:
-        """Return whether the viewer, or the disk, takes all that was added within this time, above 0 [s]."""
+        """Return whether the viewer or disk accepts everything added within this time, above 0 [s]."""
         try:
             self._stream.flush(timeout_sec=timeout_s)
         except Exception:  # noqa: BLE001  (Rerun's own, which has no common base)
@@ -128,18 +128,18 @@ class RerunLog:
         return True
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Finish the file, or send what is left, for which the viewer may take so long [s].
+        """Finish the file, or send the rest, waiting up to ``timeout_s`` [s] for the viewer.
 
         Raises:
-            LinkError: The viewer does not take what is left, which is given up.
+            LinkError: The viewer does not accept the rest, which is dropped.
         """
         if self.taken(timeout_s):
             self._stream.disconnect()
             return
-        # Disconnecting, now or when Python ends, would wait for the viewer for ever.
+        # Disconnecting, now or when Python exits, would wait for the viewer forever.
         threading.Thread(target=self._stream.disconnect, name="skyloop-rerun-end", daemon=True).start()
         self._rr.unregister_shutdown()
-        raise LinkError(f"the viewer does not take what is left: it stands still, or is closed ({timeout_s:g} s)")
+        raise LinkError(f"the viewer did not accept the remaining data within {timeout_s:g} s: it hangs, or is closed")
 
     def _begin(self) -> None:
         self._stream.log("world", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -147,7 +147,7 @@ class RerunLog:
             drone.begin()
 
     def _blueprint(self) -> Any:
-        """Return the arrangement of the viewer: the world, the cameras, the plots, the texts."""
+        """Return the viewer's layout: world, cameras, plots, texts."""
         import rerun.blueprint as views
 
         cameras = [
@@ -202,7 +202,7 @@ class _Drone:
         }
 
     def begin(self) -> None:
-        """Draw what does not change: axes and mountings."""
+        """Draw the fixed parts: axes and mountings."""
         rr = self._rr
         self._stream.log(f"world/drones/{self._name}", rr.TransformAxes3D(0.3), static=True)
         for camera in self._cameras.values():
@@ -234,7 +234,7 @@ class _Drone:
             self._stream.log(entity, rr.VideoStream(codec=rr.VideoCodec.H264), static=True)
         self._stream.log(entity, rr.VideoStream.from_fields(sample=data, is_keyframe=record.key))
 
-    # Each kind -------------------------------------------------------------------------------------------------
+    # Kinds of samples -----------------------------------------------------------------------------------------------
 
     def _at(self, proxy_ns: int) -> int:
         at_ns = self._unix(proxy_ns)
@@ -307,7 +307,7 @@ class _Drone:
         )
         self._stream.log(f"{entity}/texts", written)
 
-    # Inside ----------------------------------------------------------------------------------------------------
+    # Internals -------------------------------------------------------------------------------------------------
 
     def _plot(self, plot: str, names: Iterable[str], numbers: Iterable[float | None]) -> None:
         entity = f"plots/{self._name}/{plot}"
@@ -339,12 +339,12 @@ class _Drone:
 
 
 def entity_of(drone: str, camera: CameraInfo) -> str:
-    """Return the entity of a camera: in the world, if it is known where it is mounted."""
+    """Return the entity of a camera: in the world if its mounting is known."""
     return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
 
 
 def part(name: str) -> str:
-    """Return a name as a part of an entity's path."""
+    """Quote a name as a part of an entity path."""
     return str(rerun_sdk().escape_entity_path_part(name))
 
 
@@ -362,7 +362,7 @@ def rerun_sdk() -> Any:
 
 
 def _within(known: set[Any], name: Any) -> bool:
-    """Whether a name that an application chose may have an entity: they are limited in number."""
+    """Return whether an application's name may have an entity; their number is limited."""
     if name not in known and len(known) < _MOST_SERIES:
         known.add(name)
     return name in known

@@ -1,4 +1,4 @@
-"""Rerun as a screen: its viewer, which is started or runs already, or a file; and a recording as a file for it."""
+"""Rerun as a screen: a viewer, started or already running, or a file; and export of a recording to such a file."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from skyloop.recording.taps import check_names
 from skyloop.recording.translation import Picture
 from skyloop.recording.view import Source
 
-PORT: Final = 9876  #: of Rerun's viewer
-_START_S: Final = 20.0
-_AHEAD: Final = 8 * MB  #: that the viewer may be behind
-_PATIENCE_S: Final = 0.5
-_ASK_NS: Final = nanoseconds(1.0)
-_LAST_S: Final = 5.0
-_LOOK_S: Final = 0.1
-_SETTLED_S: Final = 1.0
+PORT: Final = 9876  #: default port of Rerun's viewer
+_START_S: Final = 20.0  # time for the viewer to listen
+_AHEAD: Final = 8 * MB  #: bytes that the viewer can be behind
+_PATIENCE_S: Final = 0.5  # how long to wait for a slow viewer before dropping samples
+_ASK_NS: Final = nanoseconds(1.0)  # how often to check whether the viewer keeps up
+_LAST_S: Final = 5.0  # time for the viewer to accept the rest at the end
+_LOOK_S: Final = 0.1  # how often to check whether the viewer listens
+_SETTLED_S: Final = 1.0  # how long it must listen to count as started
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
 
 
 class RerunViewer:
-    """A :class:`skyloop.recording.view.Screen` of everything: Rerun does not say what is looked at."""
+    """A :class:`skyloop.recording.view.Screen` of everything: Rerun does not report what is on display."""
 
     def __init__(
         self,
@@ -53,28 +53,28 @@ class RerunViewer:
         connect: str | None = None,
         save: Path | None = None,
     ) -> None:
-        """Start the viewer, connect to it, or open the file.
+        """Start or connect to the viewer, or open the file.
 
         Args:
-            drones: Connected ones, with different names.
-            host: Address on which a viewer that is started listens.
-            port: Of the viewer; a viewer that listens there already is taken. None: 9876; 0: any free one.
-            connect: Address of a viewer that runs, instead.
-            save: File to write, instead.
+            drones: Connected drones, with different names.
+            host: Address on which a started viewer listens.
+            port: Port of the viewer; a viewer already listening there is used. None: 9876; 0: any free one.
+            connect: Address of a running viewer to use instead.
+            save: File to write instead.
 
         Raises:
-            UsageError: Two drones have the same name, the file can't be written, or the address makes no sense.
+            UsageError: Two drones have the same name, the file can't be written, or the address is invalid.
             LinkError: The viewer can't be started.
-            NoAnswerError: It does not listen in time.
+            NoAnswerError: The viewer does not listen in time.
             MissingExtraError: The extra ``[rerun]`` is not installed.
         """
         check_names(drones, "view")
         rerun_sdk()
-        self.left_out = 0  #: samples for which the viewer was too slow
-        self._ahead = 0  # bytes that the viewer may not have taken yet
+        self.left_out = 0  #: samples dropped because the viewer was too slow
+        self._ahead = 0  # bytes that the viewer may not have accepted yet
         self._stalled = False
         self._due_ns = 0
-        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 that was shown
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 shown so far
         clock = ClockPair.now()
         self._channels = frozenset(
             (number, channel)
@@ -94,11 +94,11 @@ class RerunViewer:
         self._shown.connect(connect)
 
     def wanted(self) -> frozenset[Source]:
-        """Return everything that is drawn."""
+        """Return all sources that can be drawn."""
         return self._channels
 
     def show(self, item: Item) -> None:
-        """Draw a sample, unless the viewer stands still: Rerun would keep everything for it."""
+        """Draw a sample, unless the viewer hangs: Rerun would queue everything in memory."""
         if not self._keeps_up(item):
             self.left_out += 1
             return
@@ -123,7 +123,7 @@ class RerunViewer:
         taken = self._shown.taken(_PATIENCE_S)
         if taken == self._stalled:
             self._stalled = not taken
-            _log.warning("Rerun's viewer %s", "goes on" if taken else "takes nothing: it stands still, or is closed")
+            _log.warning("Rerun's viewer %s", "accepts data again" if taken else "hangs or is closed: it takes no data")
         self._ahead = 0
         self._due_ns = now_ns + _ASK_NS
         return taken
@@ -140,26 +140,26 @@ def _unix(clock: ClockPair, drone: Drone | DroneRecord) -> Callable[[int], int]:
 
 
 def _start(host: str, port: int) -> None:
-    """Start a viewer that outlives this program, unless one listens already."""
+    """Start a viewer that outlives this program, unless one is already listening."""
     if _listens(host, port):
         return
-    # Rerun's own spawn() would let it listen on all addresses.
+    # Rerun's own spawn() would listen on all addresses.
     command = [sys.executable, "-m", "rerun_cli", "--bind", host, "--port", str(port), "--expect-data-soon"]
     try:
         viewer = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL)
     except OSError as error:
         raise LinkError(f"Rerun's viewer can't be started: {error}") from None
     end = time.monotonic() + _START_S
-    listening_s = 0.0  # a viewer that finds no display listens for a moment before it ends
+    listening_s = 0.0  # a viewer without a display listens for a moment before it exits
     while listening_s < _SETTLED_S:
         if viewer.poll() is not None:
             raise LinkError(
-                "Rerun's viewer ended at once: it needs a display. Without one, --save FILE writes a file for a viewer "
-                "elsewhere, --connect URL shows the drones in one elsewhere"
+                "Rerun's viewer exited at once: it needs a display. Without one, write a file with --save FILE, or "
+                "show the drones in a viewer elsewhere with --connect URL"
             )
         if time.monotonic() > end:
-            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of what was started
-            raise NoAnswerError(f"Rerun's viewer does not listen on {host}:{port} after {_START_S:g} s")
+            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the started process
+            raise NoAnswerError(f"Rerun's viewer is not listening on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
         listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
 
@@ -193,12 +193,12 @@ _CHANNELS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What an export wrote."""
+    """The result of an export."""
 
     drones: tuple[str, ...]
     samples: int
     pictures: int
-    left_out: int  #: pictures that can't be decoded, or are damaged
+    left_out: int  #: images that are damaged or can't be decoded
 
 
 def export_rrd(
@@ -209,8 +209,8 @@ def export_rrd(
     Args:
         recording: The recording.
         path: The file; an existing one is replaced.
-        drone: The only one to export; None: all of them.
-        progress: Called with the share that was read, 0 to 1.
+        drone: The drone to export; None exports all.
+        progress: Called with the share read so far, 0 to 1.
 
     Raises:
         UnknownNameError: The recording has no such drone.

@@ -1,8 +1,7 @@
-"""The structure of an MCAP file, found without its index, as of one that was cut off, or by it; reading its parts.
+"""The structure of an MCAP file, from its index or, for a truncated file, without it; and reading its parts.
 
-The format is that of https://mcap.dev/spec: records of an opcode, a length and that many bytes, most of them chunks,
-which hold messages. Reading stops at a record within which the file ends; of a chunk that was cut off, the part that is
-there is read.
+The format is https://mcap.dev/spec: records of an opcode, a length and that many bytes, most of them chunks, which hold
+messages. Reading stops at a record that the end of the file cuts off; of a truncated chunk, the existing part is read.
 """
 
 from __future__ import annotations
@@ -18,19 +17,19 @@ from typing import IO, Any, Final
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
 
-# Limits: a few kilobytes of a file could otherwise fill the memory or keep a core busy for minutes.
-#: Bytes of a chunk, packed and unpacked, and of a message outside of one. Recorders close a chunk after 1 to 4 MB; it
-#: is larger only by one message, of which an uncompressed 4K picture is the largest.
+# Limits: a file of a few kilobytes could otherwise fill the memory or keep a core busy for minutes.
+#: Bytes of a chunk, packed and unpacked, and of a message outside chunks. Recorders close a chunk after 1 to 4 MB; only
+#: its last message makes it larger, and the largest is an uncompressed 4K image.
 MAX_CHUNK: Final = 64 << 20
-#: How many times as large a chunk may be unpacked. LZ4 can't do more than 255; what hardly changes gets to 150.
+#: Greatest ratio of a chunk's unpacked size. LZ4 reaches at most 255, and nearly constant data 150.
 MAX_RATIO: Final = 512
 MAX_RECORD: Final = 8 << 20  #: bytes of a metadata record, a schema or a channel; Skyloop's take some kilobytes
-#: Bytes of metadata, schemas and channels of a file: they are kept in memory. A recording of 100 drones has about 1 MB.
+#: Bytes of a file's metadata, schemas and channels, which stay in memory. A recording of 100 drones has about 1 MB.
 MAX_HEAD: Final = 32 << 20
-MAX_PIECES: Final = 500_000  #: chunks of a file; a recorder that closes one every second gets there after five days
-MAX_RECORDS: Final = 5_000_000  #: records of a file outside of chunks, where Skyloop's recordings have some hundreds
+MAX_PIECES: Final = 500_000  #: chunks of a file; a recorder that closes one per second gets there after five days
+MAX_RECORDS: Final = 5_000_000  #: records of a file outside chunks, of which Skyloop's recordings have some hundreds
 MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
-_RUN: Final = 4 << 20  #: bytes of messages outside of chunks that are read at once
+_RUN: Final = 4 << 20  #: bytes of messages outside chunks read at once
 
 try:
     from mcap.data_stream import ReadDataStream
@@ -45,10 +44,10 @@ FRAME: Final = struct.Struct("<BQ")  #: opcode and length of a record
 #: Of a chunk: first and last time, size and CRC when unpacked, length of compression's name.
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
-_LONGEST: Final = 1 << 32  #: a longer record is damage
-MAX_NAME: Final = 16
+_LONGEST: Final = 1 << 32  #: a longer record counts as damage
+MAX_NAME: Final = 16  #: bytes of a compression's name
 
-#: What reading a damaged record may raise.
+#: Exceptions that reading a damaged record can raise.
 Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError, RecursionError)
 
 Record = Schema | Channel | Message
@@ -76,16 +75,16 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A chunk, or a run of messages outside of chunks."""
+    """A chunk, or a run of messages outside chunks."""
 
-    offset: int  #: of the chunk's data, or of the run's first record
+    offset: int  #: offset of the chunk's data, or of the run's first record
     size: int  #: in the file
-    start_ns: int = 0  #: log time of its first and last message; 0 if not known
+    start_ns: int = 0  #: log time of its first and last message; 0 if unknown
     end_ns: int = 0
-    compression: str | None = None  #: of a chunk, ``""`` for none; None: a run of messages
-    crc: int | None = 0  #: 0: it has none; None: it is still to be read from the chunk's head
-    unpacked: int = 0  #: bytes of a chunk's records, as it announces
-    cut: bool = False  #: the file ends within it
+    compression: str | None = None  #: compression of a chunk, ``""`` for none; None: a run of messages
+    crc: int | None = 0  #: 0: none; None: not yet read from the chunk's head
+    unpacked: int = 0  #: announced bytes of a chunk's records
+    cut: bool = False  #: whether the file ends within it
 
 
 @dataclass(slots=True)
@@ -98,13 +97,13 @@ class Scan:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[tuple[int, int]] = field(default_factory=list)  #: where they lie: offset and length
-    cut: str = ""  #: why the file is incomplete, in words; empty for one with index and end
-    damaged: list[str] = field(default_factory=list)  #: what can't be read, in words
-    head: int = 0  #: bytes of metadata, schemas and channels that are kept
+    attachments: list[tuple[int, int]] = field(default_factory=list)  #: offset and length of each
+    cut: str = ""  #: why the file is incomplete, in words; empty for a file with index and end
+    damaged: list[str] = field(default_factory=list)  #: unreadable parts, in words
+    head: int = 0  #: bytes of metadata, schemas and channels kept
 
     def damage(self, what: str) -> None:
-        """Add a description of what can't be read, once."""
+        """Add a description of an unreadable part, once."""
         if what not in self.damaged:
             self.damaged.append(what)
 
@@ -114,7 +113,7 @@ def scan(path: str | Path) -> Scan:
 
     Raises:
         UsageError: The file does not exist or can't be read.
-        FileFormatError: It is no MCAP file.
+        FileFormatError: It is not an MCAP file.
     """
     file_path = Path(path)
     with open_file(file_path) as file:
@@ -125,7 +124,7 @@ def scan(path: str | Path) -> Scan:
 
 
 def find_channels(found: Scan) -> None:
-    """Read all of a file that was cut off to find its channels: only a complete one repeats them at the end."""
+    """Read all of a truncated file to find its channels: only a complete file repeats them at the end."""
     with open_file(found.path) as file:
         for piece in found.pieces:
             for record in records(file, piece, found.damage):
@@ -133,7 +132,7 @@ def find_channels(found: Scan) -> None:
 
 
 def attachments(found: Scan) -> Iterator[Attachment]:
-    """Yield the attachments; one that can't be read is left out, and noted as damage."""
+    """Yield the attachments; skip unreadable ones and note them as damage."""
     with open_file(found.path) as file:
         for offset, length in found.attachments:
             file.seek(offset)
@@ -147,7 +146,7 @@ def open_file(path: Path) -> IO[bytes]:
     """Open a file for reading.
 
     Raises:
-        UsageError: It can't be read, with the reason.
+        UsageError: The file can't be read; the message has the reason.
     """
     try:
         return path.open("rb")
@@ -156,7 +155,7 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def note(found: Scan, record: Record) -> None:
-    """Store a schema or channel, unless there are too many already."""
+    """Store a schema or channel, unless there are already too many."""
     if isinstance(record, Channel):
         if record.id in found.channels or has_room(found, len(record.topic) + len(str(record.metadata))):
             found.channels[record.id] = record
@@ -165,7 +164,7 @@ def note(found: Scan, record: Record) -> None:
 
 
 def has_room(found: Scan, size: int) -> bool:
-    """Whether so much more can be kept in memory; if not, that is noted as damage."""
+    """Return whether ``size`` more bytes can be kept in memory; note damage if not."""
     found.head += size
     if found.head > MAX_HEAD:
         found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels: the others are left out")
@@ -173,15 +172,15 @@ def has_room(found: Scan, size: int) -> bool:
 
 
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Yield schemas, channels and messages of a piece, in the file's order; ``damaged`` is told what can't be read."""
+    """Yield schemas, channels and messages of a piece, in the file's order; ``damaged`` gets what can't be read."""
     try:
         if piece.size > MAX_CHUNK:
-            raise ValueError(f"a part of {piece.size} bytes, and at most {MAX_CHUNK} are read at once")
+            raise ValueError(f"a part of {piece.size} bytes, but at most {MAX_CHUNK} are read at once")
         if piece.crc is None:
             piece = _with_crc(file, piece)
         file.seek(piece.offset)
         data = file.read(piece.size)
-        most = len(data)  # records: each takes a byte at least, however well it is packed
+        most = len(data)  # most records: each takes at least a byte unpacked
         if piece.compression is not None:
             data = _unpack(piece, data)
         yield from _parse(data, most)
@@ -191,12 +190,12 @@ def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | No
 
 
 def chunk_head_size(compression: str) -> int:
-    """Return how many bytes of a chunk's record come before its data."""
+    """Return the number of bytes before the data in a chunk's record."""
     return FRAME.size + CHUNK_HEAD.size + len(compression) + 8
 
 
 def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
-    """Read the checksum of a chunk that is known from the index.
+    """Read the checksum of a chunk known from the index.
 
     Raises:
         ValueError: There is no such chunk.
@@ -205,10 +204,10 @@ def _with_crc(file: IO[bytes], piece: Piece) -> Piece:
     file.seek(piece.offset - size)
     head = file.read(size)
     if FRAME.unpack_from(head) != (Opcode.CHUNK, size - FRAME.size + piece.size):
-        raise ValueError("there is no chunk where the file's index says so")
+        raise ValueError("the file's index points to a chunk that is not there")
     _, _, unpacked, crc, _ = CHUNK_HEAD.unpack_from(head, FRAME.size)
     if unpacked != piece.unpacked:
-        raise ValueError("a chunk's size is another than in the file's index")
+        raise ValueError("a chunk's size differs from the file's index")
     return replace(piece, crc=crc)
 
 
@@ -217,7 +216,7 @@ def _check_magic(found: Scan, head: bytes) -> None:
         return
     if not head:
         raise FileFormatError(f"{found.path} is empty: nothing was recorded")
-    raise FileFormatError(f"{found.path} is no MCAP file: it begins with {head!r} and not with {MAGIC!r}")
+    raise FileFormatError(f"{found.path} is not an MCAP file: it begins with {head!r}, not {MAGIC!r}")
 
 
 class _Scanner:
@@ -227,13 +226,13 @@ class _Scanner:
         self._found = found
         self._file = file
         self._offset = len(MAGIC)
-        self._run_start: int | None = None  # of messages outside of chunks
+        self._run_start: int | None = None  # start of messages outside chunks
 
     def run(self) -> None:
         found, file = self._found, self._file
         for number in itertools.count():
             if number >= MAX_RECORDS or len(found.pieces) >= MAX_PIECES:
-                found.cut = f"it is read up to byte {self._offset} only: it has too many records"
+                found.cut = f"it is read only up to byte {self._offset}: it has too many records"
                 break
             frame = file.read(FRAME.size)
             if len(frame) < FRAME.size:
@@ -241,7 +240,7 @@ class _Scanner:
                 break
             opcode, length = FRAME.unpack(frame)
             if length > _LONGEST or opcode == 0:
-                found.cut = f"what stands at byte {self._offset} is no record: the file is damaged from there on"
+                found.cut = f"there is no record at byte {self._offset}: the file is damaged from there on"
                 break
             end = self._offset + FRAME.size + length
             if opcode != Opcode.MESSAGE or self._run_size() + length > _RUN:
@@ -274,7 +273,7 @@ class _Scanner:
 
     def _keep(self, read: Callable[[ReadDataStream], Any], length: int) -> None:
         if length > MAX_RECORD:
-            raise ValueError(f"a record of {length} bytes, and at most {MAX_RECORD} are read")
+            raise ValueError(f"a record of {length} bytes, but at most {MAX_RECORD} are read")
         record = read(ReadDataStream(BytesIO(self._file.read(length))))
         if not isinstance(record, Metadata):
             note(self._found, record)
@@ -312,15 +311,15 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """Return a chunk's records, or what is left of a chunk that was cut off, if its compression allows that.
+    """Return a chunk's records, or the existing part of a truncated chunk if its compression allows that.
 
-    No more is unpacked than the chunk announces, and nothing if it announces too much.
+    Unpack no more than the chunk announces, and nothing if it announces too much.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
         raise ValueError(
-            f"{len(data)} bytes that announce {size} unpacked, and at most {MAX_RATIO} times as many, {MAX_CHUNK} in "
-            "all, are unpacked"
+            f"{len(data)} bytes that announce {size} unpacked, but the limits are {MAX_RATIO} times as many and "
+            f"{MAX_CHUNK} in all"
         )
     size = min(size, MAX_CHUNK, MAX_RATIO * len(data))
     if piece.compression == "":
@@ -349,7 +348,7 @@ def _unpack(piece: Piece, data: bytes) -> bytes:
 
 
 def _parse(data: bytes, most: int) -> Iterator[Record]:
-    """Yield records until the data end; one that is cut off there is left out.
+    """Yield records up to the end of the data; skip one that is cut off there.
 
     Raises:
         ValueError: There are more than ``most`` records.
@@ -359,14 +358,14 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
         if at + FRAME.size > size:
             return
         if number >= most:
-            raise ValueError(f"more than {most} records packed into as many bytes: the others are left out")
+            raise ValueError(f"more than {most} records in as many bytes: the others are left out")
         opcode, length = FRAME.unpack_from(data, at)
         begin = at + FRAME.size
         at = begin + length
         if at > size:
             return
         if opcode != Opcode.MESSAGE and length > MAX_RECORD:
-            raise ValueError(f"a record of {length} bytes, and at most {MAX_RECORD} are read")
+            raise ValueError(f"a record of {length} bytes, but at most {MAX_RECORD} are read")
         if opcode == Opcode.MESSAGE:
             channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, begin)
             yield Message(channel_id, log_ns, data[begin + _MESSAGE.size : at], publish_ns, sequence)
@@ -378,22 +377,22 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
 
 # By the index ---------------------------------------------------------------------------------------------------
 #
-# Without touching what lies before it. The index is believed only if it accounts for every byte of the file: then it
-# says the same as scan(). The footer says where the summary is, with its checksum, and that has each chunk's place,
-# size and times.
+# Without reading the records before it. The index is trusted only if it accounts for every byte of the file: then it
+# agrees with scan(). The footer gives the place and checksum of the summary, which gives each chunk's place, size and
+# times.
 
 
-_FOOTER: Final = struct.Struct("<QQI")  #: begin of the summary and of its offsets, checksum
+_FOOTER: Final = struct.Struct("<QQI")  #: start of the summary and of its offsets, checksum
 _TAIL: Final = FRAME.size + _FOOTER.size + len(MAGIC)
 _DATA_END: Final = FRAME.size + 4
-_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes of the map that follows
-_INDEX_SIZES: Final = struct.Struct("<QQ")  #: of a chunk's data, packed and unpacked
+_INDEX_HEAD: Final = struct.Struct("<QQQQI")  #: first and last time, offset and length, bytes of the following map
+_INDEX_SIZES: Final = struct.Struct("<QQ")  #: sizes of a chunk's data, packed and unpacked
 _U64: Final = struct.Struct("<Q")
 _U32: Final = struct.Struct("<I")
 
 
 def indexed(path: str | Path) -> Scan | None:
-    """Return the structure of a file by its index; None if it has none that can be relied on.
+    """Return the structure of a file by its index; None if it has no reliable one.
 
     Raises:
         UsageError: The file does not exist or can't be read.
@@ -415,7 +414,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     if not begin or summary is None:
         return False
     data, end = summary
-    spans: list[tuple[int, int]] = []  # what lies between the header and the end of the data: offset and end
+    spans: list[tuple[int, int]] = []  # parts between the header and the end of the data: offset and end
     metadata: list[MetadataIndex] = []
     for opcode, body in _records(data):
         if opcode == Opcode.CHUNK_INDEX:
@@ -440,11 +439,11 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return not found.damaged  # what is left out of a file that holds too much depends on the order: a scan decides
+    return not found.damaged  # with too much content, the order decides which parts are skipped: use a scan
 
 
 def _header_end(file: IO[bytes]) -> int:
-    """Return where the file's first record ends; 0 if that is no header."""
+    """Return the end of the file's first record; 0 if it is not a header."""
     head = file.read(len(MAGIC) + FRAME.size)
     if len(head) < len(MAGIC) + FRAME.size or not head.startswith(MAGIC):
         return 0
@@ -453,7 +452,7 @@ def _header_end(file: IO[bytes]) -> int:
 
 
 def _summary(found: Scan, file: IO[bytes]) -> tuple[bytes, int] | None:
-    """Return the summary section and where the data before it end; None if it is not there, or damaged."""
+    """Return the summary section and the end of the data before it; None if missing or damaged."""
     at = found.size - _TAIL
     if at < 0:
         return None
@@ -480,12 +479,12 @@ def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
         opcode, length = FRAME.unpack_from(data, at)
         at += FRAME.size + length
         if at > len(data):
-            raise ValueError("a record that is longer than the summary")
+            raise ValueError("a record is longer than the summary")
         yield opcode, data[at - length : at]
 
 
 def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
-    """Return a chunk, and where it lies with the indexes of its messages."""
+    """Return a chunk, and its place including the indexes of its messages."""
     start_ns, end_ns, offset, length, map_size = _INDEX_HEAD.unpack_from(body)
     at = _INDEX_HEAD.size + map_size
     (indexes,) = _U64.unpack_from(body, at)
@@ -502,7 +501,7 @@ def _chunk(body: bytes) -> tuple[Piece, tuple[int, int]]:
 
 
 def _is_gapless(spans: list[tuple[int, int]], begin: int, end: int) -> bool:
-    """Whether spans follow each other without gaps from one offset to another."""
+    """Return whether spans cover the range between two offsets without gaps."""
     for start, stop in spans:
         if start != begin or stop < start:
             return False
@@ -514,7 +513,7 @@ def _keep_metadata(found: Scan, file: IO[bytes], index: MetadataIndex) -> None:
     length = index.length - FRAME.size
     file.seek(index.offset)
     if not 0 <= length <= MAX_RECORD or FRAME.unpack(file.read(FRAME.size)) != (Opcode.METADATA, length):
-        raise ValueError("no metadata where the index says so")
+        raise ValueError("the file's index points to metadata that is not there")
     if has_room(found, length):
         found.metadata.append(Metadata.read(_stream(file.read(length))))
 

@@ -37,10 +37,10 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # a third is being encoded, a fourth arrives: one client can hold no more frame slots
+_FRAMES_WAITING: Final = 2  # plus one being encoded and one arriving: a client can't hold more frame slots
 _SIZE: Final = 400  #: bytes of an ordinary sample, approximately
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # after so long without a frame of the stream, decoded frames are recorded
-_PARAMETERS_S: Final = 2.0  # pause before parameters that could not be read are read again
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # without a stream frame for this long, record decoded frames
+_PARAMETERS_S: Final = 2.0  # pause before retrying to read parameters
 
 _log = logging.getLogger(__name__)
 
@@ -48,14 +48,14 @@ Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
 
 
 def check_names(drones: Sequence[Drone], of: str) -> None:
-    """Check that the drones of a recording, or of a view, can be told apart.
+    """Check that the drones of a recording or view have different names.
 
     Raises:
         UsageError: Two drones have the same name.
     """
     names = [drone.name for drone in drones]
     if len(set(names)) < len(names):
-        raise UsageError(f"the drones of one {of} need different names, not {', '.join(names)}")
+        raise UsageError(f"the drones of one {of} need different names, got {', '.join(names)}")
 
 
 class Gaps:
@@ -66,7 +66,7 @@ class Gaps:
         self._last: int | None = None
 
     def restart(self) -> None:
-        """Start a new sequence: what is missing up to the next number was not wanted."""
+        """Start a new sequence: numbers missing up to the next one were not wanted."""
         self._last = None
 
     def follow(self, number: int) -> None:
@@ -83,7 +83,7 @@ class Tap:
     def __init__(
         self, number: int, drone: Drone, options: Options, backlog: Backlog, *, encoded_far: bool = False
     ) -> None:
-        """Initialise without subscribing; ``encoded_far``: over a network the proxy encodes as H.264 what comes raw."""
+        """Initialise without subscribing; ``encoded_far``: over a network the proxy encodes raw frames as H.264."""
         self.drone = drone
         self._number = number
         self._options = options
@@ -118,7 +118,7 @@ class Tap:
             video.start()
 
     def stop(self) -> None:
-        """Unsubscribe; what was received before is in the backlog on return."""
+        """Unsubscribe; on return, everything received is in the backlog."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
@@ -127,7 +127,7 @@ class Tap:
             video.stop()
 
     def dropped(self) -> dict[str, int]:
-        """Return, by channel, how many samples were received and left out."""
+        """Return the number of samples received but dropped, by channel."""
         found = {
             channel: count for (number, channel), count in list(self._backlog.dropped.items()) if number == self._number
         }
@@ -137,15 +137,15 @@ class Tap:
         return found
 
     def missed(self) -> dict[str, int]:
-        """Return, by channel, how many samples were never received."""
+        """Return the number of samples never received, by channel."""
         found = {channel: gap.missed for channel, gap in self._gaps.items()}
         found |= {video.channel: video.missed for video in self._videos}
         return {channel: missed for channel, missed in found.items() if missed}
 
-    def look(self) -> None:
+    def check_streams(self) -> None:
         """Check each second whether the vehicle's own encoding still arrives."""
         for video in self._videos:
-            video.look(time.monotonic_ns())
+            video.check_stream(time.monotonic_ns())
 
     def put_drops(self, dropped: dict[str, int], missed: dict[str, int]) -> None:
         """Put the counts of dropped and missed samples into the backlog."""
@@ -153,7 +153,7 @@ class Tap:
         self._put("drops", Rank.KEPT, Drops(now_ns, dropped, missed), _SIZE, now_ns)
 
     def put_event(self, text: str, severity: Severity, data: dict[str, str]) -> None:
-        """Put an event of the recorder itself into the backlog."""
+        """Put an event of the recorder into the backlog."""
         event = Event(EventKind.RECORDING, text, self.drone.now_ns, severity, app="recorder", data=dict(data))
         self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
@@ -172,9 +172,9 @@ class Tap:
         self._put("feedback", Rank.STATE, feedback, _SIZE + (40 * len(native) if native else 0))
 
     def _event(self, event: Event) -> None:
-        if event.seq:  # events of the client itself have none
+        if event.seq:  # the client's own events have no number
             self._gaps["events"].follow(event.seq)
-        if event.kind is not EventKind.RECORDING:  # the recorder's own are added by put_event
+        if event.kind is not EventKind.RECORDING:  # put_event adds the recorder's own
             self._put("events", Rank.KEPT, event, _SIZE)
 
     def _applied(self, applied: Applied) -> None:
@@ -191,11 +191,11 @@ class Tap:
 
 
 class Stream:
-    """One camera's frames as they were encoded by the vehicle, or for a subscriber, from the first key frame on."""
+    """One camera's frames as encoded by the vehicle, or for a subscriber, from the first key frame on."""
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, subscriber: str = "") -> None:
         self.gaps = Gaps()
-        self.dropped = 0  #: frames that can't be decoded because one before them is missing
+        self.dropped = 0  #: frames that can't be decoded because an earlier one is missing
         self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
@@ -230,9 +230,9 @@ class Stream:
 
 
 class Video:
-    """One camera's frames: encoded on their own thread, unless they arrive as JPEG.
+    """One camera's frames: encoded on a separate thread unless they arrive as JPEG.
 
-    Where the vehicle's own encoding is to be kept, frames are subscribed to only while that does not arrive.
+    If the vehicle's encoding is kept, frames are subscribed to only while its stream does not arrive.
     """
 
     def __init__(
@@ -258,7 +258,7 @@ class Video:
 
     @property
     def dropped(self) -> int:
-        """Frames that the encoder had no time for or failed on, or that can't be decoded."""
+        """Frames that the encoder skipped or failed on, or that can't be decoded."""
         return self._buffer.dropped + self._failed + (self._stream.dropped if self._stream is not None else 0)
 
     @property
@@ -267,7 +267,7 @@ class Video:
         return self.gaps.missed + (self._stream.gaps.missed if self._stream is not None else 0)
 
     def start(self) -> None:
-        """Start the encoder's thread, and subscribe."""
+        """Start the encoder's thread and subscribe."""
         self._thread.start()
         if self._stream is not None:
             self._stream.start()
@@ -275,18 +275,18 @@ class Video:
             self._listen(True)
 
     def stop(self) -> None:
-        """Unsubscribe, and end the encoder's thread."""
+        """Unsubscribe and end the encoder's thread."""
         if self._stream is not None:
             self._stream.stop()
         self._listen(False)
         with self._lock:
             self._ended = True
         self._buffer.close()
-        if self._thread.ident is not None:  # a start may have failed before it
+        if self._thread.ident is not None:  # start() may have failed before starting it
             self._thread.join()
 
-    def look(self, now_ns: int) -> None:
-        """Subscribe to frames while the vehicle's encoding does not arrive: it may send another one than announced."""
+    def check_stream(self, now_ns: int) -> None:
+        """Subscribe to frames while the vehicle's stream does not arrive (it may differ from the announced one)."""
         if self._stream is not None:
             self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
 
@@ -303,7 +303,7 @@ class Video:
 
     def _arrived(self, arrival: Arrival) -> None:
         if self._stream is not None and arrival.received_ns - self._stream.newest_ns < _STREAM_GONE_NS:
-            return  # the stream is back, and is recorded instead
+            return  # the stream is back and is recorded instead
         header = arrival.header
         self.gaps.follow(header.seq)
         if header.encoding is Encoding.JPEG:
@@ -318,7 +318,7 @@ class Video:
             arrival = self._buffer.wait()
             if arrival is not None:
                 self._encode_one(arrival)
-            del arrival  # else its frame slot would stay leased while this waits for the next one
+            del arrival  # otherwise its frame slot stays leased while waiting for the next one
 
     def _encode_one(self, arrival: Arrival) -> None:
         try:
@@ -369,7 +369,7 @@ def encoder(options: Options) -> Encode:
 
 
 class Parameters:
-    """Reads all parameters at the start, then each that has changed, on its own thread."""
+    """Records all parameters at the start, then each change, on a separate thread."""
 
     def __init__(self, drone: Drone, put: Callable[[Parameter], None]) -> None:
         self._drone = drone
@@ -388,11 +388,11 @@ class Parameters:
         """End the thread."""
         self._ended = True
         self._wake.set()
-        if self._thread.ident is not None:  # a start may have failed before it
+        if self._thread.ident is not None:  # start() may have failed before starting it
             self._thread.join()
 
     def event(self, event: Event) -> None:
-        """Read again when a parameter was written, or a link came back."""
+        """Read again after a parameter was written or a link came back."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._wake.set()
@@ -404,9 +404,9 @@ class Parameters:
             if self._ended:
                 return
             self._wake.clear()
-            again = None if self._look() else _PARAMETERS_S
+            again = None if self._read_all() else _PARAMETERS_S
 
-    def _look(self) -> bool:
+    def _read_all(self) -> bool:
         """Read the parameters; return whether they could be read."""
         try:
             parameters = self._drone.config.parameters()

@@ -1,4 +1,4 @@
-"""Received samples to messages of a file: Skyloop's own, and beside it what viewers understand. Pure."""
+"""Translate received samples to messages of a file: Skyloop's own, and others for viewers. Pure."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
 from skyloop.recording.output import Message
 
-_SEQUENCES: Final = 1 << 32
-_PLACES: Final = 400  #: greatest number of places of a path; beyond it, every second one is removed
-_PATH_EVERY_NS: Final = 1_000_000_000
+_SEQUENCES: Final = 1 << 32  # MCAP's sequence numbers have 32 bits
+_PLACES: Final = 400  #: greatest number of places of a path; beyond it, remove every second one
+_PATH_EVERY_NS: Final = 1_000_000_000  # between messages of a path
 
 
 class Picture:
-    """A frame as it is written to the file."""
+    """A frame as written to the file."""
 
     __slots__ = ("data", "record")
 
@@ -44,7 +44,7 @@ class Picture:
 
 
 class Path:
-    """The places where a drone has been, oldest first, thinned out so that their number stays limited."""
+    """The places where a drone has been, oldest first, thinned out to a limited number."""
 
     def __init__(self) -> None:
         self.places: list[Any] = []
@@ -52,7 +52,7 @@ class Path:
         self._count = 0
 
     def add(self, place: Any) -> None:
-        """Append a place, or leave it out to keep the distance between places."""
+        """Append a place, or skip it to keep the distance between places."""
         if self._count % self._step == 0:
             self.places.append(place)
             if len(self.places) > _PLACES:
@@ -97,7 +97,7 @@ class Translator:
         return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
 
     def prelude(self, now_ns: int) -> Iterator[Message]:
-        """Create the messages that make each file complete in itself: parameters, mountings and calibrations."""
+        """Create the messages that make each file self-contained: parameters, mountings and calibrations."""
         at_ns = self._clock.unix(now_ns)
         for parameter in list(self._parameters.values()):
             yield from self._parameter(parameter, at_ns)
@@ -108,14 +108,14 @@ class Translator:
         for name, (width, height, intrinsics) in list(self._intrinsics.items()):
             yield from self._calibration(name, width, height, intrinsics, at_ns)
 
-    # Each kind -------------------------------------------------------------------------------------------------
+    # Kinds of samples -----------------------------------------------------------------------------------------------
 
     def _own(self, channel: Channel, sample: Any, log_ns: int, publish_ns: int, sequence: int = 0) -> Message:
         data = layout.encode(sample)
         return Message(self._topics[channel], type(sample), data, log_ns, publish_ns, sequence % _SEQUENCES)
 
     def _unix(self, proxy_ns: int) -> int:
-        """Return the Unix time of a time on the proxy's clock."""
+        """Convert a time on the proxy's clock to Unix time."""
         return self._clock.unix(proxy_ns, self._offset_ns())
 
     def _feedback(self, feedback: Feedback, log_ns: int) -> Iterator[Message]:
@@ -153,14 +153,14 @@ class Translator:
         at_ns = self._unix(annotation.captured_ns)
         yield self._own(Channel.ANNOTATIONS, annotation, log_ns, at_ns)
         if annotation.camera not in self._camera_names:
-            return  # an unknown camera: names that applications choose must not create topics
+            return  # an unknown camera: names chosen by applications must not create topics
         topic = layout.drawing_topic(self._drone, annotation.camera)
         yield Message(topic, foxglove.ImageAnnotations, foxglove.drawing(annotation, at_ns), log_ns, at_ns)
 
     def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(entry.at_ns)
-        # Applications choose an entry's own time, which stands in it. As times of publication these would run
-        # backwards, and viewers sort the whole topic anew for it.
+        # Applications choose an entry's own time, which is in the entry. As publish times these would run backwards,
+        # and viewers would re-sort the whole topic.
         yield self._own(Channel.LOGS, entry, log_ns, log_ns)
         if entry.name == MOCAP and entry.values is not None and len(entry.values) >= 7:
             pose = foxglove.pose_in_world(at_ns, foxglove.pose_of(entry.values))
@@ -224,7 +224,7 @@ class Translator:
 
 
 def _listed(value: Any) -> Any:
-    """Convert to what JSON can hold: arrays to lists, keys to strings."""
+    """Convert to JSON types: arrays to lists, keys to strings."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""A live view of drones: subscribes to what a screen wants, and hands it the samples on a thread of its own."""
+"""A live view of drones: subscribes to a screen's sources and passes it their samples on a separate thread."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ from skyloop.recording.options import MB, Options
 from skyloop.recording.taps import Tap, check_names
 
 BEAT_S: Final = 0.02  #: period of polling the backlog, so that receiving threads need not wake the view
-_BATCH: Final = MB  # bytes that are shown before what is wanted is asked again
-_LIMIT: Final = 16 * MB  # what may wait for a slow screen; older pictures are of no use to somebody who watches
-_RESERVE: Final = 16 * MB
-_QUALITY: Final = 80  # of JPEG: these pictures are looked at, and not kept
-_LOOK_NS: Final = nanoseconds(1.0)
+_BATCH: Final = MB  # bytes to show before asking the screen for its sources again
+_LIMIT: Final = 16 * MB  # bytes that can wait for a slow screen; older images are useless to a viewer
+_RESERVE: Final = 16 * MB  # bytes beyond that for samples that must not be dropped
+_QUALITY: Final = 80  # JPEG quality: these images are viewed, not kept
+_LOOK_NS: Final = nanoseconds(1.0)  # how often to check the streams
 NICENESS: Final = 5
 
-#: A drone's index, and a channel of it as :data:`skyloop.recording.options.CHOICES` names them, or ``video.CAMERA``.
+#: A drone's index, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
 Source = tuple[int, str]
 _log = logging.getLogger(__name__)
 
 
 class Screen(Protocol):
-    """Shows samples to people. All methods are called on the view's thread, except :meth:`close`."""
+    """Shows samples to people. All methods except :meth:`close` are called on the view's thread."""
 
     def wanted(self) -> frozenset[Source]:
-        """Return what somebody looks at now: nothing else is subscribed to."""
+        """Return the sources on display now; nothing else is subscribed to."""
 
     def show(self, item: Item) -> None:
         """Show a sample."""
 
     def close(self) -> None:
-        """End. The view's thread has ended before."""
+        """Close the screen. The view's thread has already ended."""
 
 
 class View:
@@ -51,7 +51,7 @@ class View:
     """
 
     def __init__(self, drones: Sequence[Drone], screen: Screen) -> None:
-        """Initialise without subscribing; the screen is closed with the view.
+        """Initialise without subscribing; the view closes the screen.
 
         Raises:
             UsageError: Two drones have the same name.
@@ -72,7 +72,7 @@ class View:
         self._thread.start()
 
     def close(self) -> None:
-        """Unsubscribe, and close the screen. Idempotent."""
+        """Unsubscribe and close the screen. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join()
@@ -89,7 +89,7 @@ class View:
 
     @property
     def subscribed(self) -> dict[str, list[str]]:
-        """What is subscribed to, by drone. May be read from any thread."""
+        """Current subscriptions by drone. Can be read from any thread."""
         found: dict[str, list[str]] = {}
         for number, channel in sorted(self._taps):
             found.setdefault(self._drones[number].name, []).append(channel)
@@ -97,7 +97,7 @@ class View:
 
     @property
     def dropped(self) -> int:
-        """Samples that the screen or the encoder was too slow for. May be read from any thread."""
+        """Samples dropped because the screen or the encoder was too slow. Can be read from any thread."""
         return sum(tuple(self._backlog.dropped.values()))
 
     # The thread ------------------------------------------------------------------------------------------------
@@ -110,11 +110,11 @@ class View:
     def _try_step(self, *, ending: bool) -> None:
         try:
             self.step(time.monotonic_ns(), ending=ending)
-        except Exception:  # noqa: BLE001  (a view that ended would show a standing picture of a flying drone)
-            _log.exception("the view goes on")
+        except Exception:  # noqa: BLE001  (a view that ended would show a frozen image of a flying drone)
+            _log.exception("the view continues after an error")
 
     def step(self, now_ns: int, *, ending: bool = False) -> None:
-        """Subscribe to what is wanted, and show what came. Called by the thread, or by a test."""
+        """Subscribe to the wanted sources and show received samples. Called by the thread, or by a test."""
         self._subscribe(frozenset() if ending else self._screen.wanted())
         for item in self._backlog.take(_BATCH):
             try:
@@ -126,7 +126,7 @@ class View:
         if now_ns >= self._look_due_ns:
             self._look_due_ns = now_ns + _LOOK_NS
             for tap in self._taps.values():
-                tap.look()
+                tap.check_streams()
 
     def _subscribe(self, wanted: frozenset[Source]) -> None:
         for source in self._taps.keys() - wanted:
@@ -140,6 +140,6 @@ class View:
 
 
 def give_way() -> None:
-    """Lower this process's priority, and that of the threads that it starts from now on: who flies goes first."""
+    """Lower the priority of this process and of threads that it starts later: the flight has priority."""
     if hasattr(os, "nice"):
         os.nice(NICENESS)

@@ -24,11 +24,11 @@ from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open
 from skyloop.recording.translation import Picture, Translator
 
 BEAT_S: Final = 0.05  #: period of polling the backlog, so that receiving threads need not wake the writer
-_COMMIT_NS: Final = nanoseconds(0.5)  #: samples older than this are in the file, unless the disk is too slow
-_REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
-#: How long a full file is continued, to end before a key frame: cameras that are no drone's send one each 10 s or so.
+_COMMIT_NS: Final = nanoseconds(0.5)  #: samples reach the file within this time, unless the disk is too slow
+_REOPEN: Final = 4 * MB  #: bytes that must be free before opening a new file on a disk that was full
+#: How long to continue a full file until a key frame: cameras outside drones send one every 10 s or so.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
-_SILENCE_NS: Final = nanoseconds(2.0)  #: without H.264 for so long, a full file waits for no key frame
+_SILENCE_NS: Final = nanoseconds(2.0)  #: without H.264 for this long, a full file does not wait for a key frame
 _LOOK_NS: Final = nanoseconds(1.0)  #: period of checking the disk, and of retrying a file that can't be written
 
 Tell = Callable[[str, Severity], None]
@@ -45,17 +45,17 @@ def free_space(folder: Path) -> int:
 
 
 class FileWriter:
-    """Writes a backlog to one file or to several in turn. Its public attributes may be read from any thread.
+    """Writes a backlog to one file or several in turn. Its public attributes can be read from any thread.
 
     Attributes:
-        state: Whether it records.
-        reason: Why it is paused or has failed.
+        state: State of the recorder.
+        reason: Why the recorder is paused or has failed.
         files: All files, oldest first.
-        room: What is written, by the space left on the disk.
+        room: Samples to write, by the space left on the disk.
         unwritable: Samples that could not be translated.
         unwritable_why: Channel and error of the last one.
-        dropped: Returns totals of dropped samples by drone and channel, for the end of each file.
-        missed: Returns totals of missed samples, the same way.
+        dropped: Returns the totals of dropped samples by drone and channel, for the end of each file.
+        missed: Returns the totals of missed samples likewise.
         each_second: Called each second on the writing thread.
     """
 
@@ -72,7 +72,7 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise the writer without opening a file; ``tell`` is called on its thread, first on :meth:`start`'s."""
+        """Initialise without opening a file; ``tell`` runs on the writing thread, at first on :meth:`start`'s."""
         self.state = RecorderState.STARTING
         self.reason = ""
         self.files: list[Path] = []
@@ -97,9 +97,9 @@ class FileWriter:
         self._closed_bytes = self._closed_messages = 0
         self._now_ns = clock.monotonic_ns
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
-        self._due_ns = 0  # since when a new file is due
-        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 of this file, by drone and channel
-        self._encoded_ns = 0  # when the last frame of H.264 was written
+        self._due_ns = 0  # time since which a new file is due
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 in this file, by drone and channel
+        self._encoded_ns = 0  # time of the last H.264 frame written
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
 
@@ -115,7 +115,7 @@ class FileWriter:
             self.room = judge_room(free, self._floor, Room.ALL)
             if self.room is Room.NOTHING:
                 raise UsageError(
-                    f"{folder} has {free / MB:.0f} MB left, and recording leaves {self._floor / MB:.0f} MB free: "
+                    f"{folder} has {free / MB:.0f} MB left, but recording keeps {self._floor / MB:.0f} MB free: "
                     "choose another folder, or a lower floor"
                 )
             self._open()
@@ -124,14 +124,14 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what was received, and close the file; a disk that hangs longer is left to the thread. Idempotent."""
+        """Write all received samples and close the file; leave a disk that hangs longer to the thread. Idempotent."""
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
 
     @property
     def path(self) -> Path:
-        """The file that is written, or that was written last."""
+        """The current or last file."""
         return self.files[-1] if self.files else self._path
 
     @property
@@ -151,18 +151,18 @@ class FileWriter:
     def _run(self) -> None:
         try:
             self._work()
-        except Exception as error:  # noqa: BLE001  (whatever it was, the state must not say that this still records)
+        except Exception as error:  # noqa: BLE001  (the state must never say that this still records)
             self._fail(error)
 
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # a last retry if it is paused, and the last counts
+        self._look_due_ns = 0  # retry once more if paused, and report the last counts
         self.step(time.monotonic_ns())
         self._end()
 
     def _fail(self, error: Exception) -> None:
-        """End after an unexpected error: report it, in the state first, and keep what was committed."""
+        """End after an unexpected error: set the state, report the error, keep the committed data."""
         self.state, self.reason = RecorderState.FAILED, f"an error in the recorder: {error!r:.300}"
         _log.exception("the recording to %s ends", self.path)
         file, self._file = self._file, None
@@ -171,16 +171,16 @@ class FileWriter:
                 file.abandon()
                 self._count(file)
         with contextlib.suppress(Exception):
-            text = f"the recording to {self.path} has ended ({self.reason}): what was written stays, nothing is added"
+            text = f"the recording to {self.path} has ended ({self.reason}): data on disk is safe, nothing is added"
             self._report(text, Severity.ERROR)
 
     def step(self, now_ns: int) -> None:
-        """Do what is due at a time [ns, monotonic]. Called by the thread, or by a test."""
+        """Do the work due at a time [ns, monotonic]. Called by the thread, or by a test."""
         self._now_ns = now_ns
         try:
             if now_ns >= self._look_due_ns:
                 self._look_due_ns = now_ns + _LOOK_NS
-                self._look()
+                self._check_disk()
                 self.each_second()
             if self._file is not None:
                 self._write()
@@ -189,7 +189,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate and write all that waits, committing in between."""
+        """Translate and write everything that waits, committing along the way."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
@@ -209,7 +209,7 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # first, so that nothing is lost when the disk fails meanwhile
+        self._uncommitted += batch  # before writing, so that nothing is lost if the disk fails meanwhile
         for item in batch:
             for message in self._messages(item):
                 file.write(message)
@@ -217,7 +217,7 @@ class FileWriter:
             self._commit()
 
     def _messages(self, item: Item) -> list[Message]:
-        """Translate a sample: all of it, or nothing if it can't be translated."""
+        """Translate a sample completely, or return nothing if it can't be translated."""
         try:
             return list(self._translators[item.drone].messages(item))
         except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
@@ -234,7 +234,7 @@ class FileWriter:
         return False
 
     def _follows(self, item: Item) -> bool:
-        """Whether a frame can be decoded from what is in this file."""
+        """Return whether a frame can be decoded from this file alone."""
         if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
             return True
         record = item.sample.record
@@ -259,7 +259,7 @@ class FileWriter:
         )
 
     def _rotate_when_due(self) -> None:
-        """Start a new file when it is due; with H.264, :meth:`_write` does so at a key frame, unless none arrives."""
+        """Start a new file when due; with H.264, :meth:`_write` does so at a key frame, unless none arrives."""
         if not self._rotation_due():
             return
         self._due_ns = self._due_ns or self._now_ns
@@ -275,7 +275,7 @@ class FileWriter:
 
     def _open(self) -> None:
         number = len(self.files) + 1
-        # A file after a pause has a name that nobody chose: it must not overwrite anything.
+        # The user did not choose the name of a file after a pause: it must not overwrite anything.
         overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
         first = number == 1 and not self._options.rotates
         path = self._path if first else self._next_free(number, overwrite)
@@ -318,7 +318,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """Pause because the disk fails. What was not committed waits for the next file."""
+        """Pause because the disk fails. Uncommitted samples wait for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
@@ -327,9 +327,9 @@ class FileWriter:
             self._uncommitted.clear()
         if (self.state, self.reason) != (RecorderState.PAUSED, why):
             self.state, self.reason = RecorderState.PAUSED, why
-            self._report(f"recording stands still ({why}): what was written stays, frames are lost", Severity.ERROR)
+            self._report(f"recording paused ({why}): data on disk is safe, new frames are dropped", Severity.ERROR)
 
-    def _look(self) -> None:
+    def _check_disk(self) -> None:
         """Check the disk and the file."""
         file = self._file
         if file is not None and file.lost:
@@ -351,7 +351,7 @@ class FileWriter:
                 self._close("rotated")
             self._pause(left)
         elif room is Room.NO_FRAMES:
-            self._report(f"{left}: frames are recorded no longer", Severity.WARNING)
+            self._report(f"{left}: frames are no longer recorded", Severity.WARNING)
         else:
             self._report(f"{left}: everything is recorded again", Severity.INFO)
 
@@ -365,7 +365,7 @@ class FileWriter:
 
 
 def _is_key(item: Item) -> bool:
-    """Whether a stream of frames that build on one another can start here."""
+    """Return whether decoding a stream can start at this frame."""
     sample = item.sample
     return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
 

@@ -1,4 +1,4 @@
-"""Drones as nodes of ROS 2: topics, services and parameters (extra ``[ros]``). ``docs/ros.md`` says which.
+"""Drones as nodes of ROS 2: topics, services and parameters (extra ``[ros]``), listed in ``docs/ros.md``.
 
 ::
 

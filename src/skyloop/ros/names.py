@@ -1,10 +1,10 @@
-"""What ROS 2 wants: the names of a drone's namespace and frames (REP 105), its time, and its type of transforms.
+"""Requirements of ROS 2: names of a drone's namespace and frames (REP 105), its time, and its type of transforms.
 
-rclpy has no ``tf2_msgs/msg/TFMessage`` where no package of it is installed, so its publisher is given bytes. rclpy asks
-a message's class for a *type support*, a C structure with its name, the hash of its definition and functions that turn
-it into bytes (``rosidl_message_type_support_t`` and, of Fast DDS, ``message_type_support_callbacks_t``). A publisher
-that is given bytes uses none of the functions but the one for the largest size, which unbounded members make unknown.
-So those of another message with such members serve, under the name and the hash of this one.
+rclpy lacks ``tf2_msgs/msg/TFMessage`` if its package is not installed, so the publisher sends ready-made bytes. rclpy
+gets a *type support* from a message's class: a C structure with its name, the hash of its definition and functions that
+serialise it (``rosidl_message_type_support_t`` and, for Fast DDS, ``message_type_support_callbacks_t``). A publisher of
+bytes calls only one of these functions, the one for the largest size, and unbounded members make that size unknown. The
+functions of another message with such members therefore work, under the name and hash of this one.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.vehicles.ros2.node import ros_name
 from skyloop.vehicles.ros2.wire import TYPE_HASH, TYPE_NAME, ClockMap
 
-KNOWN_MAJOR: Final = "9"  #: of the package ros-rclpy whose structures these are
+KNOWN_MAJOR: Final = "9"  #: version of the package ros-rclpy with these structures
 _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Names of a drone's frames; each begins with the drone's, as several drones share one tree.
+    """Names of a drone's frames; each begins with the drone's name, as several drones share one tree.
 
     Attributes:
-        drone: The drone's name, as ROS 2 allows it.
-        map: The frame in which all drones' ``odom`` begin at the same place; empty: there is none.
+        drone: The drone's name, as a valid ROS 2 name.
+        map: The frame in which all drones' ``odom`` start at the same position; empty: none.
     """
 
     drone: str
@@ -41,7 +41,7 @@ class Frames:
 
     @property
     def odom(self) -> str:
-        """The drone's world axes, x east, y north, z up: continuous, and they may drift."""
+        """The drone's world axes, x east, y north, z up: continuous, with possible drift."""
         return f"{self.drone}/odom"
 
     @property
@@ -50,7 +50,7 @@ class Frames:
         return f"{self.drone}/base_link"
 
     def optical(self, camera: str) -> str:
-        """A camera's optical axes, x right, y down, z forward (REP 103: the suffix)."""
+        """Return a camera's optical axes, x right, y down, z forward (the suffix is REP 103's)."""
         return f"{self.drone}/{ros_name(camera)}_optical_frame"
 
 
@@ -58,7 +58,7 @@ def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
     """Return each drone's namespace, without a slash.
 
     Raises:
-        UsageError: Two drones would have one.
+        UsageError: Two drones would have the same one.
     """
     found: dict[str, str] = {}
     for name in drones:
@@ -71,7 +71,7 @@ def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
 
 
 class RosTime:
-    """Stamps of a drone's samples on the clock of a node: the system's, or with ``use_sim_time`` that of ``/clock``."""
+    """Stamps for a drone's samples on a node's clock: the system's, or with ``use_sim_time`` that of ``/clock``."""
 
     def __init__(self, node: Any, drone: Drone) -> None:
         self._clock = node.get_clock()
@@ -80,12 +80,12 @@ class RosTime:
         self._lock = threading.Lock()
 
     def stamp_ns(self, captured_ns: int) -> int | None:
-        """Return ROS time of a capture on the proxy's clock [ns]; None while there is none. Any thread."""
+        """Return the ROS time of a capture on the proxy's clock [ns]; None if there is none. Any thread."""
         with self._lock:
             return self._map.to_ros(captured_ns, self._drone.now_ns, self._clock.now().nanoseconds)
 
     def age_s(self, stamp_ns: int) -> float:
-        """Return how long ago a stamp was [s], by the node's clock."""
+        """Return the age of a stamp [s], by the node's clock."""
         return float(self._clock.now().nanoseconds - stamp_ns) / 1e9
 
 
@@ -124,14 +124,14 @@ class _TypeHash(ctypes.Structure):
 
 _Find = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p, ctypes.c_char_p)
 _Hash = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)
-_kept: list[Any] = []  # memory that rclpy points into, for as long as this process runs
+_kept: list[Any] = []  # memory that rclpy keeps pointers to, for the life of this process
 
 
 def tf_message_type() -> type:
-    """Return the type of a publisher of transforms that is given the bytes of each message.
+    """Return the type for a publisher of transforms that sends ready-made bytes.
 
     Raises:
-        UnsupportedError: No package of it is installed, and this rclpy is none that is known here.
+        UnsupportedError: The message's package is not installed, and this version of rclpy is not supported.
     """
     try:
         installed: type = import_module("tf2_msgs.msg").TFMessage
@@ -185,9 +185,9 @@ def _borrowed() -> type:
 
 
 def forget_error() -> None:
-    """Forget what ROS 2 noted on this thread when it looked for functions that this type does not have.
+    """Clear the error that ROS 2 stored on this thread when it looked for functions that this type lacks.
 
-    Otherwise the next note is printed together with that one.
+    Otherwise ROS 2 prints it together with the next error.
     """
     for line in Path("/proc/self/maps").read_text().splitlines():
         if "/librcutils.so" in line:

@@ -1,4 +1,4 @@
-"""What a drone is told through ROS: flights by topics and services, with the authority for them, and its parameters."""
+"""Control of a drone through ROS: flights by topics and services, with the authority for them, and its parameters."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
 from skyloop.ros.names import Frames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
-NEAR_M: Final = 0.2  #: of a goal without a tolerance
-WARN_AGAIN_S: Final = 5.0  #: between two warnings of one kind
+NEAR_M: Final = 0.2  #: tolerance of a goal without its own
+WARN_AGAIN_S: Final = 5.0  #: between two warnings of the same kind
 
 
 class Pilot:
-    """Turns what arrives on topics and services into commands. Nothing is commanded without the authority.
+    """Turns messages on topics and service calls into commands. Commands need the authority.
 
     Args:
         topics: Node of rclpy whose callbacks never wait, in the drone's namespace.
         services: Node whose callbacks may wait, several at a time.
-        drone: Connected as a pilot, with the time after which a velocity decays to hover.
+        drone: Connected as a pilot, with the time after which a velocity turns into hover.
         time: Stamps.
         frames: Names of the drone's frames.
-        priority: Of requests for the authority, 0 (highest) to 31; None: the default.
+        priority: Priority of authority requests, 0 (highest) to 31; None: the default.
         timeout_s: How old a stamped velocity may be [s].
     """
 
@@ -55,14 +55,14 @@ class Pilot:
         self._timeout_s = timeout_s
         self._log = topics.get_logger()
         self._lock = threading.Lock()
-        self._under_way: list[str] = []  # services that wait until the drone has done it
-        # The newest wins, whether its publisher is reliable or not.
+        self._under_way: list[str] = []  # services that wait for the drone
+        # Keep only the newest sample, from reliable and best-effort publishers alike.
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         topics.create_subscription(Twist, "cmd_vel", self.on_velocity, newest)
         topics.create_subscription(TwistStamped, "cmd_vel_stamped", self.on_stamped_velocity, newest)
         topics.create_subscription(PoseStamped, "goal_pose", self.on_goal, newest)
         group = ReentrantCallbackGroup()
-        # These never wait, and must not wait for services that do.
+        # These never wait, and must not queue behind services that do.
         topics.create_service(Trigger, "hover", self._trigger("hover", drone.hover))
         topics.create_service(Trigger, "emergency_stop", self._trigger("emergency_stop", drone.emergency_stop))
         actions: dict[str, Callable[[], object]] = {
@@ -77,15 +77,15 @@ class Pilot:
         services.create_service(GetPlan, "go_to", self._go_to, callback_group=group)
 
     def request_authority(self) -> None:
-        """Ask for the authority with the priority that was given.
+        """Request the authority with the configured priority.
 
         Raises:
-            AuthorityError: Another application has it; names which.
+            AuthorityError: Another application, named in the error, has it.
         """
         self._drone.request_authority(self._priority)
 
     def close(self) -> None:
-        """Ignore what still comes on topics, so that the landing at the end is not ended by it."""
+        """Ignore further messages on topics, so that they do not abort the final landing."""
         with self._lock:
             self._under_way.append("the end of the bridge")
 
@@ -98,7 +98,7 @@ class Pilot:
         self._unless_occupied("cmd_vel", lambda: self._drone.velocity(**rates))
 
     def on_stamped_velocity(self, message: Any) -> None:
-        """Fly with the velocity of a ``TwistStamped``, unless it is too old or in the axes of something else."""
+        """Fly with the velocity of a ``TwistStamped``, unless it is too old or in another frame."""
         frame = message.header.frame_id
         stamp_ns = nanoseconds_of(message.header.stamp)
         age_s = self._time.age_s(stamp_ns) if stamp_ns else 0.0
@@ -106,7 +106,7 @@ class Pilot:
             self._ignored("cmd_vel_stamped", UsageError(f"its frame is {frame!r} and must be {self._frames.base}"))
         elif not abs(age_s) <= self._timeout_s:
             limit_s = self._timeout_s
-            self._ignored("cmd_vel_stamped", UsageError(f"its stamp is {age_s:.3g} s old, {limit_s:g} s are allowed"))
+            self._ignored("cmd_vel_stamped", UsageError(f"its stamp is {age_s:.3g} s old; the limit is {limit_s:g} s"))
         else:
             self.on_velocity(message.twist)
 
@@ -120,10 +120,10 @@ class Pilot:
         self._unless_occupied("goal_pose", fly)
 
     def _unless_occupied(self, topic: str, send: Callable[[], object]) -> None:
-        """Send a set-point, unless a service is under way: programs go on publishing while they wait for it.
+        """Send a set-point, unless a service is running: programs keep publishing while they wait for it.
 
-        Sent under the lock that a service takes before it begins: else a velocity that was checked before a landing
-        could be sent after it. ``send`` does not wait.
+        The lock is the one that a service takes before it begins; otherwise a velocity checked before a landing could
+        be sent after it. ``send`` does not wait.
         """
         try:
             with self._lock:
@@ -152,11 +152,11 @@ class Pilot:
     def _place(self, pose: Any) -> dict[str, float]:
         """Return the arguments of ``go_to`` for a ``PoseStamped``.
 
-        A pose that was drawn in a plane has no height: z = 0 keeps the present one. An orientation that was left out
-        keeps the present heading.
+        A pose drawn in a plane has no height: z = 0 keeps the present one. A missing orientation keeps the present
+        heading.
 
         Raises:
-            UsageError: It is in the axes of something else, its numbers are not finite, or its height is not known.
+            UsageError: It is in another frame, its numbers are not finite, or its height is unknown.
         """
         frame, place, turn = pose.header.frame_id, pose.pose.position, pose.pose.orientation
         allowed = [each for each in ("odom", self._frames.odom, self._frames.map) if each]
@@ -168,10 +168,10 @@ class Pilot:
         if place.z == 0.0:
             position = self._drone.feedback().position_m
             if position is None:
-                raise UsageError("the goal's height is 0 and the drone's own is not known: give z")
+                raise UsageError("the goal's height is 0 and the drone's own is unknown: give z")
             found["z"] = position[2]
         angles = euler_of((turn.x, turn.y, turn.z, turn.w))
-        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # nothing was filled in
+        as_made = (turn.x, turn.y, turn.z, turn.w) == (0.0, 0.0, 0.0, 1.0) and not frame  # a default message
         if angles is not None and not as_made:
             found["yaw"] = angles[2]
         return found
@@ -188,13 +188,13 @@ class Pilot:
                 self._log.warning(f"{name} failed: {response.message}")
                 return response
             response.success = done is not False
-            response.message = "" if response.success else "it was not sent: the proxy is not reached just now"
+            response.message = "" if response.success else "it was not sent: the proxy is not reachable at the moment"
             return response
 
         return call
 
     def _go_to(self, request: Any, response: Any) -> Any:
-        """Fly to ``goal`` and wait; the plan is the straight way that was flown, and empty if it was not."""
+        """Fly to ``goal`` and wait; the plan is the straight path that was flown, or empty if it was not."""
         from geometry_msgs.msg import PoseStamped
 
         try:
@@ -215,15 +215,15 @@ class Pilot:
 
 
 def _in_words_of_ros(error: SkyloopError) -> str:
-    """Return what is wrong, and instead of Python's calls the services that do the same."""
+    """Return the reason, with the equivalent services in place of Python calls."""
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
 class Parameters:
-    """Declares the drone's parameters at a node, writes what ROS sets, and shows what others set.
+    """Declares the drone's parameters at a node, writes values set by ROS, and shows changes made elsewhere.
 
     Args:
-        node: Of rclpy. Setting one waits for the drone's proxy.
+        node: The rclpy node. Setting a parameter waits for the drone's proxy.
         drone: Connected as a pilot: writing needs the authority.
     """
 
@@ -237,13 +237,13 @@ class Parameters:
         drone.on_event(self._on_event)
 
     def _set(self, parameters: list[Any]) -> Any:
-        """Write what differs; the first that is refused ends it, with the proxy's reason."""
+        """Write the values that differ; the first refusal stops it, with the proxy's reason."""
         from rcl_interfaces.msg import SetParametersResult
 
         for each in parameters:
             known = self._known.get(each.name)
             if known is None or _same(known.value, each.value):
-                continue  # the node's own, or what others have set already
+                continue  # the node's own, or already set
             try:
                 self._drone.config[each.name] = each.value
                 self._known[each.name] = self._drone.config.describe(each.name)
@@ -252,7 +252,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
     def _on_event(self, event: Event) -> None:
-        """Show what was written elsewhere. On a thread of the drone's own."""
+        """Show a value that was written elsewhere. Runs on the drone's own thread."""
         name = event.data.get("name")
         if event.kind is not EventKind.PARAMETER_CHANGED or name not in self._known:
             return
@@ -272,7 +272,7 @@ def _described(parameter: Parameter) -> Any:
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
     unit = f" [{parameter.unit}]" if parameter.unit else ""
-    once = " (momentary: writing it does something once)" if parameter.momentary else ""
+    once = " (momentary: each write triggers one action)" if parameter.momentary else ""
     descriptor = ParameterDescriptor(description=f"{parameter.description}{unit}{once}")
     if parameter.read_only:
         descriptor.additional_constraints = "read-only"

@@ -1,4 +1,4 @@
-"""What a drone tells ROS: odometry, IMU, battery, place on the earth, transforms, what it is doing, and its images."""
+"""A drone's data for ROS: odometry, IMU, battery, geographic position, transforms, flight state, and its images."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from skyloop.vehicles.ros2.wire import (
     stamp_of,
 )
 
-SLOW_NS: Final = 1_000_000_000  #: battery and place on the earth, once in so long
+SLOW_NS: Final = 1_000_000_000  #: period of battery and geographic position
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 JPEG_QUALITY: Final = 90
 
 
 class Telemetry:
-    """Publishes each feedback, to those topics that somebody subscribes to."""
+    """Publishes each feedback to those topics that have subscribers."""
 
     def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:
         from geometry_msgs.msg import TwistStamped
@@ -63,9 +63,9 @@ class Telemetry:
         drone.on_feedback(self.publish)
 
     def publish(self, feedback: Feedback) -> None:
-        """Publish one sample. On a thread of the drone's own."""
-        self._tell(self._state, feedback.state.value)
-        self._tell(self._pilot, feedback.owner or "")
+        """Publish one sample. Runs on the drone's own thread."""
+        self._publish_text(self._state, feedback.state.value)
+        self._publish_text(self._pilot, feedback.owner or "")
         stamp_ns = self._time.stamp_ns(feedback.captured_ns)
         if stamp_ns is None or feedback.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
             return
@@ -121,8 +121,8 @@ class Telemetry:
         if known:
             self._static.publish(encode_transforms(known))
 
-    def _tell(self, publisher: Any, text: str) -> None:
-        """Publish a text if it is another than the last one."""
+    def _publish_text(self, publisher: Any, text: str) -> None:
+        """Publish a text if it differs from the last one."""
         if self._told.get(publisher) != text:
             from std_msgs.msg import String
 
@@ -158,7 +158,7 @@ class Telemetry:
         return message
 
     def _twist(self, feedback: Feedback) -> Any:
-        """Return velocity and rates in body axes; None if the velocity or the tilt is not known."""
+        """Return velocity and rates in body axes; None if the velocity or the tilt is unknown."""
         from geometry_msgs.msg import Twist
 
         if feedback.velocity_m_s is None or feedback.roll_rad is None or feedback.pitch_rad is None:
@@ -208,8 +208,8 @@ class Telemetry:
         if origin is None or feedback.position_m is None:
             return None
         latitude_deg, longitude_deg, _ = origin.place_of(feedback.position_m)
-        # The altitude of a NavSatFix is above the ellipsoid; the vehicle's is above the sea, and what lies between them
-        # (up to 100 m) is not known here.
+        # The altitude of a NavSatFix is above the ellipsoid, the vehicle's above the sea; the difference (up to 100 m)
+        # is unknown here.
         message = NavSatFix(latitude=latitude_deg, longitude=longitude_deg, altitude=math.nan)
         message.status.status = NavSatStatus.STATUS_FIX
         message.status.service = NavSatStatus.SERVICE_GPS
@@ -238,7 +238,7 @@ def _or_nan(value: float | None) -> float:
 
 
 class CameraPublisher:
-    """Publishes one camera, while somebody subscribes to it: until then its frames are not asked for."""
+    """Publishes one camera while it has subscribers; without them it does not request frames."""
 
     def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
         from rclpy.qos import qos_profile_sensor_data
@@ -266,12 +266,12 @@ class CameraPublisher:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody subscribes to one of the topics."""
+        """Whether one of the topics has subscribers."""
         publishers = (self._image, self._info, self._compressed)
         return any(each is not None and each.get_subscription_count() for each in publishers)
 
     def update(self) -> None:
-        """Ask for frames, or no longer: called a few times a second, from one thread."""
+        """Subscribe to frames or unsubscribe; called a few times a second, from one thread."""
         watched = self.watched
         if watched and self._listener is None:
             self._listener = self._drone.on_frame(self.publish, self._camera.name)
@@ -280,7 +280,7 @@ class CameraPublisher:
             self._listener = None
 
     def publish(self, frame: Frame) -> None:
-        """Publish one frame. On a thread of the drone's own."""
+        """Publish one frame. Runs on the drone's own thread."""
         stamp_ns = self._time.stamp_ns(frame.captured_ns)
         if stamp_ns is None:
             return
@@ -298,7 +298,7 @@ class CameraPublisher:
         message.height, message.width = frame.shape[:2]
         message.encoding = "bgr8"
         message.step = 3 * message.width
-        pixels = array("B")  # the type that rclpy takes as it is; bytes are converted one by one
+        pixels = array("B")  # rclpy accepts this type directly; bytes are converted one at a time
         pixels.frombytes(frame.data.cast("B"))
         message.data = pixels
         return message
@@ -308,7 +308,7 @@ class CameraPublisher:
         from sensor_msgs.msg import CompressedImage
 
         message = self._head(CompressedImage(), stamp_ns)
-        message.format = "bgr8; jpeg compressed bgr8"  # as image_transport's compressed publisher words it
+        message.format = "bgr8; jpeg compressed bgr8"  # the wording of image_transport's compressed publisher
         _, encoded = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         message.data = array("B", encoded.tobytes())
         return message

@@ -1,6 +1,6 @@
-"""The simulator: worlds from text files, quadrotors with the logic of real firmware, stepped by their owner.
+"""The simulator: worlds from text files, and quadrotors with the logic of real firmware, stepped by their owner.
 
-Nothing here knows of proxies or networks, and nothing reads a wall clock but :class:`Pacer`.
+It is independent of proxies and networks. Only :class:`Pacer` reads a wall clock.
 """
 
 from skyloop.sim.dynamics import STEP_S

@@ -1,7 +1,7 @@
-"""The drones' flight logic: handles commands, follows a table of states, sets the loops' set-points.
+"""The drones' flight logic: apply commands, follow a table of states, and set the control loops' set-points.
 
-What changes a state is a :class:`Happening`; one that is not in the table of :data:`TRANSITIONS` for a state is
-ignored, as firmware ignores what does not fit. The charge of the :class:`Batteries` is one of the things that do.
+A :class:`Happening` changes a state. One that is not in :data:`TRANSITIONS` for the present state is ignored, as in
+firmware. The charge of the :class:`Batteries` causes some of them.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from skyloop.sim.streams import Floats
 
 
 class Happening(Enum):
-    """What changes a state: the pilot's commands first, then what the vehicle detects itself."""
+    """Causes of state changes: the pilot's commands first, then the vehicle's own observations."""
 
     TAKEOFF = auto()
     LAND = auto()
     HOVER = auto()
     SET_POINT = auto()
     STOP = auto()
-    RESET = auto()  # only on the ground: the caller checks
+    RESET = auto()  # only on the ground, which the caller checks
     HEIGHT_REACHED = auto()
     TOUCHED_GROUND = auto()
     CRASHED = auto()
@@ -75,7 +75,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
     _S.HOVERING: _IN_FLIGHT,
     _S.FLYING: _IN_FLIGHT,
     _S.LANDING: {
-        _H.HOVER: _S.HOVERING,  # as autopilots do: it breaks the landing off
+        _H.HOVER: _S.HOVERING,  # aborts the landing, as in real autopilots
         _H.TAKEOFF: _S.TAKING_OFF,
         _H.TOUCHED_GROUND: _S.LANDED,
         _H.STOP: _S.EMERGENCY,
@@ -87,7 +87,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """Return the state that follows, or None where the happening is ignored."""
+    """Return the next state, or None if the happening is ignored."""
     return TRANSITIONS[state].get(happening)
 
 
@@ -95,7 +95,7 @@ class Batteries:
     """The drones' batteries.
 
     Attributes:
-        charge: What is left, 0 to 1, (n,).
+        charge: Remaining charge, 0 to 1, (n,).
         voltage: At the terminals, (n,) [V].
     """
 
@@ -114,7 +114,7 @@ class Batteries:
         self.voltage = self.open_voltage() - current * self._resistance
 
     def strength(self) -> Floats:
-        """Return the share of the full battery's thrust that is left, (n,): thrust grows with voltage squared."""
+        """Return the available share of the full battery's thrust, (n,): thrust grows with voltage squared."""
         share: Floats = np.clip(self.voltage / self._full, 0.0, 1.0) ** 2
         return share
 
@@ -124,9 +124,9 @@ class Batteries:
         return voltage
 
 
-LOW_BATTERY = 0.03  # share of the charge at which the vehicle lands by itself
-_HEIGHT_TOLERANCE_M = 0.08
-_STANDING_S = 0.05  # a drone that touched the ground no longer ago than this stands on it
+LOW_BATTERY = 0.03  # share of the charge below which the vehicle lands
+_HEIGHT_TOLERANCE_M = 0.08  # below its target height, a take-off counts as finished
+_STANDING_S = 0.05  # time since the last ground contact below which a drone counts as standing
 _KEPT_OCCURRENCES = 1000
 
 
@@ -149,16 +149,16 @@ class Autopilot:
         self.states = [FlightState.LANDED for _ in parameters]
         self.reasons = ["" for _ in parameters]
         self.occurrences: deque[Occurrence] = deque(maxlen=_KEPT_OCCURRENCES)
-        self._stood_s = [0.0 for _ in parameters]  # when each last had something under its feet
-        self._rising: dict[int, float] = {}  # drones that are taking off, and the altitude that ends it
+        self._stood_s = [0.0 for _ in parameters]  # time of each drone's last support from below
+        self._rising: dict[int, float] = {}  # drones that are taking off, and the altitude where the take-off ends
         self._warned: set[int] = set()
-        self.handed_over: set[int] = set()  #: drones that firmware flies
+        self.handed_over: set[int] = set()  #: drones flown by firmware
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point in force is clamped only when it is given again; the tilt, climb and altitude that the loops
-        themselves ask for follow at once.
+        A set-point in force is clamped only when it is sent again; the loops' own tilt, climb and altitude follow at
+        once.
         """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
@@ -166,7 +166,7 @@ class Autopilot:
             self._loops.set_ceiling(drone, limits.altitude_m)
 
     def command(self, drone: int, action: AnyAction, time_s: float) -> AnyAction:
-        """Apply a command; return what was applied, :class:`Idle` where it was ignored."""
+        """Apply a command; return the applied action, :class:`Idle` if it was ignored."""
         if isinstance(action, Takeoff):
             if self._batteries.charge[drone] <= LOW_BATTERY:
                 return Idle()
@@ -187,46 +187,46 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Hover where a flying drone was moved to; it has learnt nothing of the wind there."""
+        """Hover at a flying drone's new position, without any estimate of the wind there."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
     def grounded(self, drone: int, time_s: float) -> bool:
-        """Whether a drone stands: landed, or fallen in an emergency."""
+        """Return whether a drone is on the ground: landed, or fallen in an emergency."""
         fallen = time_s - self._stood_s[drone] <= _STANDING_S
         return self.states[drone] is FlightState.LANDED or (self.states[drone] is FlightState.EMERGENCY and fallen)
 
     def hand_over(self, drone: int) -> None:
-        """Leave a drone that stands to firmware."""
+        """Hand a drone on the ground over to firmware."""
         if self.states[drone] is FlightState.EMERGENCY:
             self._loops.stop(drone)
         self.states[drone], self.reasons[drone] = FlightState.LANDED, ""
         self.handed_over.add(drone)
 
     def take_back(self, drone: int, time_s: float) -> None:
-        """Have a drone again whose rotors were stopped."""
+        """Take a drone back whose rotors were stopped."""
         self.handed_over.discard(drone)
         flew, self.states[drone] = self.states[drone].airborne, FlightState.LANDED
         if flew:
             self._advance(drone, Happening.STOP, EmergencyStop(), time_s, "taken from its firmware in the air")
 
     def watch_firmware(self, rotors: RotorBodies, time_s: float) -> None:
-        """Follow the states of the drones that firmware flies; called once per step."""
+        """Follow the states of drones flown by firmware; called once per step."""
         for drone in self.handed_over:
             stands = time_s - self._stood_s[drone] <= _STANDING_S and rotors.idles(drone)
             self.states[drone] = FlightState.LANDED if stands else FlightState.FLYING
 
     def supervise(self, time_s: float) -> None:
-        """End the take-off of drones that have reached its height; called once per period of the loops."""
+        """End the take-off of drones at its target height; called once per period of the loops."""
         for drone, height in list(self._rising.items()):
             if self._sensors.altitude[drone] >= height - _HEIGHT_TOLERANCE_M:
                 self._advance(drone, Happening.HEIGHT_REACHED, Hover(), time_s)
 
     def watch_batteries(self, time_s: float) -> None:
-        """Land drones with a low battery, and stop those with an empty one; called now and then."""
+        """Land drones with a low battery, and stop those with an empty one; called periodically."""
         self._loops.set_strength(self._batteries.strength())
         low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
-        self._warned.intersection_update(low)  # a new battery is warned of again
+        self._warned.intersection_update(low)  # warn again after a battery change
         for drone in low:
             if drone not in self._warned:
                 self._warned.add(drone)
@@ -238,7 +238,7 @@ class Autopilot:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
     def feel(self, contacts: Contacts, time_s: float) -> None:
-        """React to what was touched in a step."""
+        """React to the contacts of a step."""
         for drone, speed, what in contacts.impacts:
             text = f"hit {what} at {speed:.1f} m/s"
             self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)

@@ -20,7 +20,7 @@ Vec3 = tuple[float, float, float]
 Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
 
-_BLOCK: Final = 16384  #: points that are undistorted at a time
+_BLOCK: Final = 16384  #: points undistorted at a time
 
 #: Body from optical of a camera that looks forward, level, with the image's top up.
 LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
@@ -29,13 +29,13 @@ LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 def looking_up(tilt_rad: float) -> Rotation9:
-    """Return body from optical of a camera that looks forward and by an angle up, with the image's top up."""
+    """Return body from optical of a camera that looks forward and up by an angle, with the image's top up."""
     s, c = math.sin(tilt_rad), math.cos(tilt_rad)
     return (0.0, s, c, -1.0, 0.0, 0.0, 0.0, -c, s)
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World from optical axes (x right, y down, z forward) of a camera that looks from one point at another."""
+    """Return world from optical axes (x right, y down, z forward) of a camera at one point that looks at another."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -59,7 +59,7 @@ class CameraPose:
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A camera as it is mounted on a drone.
+    """A camera mounted on a drone.
 
     Raises:
         UsageError: A value is out of its range.
@@ -73,14 +73,14 @@ class CameraModel:
     fy: float
     cx: float
     cy: float
-    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 as OpenCV orders them
-    position_m: Vec3 = (0.0, 0.0, 0.0)  #: of the optical centre in body axes
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 in OpenCV's order
+    position_m: Vec3 = (0.0, 0.0, 0.0)  #: position of the optical centre in body axes
     rotation: Rotation9 = LOOKING_FORWARD  #: body from optical, row by row
     latency_s: float = 0.0  #: from the middle of the exposure until the frame is delivered
-    noise_sigma: float = 0.0  #: of each channel of each pixel, in steps of 0 … 255
-    exposure_s: float = 0.0  #: how long the shutter is open, which blurs the image of a turning drone
+    noise_sigma: float = 0.0  #: standard deviation per channel of each pixel, in steps of 0 … 255
+    exposure_s: float = 0.0  #: opening time of the shutter, which blurs the image of a turning drone
     exposure_gain: float = 1.0  #: brightness relative to the scene's own
-    vignetting: float = 0.0  #: share of the light that is lost in the corners, 0 … 1
+    vignetting: float = 0.0  #: share of light lost in the corners, 0 … 1
 
     def __post_init__(self) -> None:
         if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
@@ -117,12 +117,12 @@ class CameraModel:
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """Return the intrinsics, as each frame carries them."""
+        """Return the intrinsics, as in each frame."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 
     def info(self) -> CameraInfo:
-        """Return the camera's description, as a driver gives it before the first frame."""
+        """Return the camera's description, as drivers report it before the first frame."""
         return CameraInfo(
             name=self.name,
             width=self.width,
@@ -147,7 +147,7 @@ class CameraModel:
         return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
 
     def scaled(self, factor: float) -> CameraModel:
-        """Return the same lens over an image of another size: factor 2 turns 320×240 into 640×480.
+        """Return the same lens with another image size: factor 2 turns 320×240 into 640×480.
 
         Raises:
             UsageError: The factor is not finite and above 0.
@@ -178,7 +178,7 @@ class CameraModel:
         return bent * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return x/z and y/z in optical axes of what pixels see, both of shape (n, 2).
+        """Return x/z and y/z in optical axes for pixels, both of shape (n, 2).
 
         Raises:
             UsageError: The distortion folds the image over itself.
@@ -202,9 +202,9 @@ def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.f
 
 
 def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
-    """The inverse of :func:`distort` by Newton's method; None where there is no inverse near the optical axis."""
+    """Invert :func:`distort` by Newton's method; return None without an inverse near the optical axis."""
     straight = np.empty_like(points)
-    for first in range(0, len(points), _BLOCK):  # each block's intermediate values stay in the processor's cache
+    for first in range(0, len(points), _BLOCK):  # in blocks, so that intermediate values stay in the CPU cache
         part = slice(first, first + _BLOCK)
         if (block := _undistort(points[part], distortion)) is None:
             return None
@@ -235,8 +235,8 @@ def _undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[n
     return guess if np.abs(distort(guess, distortion) - points).max(initial=0.0) < 1e-9 else None
 
 
-# Pictures of 320×240 with the diagonal fields of view that Parrot gives for its AR.Drone: 92° forward and 64° down.
-# The forward lens is a wide one: with this barrel distortion its focal length comes out as calibrations have it.
+# Pictures of 320×240 with Parrot's diagonal fields of view for its AR.Drone: 92° forward and 64° down.
+# The forward lens is wide: with this barrel distortion its focal length matches that of calibrations.
 FRONT_CAMERA = CameraModel(
     name="front",
     width=320,
@@ -270,8 +270,8 @@ BOTTOM_CAMERA = CameraModel(
     exposure_s=0.006,
     vignetting=0.15,
 )
-# What a racer's pilot sees: 100° by 76° and 120° across the corners, as of a wide 2.1 mm lens, at the tilt of a quick
-# flight; rate, latency and short exposure are estimates of an analogue camera's.
+# A racing pilot's view: 100° by 76° and 120° across the corners, as of a wide 2.1 mm lens, at the tilt of a fast
+# flight; rate, latency and short exposure are estimates for an analogue camera.
 FPV_CAMERA = CameraModel(
     name="fpv",
     width=320,

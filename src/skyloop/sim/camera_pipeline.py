@@ -1,4 +1,4 @@
-"""The cameras of simulated drones: when they expose, and the thread that renders and delivers their frames."""
+"""The cameras of simulated drones: their exposure times, and the thread that renders and delivers their frames."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Where fewer pictures are used than a camera takes, so many times as many are rendered: whoever chooses some of them,
-#: by a count of its own, finds one in time.
-SPARE: Final = 1.25
+#: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that picks
+#: frames by its own count always finds one in time.
+RATE_MARGIN: Final = 1.25
 
 
 class Screen(Protocol):
-    """Where a drone's frames go."""
+    """The recipient of a drone's frames."""
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
 
@@ -33,7 +33,7 @@ class Screen(Protocol):
 
 
 class Exposing(Protocol):
-    """What renders exposures, and delivers the frames when they are due."""
+    """Renders exposures, and delivers the frames when they are due."""
 
     def expose(self, exposures: list[Exposure]) -> None: ...
 
@@ -43,7 +43,7 @@ class Exposing(Protocol):
 
 
 class Shutter:
-    """Decides when a camera exposes, by absolute times of the simulation. Pure."""
+    """Decides when a camera exposes, by absolute simulation times. Pure."""
 
     def __init__(self, offset_s: float = 0.0) -> None:
         """Set the time of the first exposure [s]."""
@@ -51,7 +51,7 @@ class Shutter:
         self.count = 0  #: exposures so far, including those without an observer
 
     def due(self, now_s: float, fps: float) -> bool:
-        """Whether it exposes now. After a pause it continues from here, without making up for missed exposures."""
+        """Return whether to expose now. After a pause, missed exposures are not made up for."""
         if now_s < self._next_s:
             return False
         self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
@@ -68,7 +68,7 @@ class Camera:
     screen: Screen
     seed: int
     shutter: Shutter
-    dropped: int = 0  #: exposures that were replaced by a newer one before they were rendered
+    dropped: int = 0  #: exposures replaced by a newer one before rendering
     gone: bool = False  #: whether its observer was detached
     _effects: tuple[CameraModel, SensorEffects] | None = field(default=None, init=False)
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
@@ -77,12 +77,12 @@ class Camera:
         """Return whether the exposure that is due now is worth rendering.
 
         Args:
-            captured_ns: When it is.
-            fps: How many pictures a second are used: 0: none; infinity: all.
+            captured_ns: Its time.
+            fps: How many frames per second are used; 0: none; infinity: all.
         """
         if not fps:
             return False
-        enough = fps * SPARE
+        enough = fps * RATE_MARGIN
         self._limiter.max_hz = enough if enough < self.model.fps else math.inf
         return self._limiter.in_time(captured_ns)
 
@@ -95,7 +95,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """What a camera saw at one time, to be rendered."""
+    """A camera's view at one time, to be rendered."""
 
     camera: Camera
     model: CameraModel
@@ -104,11 +104,11 @@ class Exposure:
     rates_rad_s: NDArray[np.float64]
     number: int
     captured_ns: int
-    due_ns: int  #: when the frame is delivered
+    due_ns: int  #: when to deliver the frame
 
 
 class _Frames:
-    """Finished pictures, each delivered when it is due."""
+    """Rendered frames, each delivered when due."""
 
     def __init__(self) -> None:
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
@@ -116,7 +116,7 @@ class _Frames:
         self._handing = threading.RLock()
 
     def hand_out(self, now_ns: int) -> None:
-        """Deliver the frames that are due by then."""
+        """Deliver the frames that are due at this time."""
         while self._finished and self._finished[0][0] <= now_ns:
             _, _, exposure, picture = heapq.heappop(self._finished)
             with self._handing:
@@ -124,7 +124,7 @@ class _Frames:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames of these cameras; on return no other thread delivers one."""
+        """Stop delivering frames of these cameras; after it returns, no other thread delivers one."""
         with self._handing:
             for camera in cameras:
                 camera.gone = True
@@ -136,9 +136,9 @@ class _Frames:
 
 
 class CameraPipeline(_Frames):
-    """Renders exposures on its own thread, the newest of each camera, and delivers each frame when it is due.
+    """Renders each camera's newest exposure on a separate thread, and delivers each frame when it is due.
 
-    The scene is created at the start, which takes some tenths of a second: start it when the first frame is wanted.
+    Creating the scene takes some tenths of a second: start the pipeline when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -146,8 +146,8 @@ class CameraPipeline(_Frames):
 
         Args:
             world: The world.
-            drones: How many it has.
-            quality: Of the images: ``fast``, ``smooth`` or ``best``.
+            drones: Their number.
+            quality: Image quality: ``fast``, ``smooth`` or ``best``.
         """
         super().__init__()
         self._world = world
@@ -159,11 +159,11 @@ class CameraPipeline(_Frames):
         self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
 
     def start(self) -> None:
-        """Start the thread; it creates the scene first, and exposures meanwhile are replaced by newer ones."""
+        """Start the thread. It first creates the scene; newer exposures replace older ones meanwhile."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; frames that were not delivered yet are lost."""
+        """End the thread; undelivered frames are lost."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -171,7 +171,7 @@ class CameraPipeline(_Frames):
             self._thread.join()
 
     def expose(self, exposures: list[Exposure]) -> None:
-        """Queue exposures; each replaces one of the same camera that still waits."""
+        """Queue exposures; each replaces a waiting one of the same camera."""
         with self._changed:
             for exposure in exposures:
                 if exposure.camera in self._waiting:
@@ -182,7 +182,7 @@ class CameraPipeline(_Frames):
     def _run(self) -> None:
         try:
             renderer = make_renderer(self._world, self._drones, self._quality)
-        except Exception as error:  # noqa: BLE001  reported to the drivers: there will be no frames
+        except Exception as error:  # noqa: BLE001  reported to the drivers: no frames will follow
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
             for screen in screens:
@@ -195,7 +195,7 @@ class CameraPipeline(_Frames):
                 exposure.camera.screen.failed(error)
 
     def _next(self) -> Exposure | None:
-        """Return the next exposure to render, delivering meanwhile what is due; None to stop."""
+        """Return the next exposure to render, and deliver due frames meanwhile; None to stop."""
         while True:
             self.hand_out(monotonic_ns())
             with self._changed:
@@ -211,9 +211,9 @@ class CameraPipeline(_Frames):
 
 
 class SteppedCameraPipeline(_Frames):
-    """Renders each exposure at once, and delivers what is due on demand, all on one thread.
+    """Renders each exposure at once, and delivers due frames on request, all on one thread.
 
-    For a world whose time stands still between two steps.
+    For a world whose time advances only by explicit steps.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -227,12 +227,12 @@ class SteppedCameraPipeline(_Frames):
             self._develop(self._renderer, exposure)
 
     def stop(self) -> None:
-        """Drop the frames that were not delivered yet."""
+        """Drop the undelivered frames."""
         self._finished.clear()
 
 
 def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
-    """Create a renderer; to be called on the thread that renders, to which it belongs."""
+    """Create a renderer. Call it on the rendering thread, to which the renderer belongs."""
     return PlanarRenderer(Scene(world, drones), Quality(quality))
 
 

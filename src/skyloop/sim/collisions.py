@@ -1,7 +1,7 @@
-"""Collisions of drones with the floor, solid things and one another: contact, bounce and friction.
+"""Collisions of drones with the floor, solids and one another: contact, bounce and friction.
 
-A broad phase finds, every few steps, what each drone can reach before the next time. In between only those pairs are
-looked at: all together in arrays where they are many, one by one where they are few.
+Every few steps, a broad phase finds everything within each drone's reach until the next one. The steps until
+then check only those pairs: as arrays if there are many, one at a time if there are few.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
-_PASSES = 6
-_TOUCH_M = 1e-9  # overlaps up to this are touching: rounding alone leaves some that no push ends
-#: Steps between two broad phases, which for few drones cost as much as for some, but leave less to look at.
-LOOK_STEPS, LOOK_STEPS_OF_FEW = 15, 30
-_SLACK_M = 0.03  # a broad phase looks so much further, for what is pushed
-#: Up to so many pairs are faster looked at one by one.
+_STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or nothing would come to rest
+_PASSES = 6  # attempts per step to push a drone out of solids
+_TOUCH_M = 1e-9  # overlaps up to this count as touching: rounding leaves some that no push removes
+#: Steps between two broad phases. With few drones one costs as much, but leaves fewer pairs to check.
+BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
+_SLACK_M = 0.03  # extra reach in a broad phase, for drones that are pushed
+#: Up to this many pairs are faster to check one at a time.
 FEW_PAIRS = 6
 
 
 @dataclass(slots=True)
 class Contacts:
-    """What was touched in a step.
+    """The contacts of a step.
 
     Attributes:
-        standing: Drones with something under their feet that is no drone.
+        standing: Drones supported from below by something other than a drone.
         upon: Drones on drones, the upper one first.
-        impacts: Drone, speed along the normal [m/s], and what it met.
+        impacts: Drone, speed along the normal [m/s], and the name of the other object.
     """
 
     standing: set[int] = field(default_factory=set)
@@ -47,14 +47,14 @@ class Contacts:
 
 @dataclass(slots=True)
 class _Near:
-    """What drones can reach before the next broad phase.
+    """Everything within the drones' reach until the next broad phase.
 
     Attributes:
-        one: The first of each pair of drones that can reach one another, the lesser number.
+        one: The first drone of each pair of drones within reach, with the lower number.
         other: The second.
         across: The square of the sum of their radii.
         upright: The square of the sum of their half heights.
-        solids: The solids that a drone can reach, of those that can reach any or a wall or the ceiling.
+        solids: The solids within reach, by drone; drones near only a wall or the ceiling have none.
         who: The drone of each pair of a drone and a solid.
         what: The solid.
         sizes: See :meth:`Solids.sizes`.
@@ -95,16 +95,16 @@ class Collisions:
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
         self._feet = self._hull[2]
-        # Rows, of which single numbers are written faster than whole columns.
+        # Rows: writing single numbers is faster than writing columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
-        self._free = bodies.position.copy()  # where each drone last was clear of all that doesn't move
-        self._look_steps = LOOK_STEPS_OF_FEW if few(len(parameters)) else LOOK_STEPS
-        self._span_m = _span(bodies.most_acceleration_m_s2, self._look_steps)
+        self._free = bodies.position.copy()  # each drone's last position clear of all fixed objects
+        self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
+        self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
         self._next = 0  # the step of the next broad phase
-        self._reach = np.zeros(len(parameters))  # how far each drone can get until then
-        self._strayed = [0.0 for _ in parameters]  # how much further it may get, because it was pushed or hit
-        self._look_around(0)
+        self._reach = np.zeros(len(parameters))  # how far each drone can move until then
+        self._extra_reach = [0.0 for _ in parameters]  # additional movement from pushes and impacts
+        self._run_broad_phase(0)
         self._next = 0
 
     def resolve(self, step: int) -> Contacts | None:
@@ -116,7 +116,7 @@ class Collisions:
             self._meet_floor(self._on_floor.nonzero()[0], contacts)
         looked = step >= self._next
         if looked:
-            self._look_around(step)
+            self._run_broad_phase(step)
         elif self._near.moving:
             self._solids.move((step + 1) * STEP_S)
         if len(self._near.one) or self._near.solids:
@@ -128,27 +128,27 @@ class Collisions:
 
     def _narrow(self, step: int, contacts: Contacts) -> None:
         if len(self._near.one) and self._meet_drones((self._next - step) * STEP_S, contacts):
-            self._look_around(step)
+            self._run_broad_phase(step)
         left_s = (self._next - step) * STEP_S
         for drone in self._within_solids():
             if self._meet_solids(drone, left_s, contacts):
                 self._next = step + 1
 
     def moved(self, drone: int) -> None:
-        """Take note that a drone was put somewhere else."""
+        """Record that a drone was moved elsewhere."""
         self._free[:, drone] = self._bodies.position[:, drone]
         self._next = 0
 
     # The broad phase -------------------------------------------------------------------------------------------
 
-    def _look_around(self, step: int) -> None:
-        """Find what each drone can reach until the next broad phase."""
+    def _run_broad_phase(self, step: int) -> None:
+        """Find everything within each drone's reach until the next broad phase."""
         solids, position, velocity = self._solids, self._bodies.position, self._bodies.velocity
         if solids.moving:
             solids.move((step + 1) * STEP_S)
-        self._next = step + self._look_steps
-        seconds = self._look_steps * STEP_S
-        self._strayed = [0.0] * len(self._strayed)
+        self._next = step + self._broad_phase_steps
+        seconds = self._broad_phase_steps * STEP_S
+        self._extra_reach = [0.0] * len(self._extra_reach)
         np.sqrt((velocity * velocity).sum(axis=0), out=self._reach)
         np.multiply(self._reach, seconds, out=self._reach)
         np.add(self._reach, self._span_m + _SLACK_M, out=self._reach)
@@ -181,10 +181,10 @@ class Collisions:
             room_high=self._high.take(walled, axis=1),
         )
 
-    def _strays(self, drone: int, metres: float) -> bool:
-        """Whether a drone that gets further by so much leaves what the last broad phase looked at."""
-        self._strayed[drone] += metres
-        return self._strayed[drone] > _SLACK_M
+    def _extend_reach(self, drone: int, metres: float) -> bool:
+        """Extend a drone's possible movement; return whether it leaves the reach of the last broad phase."""
+        self._extra_reach[drone] += metres
+        return self._extra_reach[drone] > _SLACK_M
 
     # The floor -------------------------------------------------------------------------------------------------
 
@@ -211,7 +211,7 @@ class Collisions:
     # Solids ----------------------------------------------------------------------------------------------------
 
     def _within_solids(self) -> list[int]:
-        """Return the drones that may be within a solid, a wall or the ceiling, in ascending order."""
+        """Return the drones that may be inside a solid, a wall or the ceiling, in ascending order."""
         near, position = self._near, self._bodies.position
         if len(near.who) + len(near.walled) <= FEW_PAIRS:
             return list(near.solids)
@@ -226,7 +226,7 @@ class Collisions:
         return sorted(found)
 
     def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
-        """Push a drone out of solids; returns whether it may leave, in this time, what the broad phase looked at."""
+        """Push a drone out of solids; return whether it may leave the broad phase's reach in the remaining time."""
         bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
         x, y, z = start = bodies.position[:, drone].tolist()
         height, climb = z, float(self._vz[drone])
@@ -246,31 +246,31 @@ class Collisions:
             z = max(z + normal_z * overlap.depth_m, half_height)
             impact, more_x, more_y, faster = self._rebound(drone, overlap)
             carried += faster
-            # Friction acts on this step's motion too, or a drone that stands in wind would creep.
+            # Friction also acts on this step's motion, or a drone that stands in wind would creep.
             x, y = x + more_x * STEP_S, y + more_y * STEP_S
             if normal_z > 0.5:
                 contacts.standing.add(drone)
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
-            # (A moving platform may overlap it afterwards: it can't be clear of both.)
+            # (A moving platform may overlap it afterwards; being clear of both is impossible.)
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
         self._x[drone], self._y[drone], self._z[drone] = x, y, z
-        return self._strays(drone, math.dist(start, (x, y, z)) + carried * left_s)
+        return self._extend_reach(drone, math.dist(start, (x, y, z)) + carried * left_s)
 
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
-        """Return the position of a drone that is wedged, so that pushing it out of one thing leads into another.
+        """Return the position of a wedged drone: pushing it out of one object leads into another.
 
-        It is across where it was clear, and free vertically, for nothing that it is wedged between holds it there. It
-        has no friction: what presses it would grow without end in a narrow enough corner, and hold it in the air for
-        ever.
+        Horizontally it returns to its last clear position; vertically it stays free, since nothing it is wedged between
+        supports it. It has no friction: in a narrow enough corner the pressure would grow without limit and hold the
+        drone in the air forever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
         self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
-        # All faces are level or upright: there is one above or below.
+        # All faces are horizontal or vertical, so there is one above or below.
         self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
@@ -281,10 +281,10 @@ class Collisions:
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
     def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
-        """Take the velocity into the surface back, and rub.
+        """Remove the velocity into the surface, and apply friction.
 
         Returns:
-            That velocity [m/s]; the changes of the velocity east and north; and by how much it is faster.
+            That velocity [m/s]; the changes of the velocity east and north; and the increase in speed.
         """
         vx, vy, vz = self._bodies.velocity[:, drone].tolist()
         nx, ny, nz = overlap.normal
@@ -307,7 +307,7 @@ class Collisions:
         return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
-        """Let a surface that turns take a drone on it along: friction all over the foot print of a disk.
+        """Let a turning surface take a drone on it along: friction over the whole contact disk.
 
         With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
@@ -317,10 +317,10 @@ class Collisions:
     # Drones ----------------------------------------------------------------------------------------------------
 
     def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
-        """Part drones that overlap; returns whether one may leave, in this time, what the broad phase looked at."""
+        """Separate overlapping drones; return whether one may leave the broad phase's reach in the remaining time."""
         strayed = False
         for one, other in self._close_pairs():
-            if self._part(one, other, left_s, contacts):
+            if self._separate(one, other, left_s, contacts):
                 strayed = True
         return strayed
 
@@ -337,8 +337,8 @@ class Collisions:
         which = close.nonzero()[0]
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
-    def _part(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Part two drones; returns whether one may leave, in this time, what the broad phase looked at."""
+    def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
+        """Separate two drones; return whether one may leave the broad phase's reach in the remaining time."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -348,7 +348,7 @@ class Collisions:
         upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
         depth = -max(across, upright)
         if depth <= 0.0:
-            return False  # a push by a third one has parted them
+            return False  # a third drone's push has separated them
         if across > upright:
             nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
         else:
@@ -357,7 +357,7 @@ class Collisions:
         mine = self._mass[other] / (self._mass[one] + self._mass[other])
         theirs = 1.0 - mine
         one_z, other_z = one_z + nz * depth * mine, other_z - nz * depth * theirs
-        # Nobody is pushed into the floor: both are lifted instead.
+        # Neither may be pushed into the floor: both are lifted instead.
         up = max(self._half_heights[one] - one_z, self._half_heights[other] - other_z, 0.0)
         self._x[one], self._y[one], self._z[one] = one_x + nx * depth * mine, one_y + ny * depth * mine, one_z + up
         self._x[other], self._y[other] = other_x - nx * depth * theirs, other_y - ny * depth * theirs
@@ -375,11 +375,11 @@ class Collisions:
             if into > _STILL_M_S:
                 contacts.impacts += [(one, into, "another drone"), (other, into, "another drone")]
         further = depth + change * left_s
-        return self._strays(one, further * mine + up) | self._strays(other, further * theirs + up)
+        return self._extend_reach(one, further * mine + up) | self._extend_reach(other, further * theirs + up)
 
 
 def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, N, N, N]:
-    """Return the velocity after meeting the floor, and how fast that was, along the normal [m/s]."""
+    """Return the velocity after a contact with the floor, and the impact speed along the normal [m/s]."""
     vx, vy, vz = velocity
     falling = do.most(-vz, 0.0)
     back = do.choose(falling > _STILL_M_S, falling * bounce, 0.0)
@@ -388,5 +388,5 @@ def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, 
 
 
 def _span(acceleration_m_s2: float, steps: int) -> float:
-    """Return how far a drone gets from rest in so many steps at most [m]."""
+    """Return the largest distance that a drone covers from rest in this many steps [m]."""
     return acceleration_m_s2 * STEP_S * STEP_S * steps * (steps + 1) / 2

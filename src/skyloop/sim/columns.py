@@ -1,8 +1,8 @@
-"""Numbers of all drones, one column each, which can also be read and written one drone at a time as plain floats.
+"""Tables with one column per drone, which can also be read and written drone by drone as plain floats.
 
-NumPy takes as long for three numbers as for three hundred. Of a few drones each is faster computed by itself, in plain
-floats; of many all together, in arrays. Both ways give the same bits: they do the same operations in the same order,
-and sines and cosines are NumPy's in both.
+NumPy takes as long for three numbers as for three hundred. A few drones are therefore faster one by one in plain
+floats, many together in arrays. Both ways give the same bits: they do the same operations in the same order, and sines
+and cosines are NumPy's in both.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ import numpy as np
 from skyloop.sim.streams import Floats
 
 N: TypeAlias = Any  #: a number of one drone, or an array with one of each
-FEW = 3  #: up to so many drones are computed one by one
+FEW = 3  #: up to this many drones are computed one by one
 
 
 def few(drones: int) -> bool:
-    """Whether so many drones are computed one by one."""
+    """Return whether this many drones are computed one by one."""
     return drones <= FEW
 
 
 def columns(rows: int, drones: int) -> Floats:
-    """Return zeros of shape (rows, drones), laid out for the way in which so many drones are computed."""
+    """Return zeros of shape (rows, drones), in the memory layout for this many drones."""
     return np.zeros((drones, rows)).T if few(drones) else np.zeros((rows, drones))
 
 
@@ -36,8 +36,8 @@ class Fields:
     """Consecutive rows of an array made by :func:`columns` for a few drones, as plain floats.
 
     Attributes:
-        read: Of each drone, a function that returns its numbers.
-        write: Of each drone, a function that replaces them; it takes as many numbers.
+        read: One function per drone, which returns its numbers.
+        write: One function per drone, which replaces them; takes as many numbers.
     """
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
@@ -51,11 +51,11 @@ class Fields:
 
 @dataclass(frozen=True, slots=True)
 class Operations:
-    """What is written differently for numbers and for arrays, so that one formula does for both.
+    """Operations that differ between numbers and arrays, so that one formula serves both.
 
     Attributes:
-        least: Of two values, the lesser.
-        most: Of two values, the greater.
+        least: The smaller of two values.
+        most: The larger of two values.
         root: The square root.
         choose: The second value where the first is true, else the third.
     """

@@ -1,6 +1,6 @@
-"""The firmware's outer loops: from set-points and estimates to attitude and thrust, for all drones.
+"""The firmware's outer loops: turn set-points and estimates into attitude and thrust, for all drones.
 
-The formulas are written once, for the numbers of one drone and for arrays of all.
+The formulas serve both the numbers of one drone and arrays of all.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
 
-_REFERENCE_LEAD_M = 0.5  # the altitude reference waits for a vehicle that can't follow
-_HELD_M = 0.25  # so far behind its descent, a landing drone counts as held
-_HELD_CLIMB_M_S = 0.15  # what climbs faster isn't held, but on its way
-_HELD_EASE_PER_S2 = 8.0  # of thrust, for each metre further behind
-_HELD_REGAIN = 4.0  # how much faster it counts as free again, or it would drop when nothing holds it any more
-_INTEGRATED_ERROR_M_S = 0.25  # larger errors count as this: braking from speed must not wind the integral up
-_MOST_INTEGRAL_M_S2 = 3.0  # a drone that is held by a wall stops learning here
+_REFERENCE_LEAD_M = 0.5  # the altitude reference gets no further ahead of the vehicle than this
+_HELD_M = 0.25  # a landing drone this far behind its descent counts as held
+_HELD_CLIMB_M_S = 0.15  # a drone that climbs faster is not held, but still on its way
+_HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
+_HELD_REGAIN = 4.0  # how much faster it counts as free again, or it would drop when released
+_INTEGRATED_ERROR_M_S = 0.25  # clamp of the integrated error: braking from speed must not wind the integral up
+_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, for a drone held by a wall
 
 
 _ROWS = 15  # of the table of set-points, limits and, from this row on, the loops' state:
-_STATE = 11
-_LANDING = 10
+_STATE = 11  # first row of the state
+_LANDING = 10  # row that is above 0 while landing
 
 
 @dataclass(frozen=True, slots=True)
 class _Gains:
-    """Of one drone, or of all."""
+    """Gains of one drone, or of all."""
 
     velocity: N
     integral: N
@@ -55,7 +55,7 @@ class ControlLoops:
         self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
         self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
         self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
-        # How far a landing drone is above where its descent should have brought it is the last one.
+        # The last row is a landing drone's distance above its expected descent.
         self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
         self._rows = tuple(table)
         self._by_velocity[:] = 1.0
@@ -91,7 +91,7 @@ class ControlLoops:
         self._ceiling[drone] = altitude_m
 
     def set_strength(self, share: Floats) -> None:
-        """Set the share of the full thrust that is left, (n,)."""
+        """Set the available share of the full thrust, (n,)."""
         np.multiply(self._full_thrust, share, out=self.most_thrust)
 
     def follow_velocity(self, drone: int, forward: float, left: float, climb: float, yaw_rate: float) -> None:
@@ -107,7 +107,7 @@ class ControlLoops:
         self._landing[drone] = 0.0
 
     def land(self, drone: int, descent_m_s: float) -> None:
-        """Descend on the spot, whatever set-point was in force."""
+        """Descend on the spot, whatever the set-point in force."""
         self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
         self._landing[drone] = 1.0
         self._behind[drone] = 0.0
@@ -126,11 +126,11 @@ class ControlLoops:
         self._bodies.cut(drone)
 
     def rest(self, drone: int) -> None:
-        """Rest on the legs, which hold the body level."""
+        """Stand on the legs, which hold the body level."""
         self._bodies.steady(drone)
 
     def update(self, sensors: Sensors) -> None:
-        """Compute the commands of the attitude loops and motors for one period."""
+        """Compute the inputs of attitude loops and motors for one period."""
         bodies = self._bodies
         turned: Sequence[N]
         estimate: Sequence[N]
@@ -159,14 +159,14 @@ class ControlLoops:
         estimate: Sequence[N],
         landing: bool,
     ) -> tuple[tuple[N, N, N, N], tuple[N, N, N, N]]:
-        """Return roll, pitch, yaw rate and thrust; and the loops' state after the period."""
+        """Return roll, pitch, yaw rate, thrust, and the loops' state after the period."""
         first, second, climb, yaw_rate, tilt_limit, climb_limit, *rest = inputs
         ceiling, most_thrust, running, by_velocity, held, reference, east, north, behind = rest
         sin_yaw, cos_roll, cos_pitch, cos_yaw = turned
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Roll and pitch that bring the horizontal velocity to the set-point.
+        # Roll and pitch for the horizontal velocity. The integral is in world axes, in which wind stays in turns.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S
@@ -177,7 +177,7 @@ class ControlLoops:
         pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
-        if self._any_level_brake:  # against the speed, of drones that fly by attitude
+        if self._any_level_brake:  # lean against the speed, for drones flown by attitude
             brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
@@ -197,7 +197,7 @@ class ControlLoops:
         return commands, (reference, east, north, behind)
 
     def _fall_behind(self, do: Operations, climbing: N, descent: N, behind: N) -> N:
-        """Return how far a landing drone that does not get down is behind now [m]; it takes less thrust by that."""
+        """Return how far a held landing drone is behind its descent [m]; its thrust falls with it."""
         error = climbing - descent
         held = do.choose(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
         most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2
@@ -205,6 +205,6 @@ class ControlLoops:
 
 
 def _brake(do: Operations, lean: N, set_point: N, tilt_limit: N) -> N:
-    """Return by how much more to lean in an axis than its set-point says, against the speed."""
+    """Return the additional lean against the speed in one axis, beyond the set-point."""
     share = do.most(1.0 - abs(set_point) / tilt_limit, 0.0)
     return do.least(do.most(lean, -tilt_limit), tilt_limit) * share

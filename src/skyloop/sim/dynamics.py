@@ -1,6 +1,6 @@
-"""Dynamics of quadrotors, and the wind, in fixed steps: all drones at once, one array column each; a few one by one.
+"""Dynamics of quadrotors and the wind in fixed steps: many drones at once as array columns, a few one by one.
 
-Both ways give the same bits, to which ``tests/sim/test_columns.py`` holds them.
+Both ways give the same bits; ``tests/sim/test_columns.py`` checks it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose
 from skyloop.sim.world import Wind
 
-STEP_S = 0.004
+STEP_S = 0.004  # of the simulation: 250 Hz
 
-# As arrays, with which NumPy computes faster than with numbers.
+# As arrays, since NumPy computes faster with them than with numbers.
 _STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)
-_ROWS = 32  # of the table of a body's state and inputs
+_ROWS = 32  # rows of the table of a body's state and inputs
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
-_MOST_TILTING_AIRSPEED_M_S = 3.0  # the air tilts no further beyond: no recording is faster
+_MOST_TILTING_AIRSPEED_M_S = 3.0  # no additional tilt above this airspeed, as no recording is faster
 
 
 def column(parameters: Sequence[VehicleParameters], value: Callable[[VehicleParameters], float]) -> Floats:
@@ -31,11 +31,11 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
 
 
 class BodyTable(ABC):
-    """State and inputs of the bodies, whatever moves them. Rows are axes, columns drones.
+    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns drones.
 
     Attributes:
-        position: Of the body's centre, world axes, (3, n) [m].
-        velocity: Of the body's centre, world axes, (3, n) [m/s].
+        position: Position of the body's centre, world axes, (3, n) [m].
+        velocity: Velocity of the body's centre, world axes, (3, n) [m/s].
         velocity_before: The same before the last step.
         angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
         rates: Derivatives of the angles.
@@ -45,13 +45,13 @@ class BodyTable(ABC):
         attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
         thrust_command: Input: per mass, (n,).
         air: Input: velocity of the air, (3, n).
-        commands: Of a few drones: the inputs attitude_command and thrust_command.
-        turned: Of a few drones: sine of yaw; cosines of roll, pitch, yaw.
-        moved: Of a few drones: height of the centre [m], velocity [m/s].
-        most_acceleration_m_s2: What no body exceeds unless it hits something.
+        commands: For a few drones: the inputs attitude_command and thrust_command.
+        turned: For a few drones: sine of yaw; cosines of roll, pitch, yaw.
+        moved: For a few drones: height of the centre [m], velocity [m/s].
+        most_acceleration_m_s2: An upper bound for every body without collisions.
     """
 
-    most_acceleration_m_s2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
+    most_acceleration_m_s2 = 60.0  # above thrust, gravity and drag in a headwind of 10 m/s together
 
     def __init__(self, positions: Floats, yaws: Floats) -> None:
         n = len(yaws)
@@ -71,11 +71,11 @@ class BodyTable(ABC):
 
     @abstractmethod
     def cut(self, drone: int) -> None:
-        """Stop the motors: nothing holds the attitude any more."""
+        """Stop the motors, so that nothing holds the attitude."""
 
     @abstractmethod
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, by running motors or by legs on the ground."""
+        """Hold the attitude again, with running motors or with legs on the ground."""
 
     @abstractmethod
     def step(self) -> None:
@@ -83,11 +83,11 @@ class BodyTable(ABC):
 
     @abstractmethod
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Turn a body faster about the vertical by so much, counter-clockwise from above, from this step on."""
+        """Change a body's turn rate about the vertical, counter-clockwise from above, from this step on."""
 
     @abstractmethod
     def power(self) -> Floats:
-        """Return what each drone takes from its battery now, (n,) [W]."""
+        """Return each drone's present battery power, (n,) [W]."""
 
     def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
         """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
@@ -113,7 +113,7 @@ class BodyTable(ABC):
         return rotations(self.sin, self.cos)
 
     def specific_force(self) -> Floats:
-        """Return what ideal accelerometers on the drones measure, body axes, (3, n) [m/s²]: at rest, +g along z."""
+        """Return the readings of ideal accelerometers, body axes, (3, n) [m/s²]: at rest, +g along z."""
         change = (self.velocity - self.velocity_before) / STEP_S
         change[2] += GRAVITY_M_S2
         force: Floats = np.einsum("nji,jn->in", self.rotations(), change)
@@ -121,7 +121,7 @@ class BodyTable(ABC):
 
 
 class Bodies(BodyTable):
-    """Bodies that follow their attitude as a second-order response to the command, with Euler angles as their state."""
+    """Bodies whose attitude follows the command as a second-order response, with Euler angles as their state."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
         super().__init__(positions, yaws)
@@ -132,7 +132,7 @@ class Bodies(BodyTable):
             self._moving, self._moved = Fields(table, 12, 17), Fields(table, 22, 10)
             self._each = list(enumerate(self._constants()))
         else:
-            # Views and constants that a step needs are made once: making one takes as long as computing with it.
+            # Make a step's views and constants once: making one takes as long as computing with it.
             self._a, self._b, self._squares = (np.empty((3, n)) for _ in range(3))
             self._a_rows, self._b_rows, self._square_rows = tuple(self._a), tuple(self._b), tuple(self._squares)
             self._c, self._d = np.empty(n), np.empty(n)
@@ -169,7 +169,7 @@ class Bodies(BodyTable):
         self._electronics_power = column(parameters, lambda p: p.electronics_power_w)
 
     def _constants(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-        """Return each drone's constants as plain floats, of turning and of moving."""
+        """Return each drone's constants of rotation and translation as plain floats."""
         turning = [*self._damp[1:], *self._most_change[1:], self._airspeed_tilt]
         moving = [self._motor_share, self._rotor_offset, self._rotor_height, self._ground_effect]
         moving += [*self._linear[1:], *self._quadratic[1:]]
@@ -177,22 +177,22 @@ class Bodies(BodyTable):
         return [(tuple(one), tuple(other)) for one, other in zip(*rows, strict=True)]
 
     def cut(self, drone: int) -> None:
-        """Stop the motors: nothing holds the attitude any more."""
+        """Stop the motors, so that nothing holds the attitude."""
         self._stiff[:, drone] = 0.0
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, by running motors or by legs on the ground."""
+        """Hold the attitude again, with running motors or with legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Turn a body faster about the vertical by so much."""
+        """Change a body's turn rate about the vertical."""
         self.rates[2, drone] += change_rad_s
         self.angles[2, drone] += change_rad_s * STEP_S
 
     def power(self) -> Floats:
-        """Return what each drone takes from its battery now, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
+        """Return each drone's present battery power, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
         power: Floats = self._hover_power * (self.thrust / GRAVITY_M_S2) ** 1.5 + self._electronics_power
         return power
 
@@ -205,7 +205,7 @@ class Bodies(BodyTable):
             self._move()
 
     def _step_each(self) -> None:
-        """As :meth:`_turn` and :meth:`_move`, one drone after the other."""
+        """Do the work of :meth:`_turn` and :meth:`_move` drone by drone."""
         for drone, (constants, _) in self._each:
             self._turn_one(drone, *constants)
         np.sin(self.angles, out=self.sin)
@@ -234,7 +234,7 @@ class Bodies(BodyTable):
         self._turned.write[drone](roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
 
     def _tilt_one(self, drone: int, airspeed_tilt: float) -> tuple[float, float]:
-        """As :meth:`_tilt_by_airspeed`, for one drone."""
+        """Do the work of :meth:`_tilt_by_airspeed` for one drone."""
         *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read[drone]()
         east, north = vx - air_x, vy - air_y
         speed = math.sqrt(east * east + north * north)
@@ -290,7 +290,7 @@ class Bodies(BodyTable):
         np.cos(self.angles, out=self.cos)
 
     def _tilt_by_airspeed(self) -> Floats:
-        """Roll and pitch that the air adds to what is commanded, shape (2, n): the leading side goes up."""
+        """Return the roll and pitch that the air adds to the commanded ones, shape (2, n): the leading side rises."""
         east, north = self.velocity[:2] - self.air[:2]
         sin_yaw, cos_yaw = self.sin[2], self.cos[2]
         forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
@@ -334,7 +334,7 @@ class Bodies(BodyTable):
         np.add(self.position, total, out=self.position)
 
     def _lift(self) -> Floats:
-        """Thrust with the motors' lag, raised near the floor by 1 / (1 - (R / 4h)²): Cheeseman and Bennett 1955."""
+        """Return thrust with the motors' lag, raised near the floor by 1 / (1 - (R / 4h)²): Cheeseman, Bennett 1955."""
         lift, shortfall = self._c, self._d
         np.subtract(self.thrust_command, self.thrust, out=lift)
         np.multiply(lift, self._motor_share, out=lift)
@@ -349,10 +349,10 @@ class Bodies(BodyTable):
 
 
 def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
-    """Return angular velocities about a body's axes [rad/s], from the rates of its Euler angles.
+    """Return angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
 
     Args:
-        rates: Of roll, pitch, yaw: three numbers, or three arrays.
+        rates: Rates of roll, pitch, yaw: three numbers, or three arrays.
         sin: Sines of roll, pitch, yaw.
         cos: Cosines.
     """
@@ -379,7 +379,7 @@ def rotations(sin: Floats, cos: Floats) -> Floats:
 
 
 class WindField:
-    """Velocity of the air at each drone: the world's mean, and gusts of its own, which are small beside the distances.
+    """Velocity of the air at each drone: the world's mean and independent gusts, as gusts are small in extent.
 
     Gusts are a first-order Gauss-Markov process per axis (the low-pass part of the Dryden gust model of MIL-F-8785C).
     """

@@ -1,4 +1,4 @@
-"""A simulated world as maps show it."""
+"""A simulated world's geometry for maps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from skyloop.sim.world import World
 
 
 def geometry_of(world: World) -> WorldGeometry:
-    """Return what stands in a world, without its textures and without what moves."""
+    """Return a world's fixed geometry, without textures and moving objects."""
     x, y, z = world.room.size_m
     return WorldGeometry(
         name=world.name[:64],
@@ -35,5 +35,5 @@ def geometry_of(world: World) -> WorldGeometry:
 
 
 def _rounded(place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """To millimetres: the text has to be short."""
+    """Round to millimetres, to keep the text short."""
     return round(place[0], 3), round(place[1], 3), round(place[2], 3)

@@ -1,4 +1,4 @@
-"""A world with its drones that keeps time and is rendered, for the observers of the drones: drivers and emulators."""
+"""A world with drones that keeps time and is rendered, for the drones' observers: drivers and emulators."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
     from skyloop.sim.camera_pipeline import Camera, Exposing, Screen
 
-TICK_S: Final = 0.008  #: simulated time of the steps that are done at once
+TICK_S: Final = 0.008  #: simulated time per batch of steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,26 +35,26 @@ class Report:
 
 
 class Observer(Protocol):
-    """What a host calls, on the thread that steps the world. Must return quickly and never raise."""
+    """Callbacks of a host, on the thread that steps the world. They must return quickly and never raise."""
 
     def report(self, report: Report) -> None: ...
 
     def happened(self, occurrence: Occurrence) -> None: ...
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many pictures a second of this camera are used: 0: none; infinity: all."""
+        """Return how many frames per second of this camera are used; 0: none; infinity: all."""
 
     def failed(self, error: Exception) -> None:
-        """Handle the failure of the simulation: nothing more will be reported."""
+        """Handle a failure of the simulation, after which no reports follow."""
 
 
 class SimHost:
-    """Several drones in one world, numbered from 0, each for one :class:`Observer`: a driver, or emulated firmware.
+    """Several drones in one world, numbered from 0, each with one :class:`Observer`: a driver or emulated firmware.
 
     The world is stepped while at least one observer is attached.
 
     Attributes:
-        options: Of the world and its drones.
+        options: Options of the world and its drones.
         wind: The present wind.
         simulation: The world.
     """
@@ -63,11 +63,11 @@ class SimHost:
         """Load the world and place the drones.
 
         Args:
-            options: Of the world and its drones; None takes the defaults.
-            drones: How many.
+            options: Options of the world and its drones; None takes the defaults.
+            drones: Their number.
 
         Raises:
-            UsageError: The world has no place for so many drones.
+            UsageError: The world has no room for this many drones.
             UnknownNameError: There is no such world.
             FileFormatError: The world's file is invalid.
         """
@@ -82,7 +82,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held by the thread that steps the world: one that ends may be in a step
+        self.stepping = threading.Lock()  #: held by the stepping thread, as one that is ending may be in a step
         self._lock = threading.Lock()
         self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
         self._stepper: Stepper | None = None
@@ -98,20 +98,20 @@ class SimHost:
         self.simulation.set_wind(wind)
 
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
-        """Report about a drone to an observer from now on, and render its cameras; the first observer starts the world.
+        """Start reporting a drone to an observer and rendering its cameras; the first observer starts the world.
 
         Args:
             drone: Its number.
             observer: Called on the thread that steps the world.
-            screen: Gets the cameras' frames, on the thread that renders.
+            screen: Receives the cameras' frames, on the rendering thread.
             models: The drone's cameras.
 
         Returns:
             The cameras.
 
         Raises:
-            UsageError: There is no such drone, or it has an observer already.
-            MissingExtraError: Cameras are wanted, and what renders them is not installed.
+            UsageError: No such drone, or it already has an observer.
+            MissingExtraError: Cameras are requested, and their renderer's libraries are not installed.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -125,11 +125,11 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; on return no report is under way. The last observer stops the world.
+        """Stop reporting to an observer; no report is running when this returns. The last observer stops the world.
 
         Args:
             drone: Its number.
-            observer: The one that was attached; any other is ignored.
+            observer: The attached one; any other is ignored.
         """
         with self._lock:
             entry = self._observers.get(drone)
@@ -147,7 +147,7 @@ class SimHost:
 
     @property
     def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
-        """By drone: its observer and its cameras."""
+        """Observer and cameras by drone."""
         return self._observers
 
     def _make_stepper(self) -> Stepper:
@@ -168,32 +168,32 @@ class SimHost:
 
 
 class Stepper(Protocol):
-    """What steps a host's world while an observer is attached."""
+    """Steps a host's world while an observer is attached."""
 
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Wait for the round of reports that is under way; afterwards no frame of these cameras is delivered."""
+        """Wait for the running round of reports; afterwards no frame of these cameras is delivered."""
 
 
 class ReportPublisher:
-    """Reports to the observers of a host, and exposes the cameras that are due, after each bunch of steps."""
+    """Reports to a host's observers and exposes due cameras after each batch of steps."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
         """Initialise the publisher.
 
         Args:
-            host: Whose observers are reported to.
-            make_pipeline: Creates the pipeline of cameras when the first frame is wanted.
+            host: The host of the observers.
+            make_pipeline: Creates the pipeline of cameras when the first frame is requested.
         """
-        self.pipeline: Exposing | None = None  #: created when the first frame is wanted
+        self.pipeline: Exposing | None = None  #: created when the first frame is requested
         self._host = host
         self._make_pipeline = make_pipeline
         self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish what is due.
+        """Publish due reports and exposures.
 
         Args:
             captured_ns: The time of the simulation's state, on the observers' clock.
@@ -234,7 +234,7 @@ class ReportPublisher:
 
 
 class _RealTimeStepper:
-    """A world in real time: one thread steps it and reports, one draws."""
+    """A world in real time: one thread steps it and reports, another renders."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
@@ -274,7 +274,7 @@ class _RealTimeStepper:
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
                     self._report_slowness()
-        except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not die silently
+        except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not end silently
             for observer, _ in self._host.observers.values():
                 observer.failed(error)
 

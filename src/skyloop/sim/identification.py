@@ -1,12 +1,12 @@
-"""Recorded pitch steps of a real vehicle, and the same commands flown by simulated ones.
+"""Recorded pitch steps of a real vehicle, and the same commands flown by simulated vehicles.
 
-A recording is a folder of three text files, as the control characterisation of rc500/ardrone_archive_aarons_laptop
-wrote them, one line a sample: Unix time of receipt [s] and a value.
+A recording is a folder of three text files from the control characterisation of rc500/ardrone_archive_aarons_laptop,
+with one sample per line: Unix time of receipt [s] and a value.
 
 ==================  ==================================================================================================
-``command_dump``    pitch command, -1 to 1 of the drone's own limit, negative nose down; stamped when it was sent
+``command_dump``    pitch command, -1 to 1 of the drone's own limit, negative nose down; stamped when sent
 ``theta_dump``      pitch [millidegrees], negative nose down
-``vx_dump``         forward speed as the drone estimates it [mm/s]
+``vx_dump``         the drone's own estimate of its forward speed [mm/s]
 ==================  ==================================================================================================
 """
 
@@ -29,12 +29,11 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.streams import Floats
 from skyloop.sim.world_file import parse_world
 
-#: How long after the beginning of a step the vehicles are compared.
+#: Length of the comparison from the beginning of a step.
 WINDOW_S = 3.0
-#: The recorded drone sends samples so often.
-_MAX_BYTES = 16 << 20  # of a track; an hour at 200 Hz takes 15 MB
-SAMPLE_PERIOD_S = 0.005
-#: Half a command and a whole one tilted the recorded drone equally far: from this magnitude on it tilts fully.
+_MAX_BYTES = 16 << 20  # size limit of a track; an hour at 200 Hz takes 15 MB
+SAMPLE_PERIOD_S = 0.005  #: between samples of the recorded drone
+#: Half a command tilted the recorded drone as far as a whole one: from this magnitude on it tilts fully.
 FULL_TILT_COMMAND = 0.5
 
 _HALL = parse_world("[room]\nsize = [30, 30, 10]\n", "hall")
@@ -59,9 +58,9 @@ class Recording:
     """A flight. Times are seconds of the clock that stamped them.
 
     Attributes:
-        name: Of its folder.
-        command: As recorded, but nose down positive.
-        pitch: Nose down positive [rad].
+        name: The folder's name.
+        command: As recorded, but positive nose down.
+        pitch: Positive nose down [rad].
         forward: Speed [m/s].
     """
 
@@ -76,14 +75,14 @@ class Recording:
         return [float(time) for time in self.command.times_s[changes]]
 
     def since(self, begin_s: float) -> Recording:
-        """Return the same with times that count from this one."""
+        """Return the same recording with times relative to this one."""
         tracks = (self.command, self.pitch, self.forward)
         return Recording(self.name, *(Track(track.times_s - begin_s, track.values) for track in tracks))
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What simulated vehicles did, one row each.
+    """The motion of simulated vehicles, one row each.
 
     Attributes:
         times_s: After the start of the step.
@@ -98,18 +97,18 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class SpeedEstimate:
-    """How the recorded drone's own estimate of its speed follows the speed: first order.
+    """A first-order model of the recorded drone's speed estimate.
 
     Attributes:
         lag_s: Time constant [s].
-        scale: Of the estimate; the recordings can't tell it from a pitch that reads too small by the same share.
+        scale: Factor of the estimate. The recordings can't tell it from a pitch that reads too small by the same share.
     """
 
     lag_s: float
     scale: float
 
     def of(self, response: Response) -> Floats:
-        """Return what the vehicles would report as their speed, shape (vehicles, samples) [m/s]."""
+        """Return the speed that the vehicles would report, shape (vehicles, samples) [m/s]."""
         share = 1.0 - math.exp(-STEP_S / self.lag_s)
         reported = np.empty_like(response.forward)
         last = response.forward[:, 0]
@@ -119,7 +118,7 @@ class SpeedEstimate:
         return self.scale * reported
 
 
-#: As ``scripts/identify_ardrone.py`` fits it together with the vehicle.
+#: Fitted together with the vehicle by ``scripts/identify_ardrone.py``.
 AR_DRONE_ESTIMATE = SpeedEstimate(lag_s=0.124, scale=1.15)
 
 
@@ -149,8 +148,8 @@ def read_recording(folder: Path, *, as_stamped: bool = False) -> Recording:
 
     Args:
         folder: With the files ``command_dump.dat``, ``theta_dump.dat`` and ``vx_dump.dat``.
-        as_stamped: Whether samples keep the times of receipt; otherwise they get times at which the drone can have
-            taken them, see :func:`sample_times`.
+        as_stamped: Whether samples keep their times of receipt; otherwise they get plausible sampling times, see
+            :func:`sample_times`.
 
     Raises:
         FileFormatError: A file can't be read.
@@ -169,19 +168,19 @@ def _read(path: Path) -> Track:
         try:
             time_s, value = map(float, line.split())
         except ValueError:
-            raise FileFormatError(f"{path}, line {number}: a time and a value are wanted, not {line!r:.80}") from None
+            raise FileFormatError(f"{path}, line {number}: expected a time and a value, got {line!r:.80}") from None
         rows.append((time_s, value))
     table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
-        raise FileFormatError(f"{path}: at least two lines, finite numbers and times that don't fall are wanted")
+        raise FileFormatError(f"{path}: expected at least two lines with finite numbers and times that don't fall")
     return Track(table[:, 0], table[:, 1])
 
 
 def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Floats:
-    """Estimate when samples were taken, at the latest, from when they were received.
+    """Estimate the latest possible sampling times from the times of receipt.
 
-    Each was taken a period before the one after it, or earlier. A radio link that hangs and then delivers all at once
-    makes times of receipt useless for dynamics.
+    Each sample was taken at least one period before the next one. A radio link that stalls and then delivers everything
+    at once makes times of receipt useless for dynamics.
     """
     ticks = np.arange(len(received_s)) * period_s
     latest: Floats = np.minimum.accumulate((received_s - ticks)[::-1])[::-1] + ticks
@@ -189,21 +188,21 @@ def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Float
 
 
 def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: float = WINDOW_S) -> Response:
-    """Fly a command with simulated vehicles in calm air whose sensors have no errors.
+    """Fly a command with simulated vehicles in calm air, with sensors without errors.
 
-    Each hovers, and from time 0 on gets the command as its pitch set-point: magnitudes from :data:`FULL_TILT_COMMAND`
-    on are the tilt limit. Where the command is 0 the set-point is level, which differs from hovering.
+    Each vehicle hovers, and from time 0 on gets the command as its pitch set-point: magnitudes from
+    :data:`FULL_TILT_COMMAND` on are the tilt limit. A command of 0 is a level set-point, which differs from hovering.
 
     Args:
-        command: Nose down positive.
+        command: Positive nose down.
         vehicles: At least one.
-        duration_s: How long.
+        duration_s: Length of the flight.
 
     Raises:
-        UsageError: There are no vehicles, or more than the world has room for.
+        UsageError: No vehicles, or more than fit into the world.
     """
     if not vehicles:
-        raise UsageError("at least one vehicle is wanted")
+        raise UsageError("give at least one vehicle")
     limits = Limits()
     ideal = [with_ideal_sensors(vehicle) for vehicle in vehicles]
     simulation = Simulation(_HALL, len(ideal), seed=0, parameters=ideal, limits=limits)
@@ -228,7 +227,7 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
 
 
 def _held(command: Track, times_s: Floats) -> list[float]:
-    """The command in force at these times: the last one before, and none before the first."""
+    """Return the command in force at these times: the last one before, none before the first."""
     last = np.searchsorted(command.times_s, times_s + 1e-9, side="right") - 1
     values = np.where(last < 0, 0.0, command.values[np.maximum(last, 0)])
     return [float(value) for value in values]

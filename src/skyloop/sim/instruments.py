@@ -1,6 +1,6 @@
-"""The instruments of one rotor-level drone, as its firmware reads them: each with its noise, bias, rate and delay.
+"""The instruments of one rotor-level drone as read by its firmware, with their noise, bias, rate and delay.
 
-Every world's origin is at one place on Earth, in Zürich, where PX4's simulations start by default.
+Every world's origin is the same place on Earth, in Zürich, where PX4's simulations start by default.
 """
 
 from __future__ import annotations
@@ -20,50 +20,50 @@ from skyloop.sim.world import Vec3
 
 
 class GpsFix(msgspec.Struct, frozen=True, gc=False):
-    """A fix of the satellite receiver, with its error, as old as its delay. Altitude is above mean sea level."""
+    """A satellite receiver's fix, with its error and delay. Altitude is above mean sea level."""
 
-    time_s: float  #: of the simulation, when the receiver was there
+    time_s: float  #: simulation time at which the receiver was there
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
     velocity_m_s: Vec3  #: east, north, up
-    horizontal_error_m: float  #: one standard deviation, as the receiver states it
+    horizontal_error_m: float  #: one standard deviation, as reported by the receiver
     vertical_error_m: float
     satellites: int
 
 
 class FlowSample(msgspec.Struct, frozen=True, gc=False):
-    """What a camera that looks down saw move, over an interval.
+    """Motion seen by a camera that looks down, over an interval.
 
-    Angles are about the body's forward and left axes, as if the vehicle had turned by them over ground that is far
-    away: a drone at height h that flies forward at v and turns at the rate ω about its left axis sees ω - v/h; one that
-    flies left at v and turns at ω about its forward axis sees ω + v/h.
+    Angles are about the body's forward and left axes, as if the vehicle had turned by them over very distant ground. A
+    drone at height h that flies forward at v and turns at the rate ω about its left axis sees ω - v/h; one that flies
+    left at v and turns at ω about its forward axis sees ω + v/h.
     """
 
     interval_s: float
     about_forward_rad: float
     about_left_rad: float
-    gyro_forward_rad: float  #: what the gyro turned in the interval, about the same axes
+    gyro_forward_rad: float  #: the gyro's rotation in the interval, about the same axes
     gyro_left_rad: float
-    quality: float  #: 0 to 1; at 0 there is nothing to be seen, and the angles are 0
+    quality: float  #: 0 to 1; at 0 nothing is visible and the angles are 0
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Readings of one drone's instruments at one time, and its true state beside them.
+    """Readings of one drone's instruments at one time, together with its true state.
 
     Body axes are forward, left, up; world axes east, north, up. Barometer, magnetometer and range finder keep their
-    newest sample until the next.
+    newest sample until the next one.
     """
 
-    time_s: float  #: of the simulation
+    time_s: float  #: simulation time
     gyro_rad_s: Vec3
     acceleration_m_s2: Vec3  #: specific force: at rest, +g along z
     pressure_pa: float
     temperature_c: float
     magnetic_gauss: Vec3  #: body axes
-    gps: GpsFix | None  #: a new fix, only in the step in which it comes
-    range_m: float | None  #: down along the body's axis to the floor or something solid; None out of reach
-    flow: FlowSample | None  #: a new sample, only in the step in which it comes
+    gps: GpsFix | None  #: a new fix, only in the step of its arrival
+    range_m: float | None  #: down along the body's axis to the floor or a solid; None out of range
+    flow: FlowSample | None  #: a new sample, only in the step of its arrival
     battery_v: float
     battery_a: float
     position_m: Vec3  #: true, of the body's centre
@@ -76,29 +76,29 @@ class Firmware(Protocol):
     """Flies one drone of a simulation: see :meth:`~skyloop.sim.simulation.Simulation.fly_by`."""
 
     def exchange(self, readings: Readings) -> Sequence[float] | None:
-        """Take the readings of a step and return what the rotors do in it.
+        """Process the readings of a step and return the rotor commands for it.
 
-        Called once per step of the plant (1 ms) on the thread that steps the simulation, which holds its lock: it must
-        return in bounded time, and call no method of the simulation.
+        Called once per step of the plant (1 ms) on the thread that steps the simulation, with the simulation's lock
+        held: it must return in bounded time and call no method of the simulation.
 
         Args:
-            readings: At the begin of the step.
+            readings: The readings at the beginning of the step.
 
         Returns:
-            Commands of the rotors, 0 (stands) to 1 (full): front left, front right, rear left, rear right; what is
-            beyond is clamped. None: no new ones, the last stay in force.
+            Commands of the rotors, 0 (stopped) to 1 (full): front left, front right, rear left, rear right; values
+            beyond are clamped. None keeps the last commands.
 
         Raises:
-            Exception: What it raises, ends the step, and is raised by :meth:`Simulation.step`.
+            Exception: Any exception ends the step, and :meth:`Simulation.step` raises it.
         """
         ...
 
 
-LATITUDE_DEG: Final = 47.397742  #: of the worlds' origin, WGS 84
+LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
 LONGITUDE_DEG: Final = 8.545594
-ALTITUDE_M: Final = 488.0  #: of the worlds' floor above mean sea level
+ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
-#: Of the Earth there, east, north, up: the World Magnetic Model 2025, at the beginning of 2026.
+#: The Earth's field there, east, north, up: the World Magnetic Model 2025, at the beginning of 2026.
 MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
 
 _EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
@@ -118,16 +118,16 @@ _DEG_PER_EAST_M = math.degrees(1 / ((_NORMAL_M + ALTITUDE_M) * math.cos(math.rad
 
 
 def geodetic(position_m: Vec3) -> Vec3:
-    """Return latitude, longitude [deg] and altitude above mean sea level [m] of a place, world axes.
+    """Return latitude, longitude [deg] and altitude above mean sea level [m] of a position in world axes.
 
-    The Earth counts as flat: a kilometre away that is wrong by less than 0.1 m.
+    The Earth counts as flat; at a distance of one kilometre the error is below 0.1 m.
     """
     east, north, up = position_m
     return LATITUDE_DEG + north * _DEG_PER_NORTH_M, LONGITUDE_DEG + east * _DEG_PER_EAST_M, ALTITUDE_M + up
 
 
 def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-    """Return the place in world axes: the inverse of :func:`geodetic`."""
+    """Return the position in world axes: the inverse of :func:`geodetic`."""
     north = (latitude_deg - LATITUDE_DEG) / _DEG_PER_NORTH_M
     return (longitude_deg - LONGITUDE_DEG) / _DEG_PER_EAST_M, north, altitude_m - ALTITUDE_M
 
@@ -138,24 +138,24 @@ def pressure_pa(height_m: float) -> float:
     return float(_SEA_LEVEL_PA * share**_EXPONENT)
 
 
-#: Distance from a point along a unit vector, both in world axes, to the first solid thing; infinite without any.
+#: Distance from a point along a unit vector, both in world axes, to the first solid; infinite without one.
 Ranging = Callable[[Vec3, Vec3], float]
 
-_AHEAD = 256  # samples whose noise is drawn at once
+_NOISE_BLOCK = 256  # number of samples with noise drawn in one call
 _WANDER_STEPS = 100  # biases change at 10 Hz
-_LEAST_FLOW_M = 0.08  # nearer, the image is out of focus
-_GPS_VERTICAL = 1.7  # how much worse a receiver is vertically
+_LEAST_FLOW_M = 0.08  # closer than this, the image is out of focus
+_GPS_VERTICAL = 1.7  # factor of the vertical error over the horizontal one
 _SATELLITES = 14
 
 
 class Instruments:
-    """One drone's instruments. Random numbers of each are a stream of its own.
+    """One drone's instruments, each with its own stream of random numbers.
 
     Args:
         vehicle: The drone, with rotors.
         drone: Its number.
-        seed: Of the simulation.
-        ranging: What is below.
+        seed: The simulation's seed.
+        ranging: Measures distances to the surroundings.
     """
 
     def __init__(self, vehicle: VehicleParameters, drone: int, seed: int, ranging: Ranging) -> None:
@@ -189,12 +189,12 @@ class Instruments:
             )
         )
         self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
-        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step in which it comes
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step of its arrival
         self._magnetic: Vec3 = (0.0, 0.0, 0.0)
         self._pressure_pa = 0.0
         self._below_m = math.inf
         self._range_m: float | None = None
-        self._turned = (0.0, 0.0, 0.0, 0.0)  # since the last flow sample, about forward and left: truly, by the gyro
+        self._turned = (0.0, 0.0, 0.0, 0.0)  # since the last flow sample, about forward and left: true, then gyro
         self._first = -1
 
     def read(
@@ -208,7 +208,7 @@ class Instruments:
         battery_v: float,
         battery_a: float,
     ) -> Readings:
-        """Return the readings of a step of the plant; called for each step in turn."""
+        """Return the readings of a step of the plant; call it for every step in order."""
         if step % _WANDER_STEPS == 0:
             self._bias = next(self._wandering)
         errors, bias = self._errors, self._bias
@@ -310,16 +310,16 @@ def _to_body(quaternion: tuple[float, float, float, float], vector: Vec3) -> Vec
 
 
 def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[float, ...]]:
-    """Yield standard normal numbers for ever, so many at a time."""
+    """Yield standard normal numbers endlessly, ``count`` at a time."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
     while True:
-        yield from map(tuple, generator.standard_normal((_AHEAD, count)).tolist())
+        yield from map(tuple, generator.standard_normal((_NOISE_BLOCK, count)).tolist())
 
 
 def _wandering(
     seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constants_s: np.typing.NDArray[np.float64]
 ) -> Iterator[list[float]]:
-    """Yield biases for ever: first-order Gauss-Markov processes, every :data:`_WANDER_STEPS`."""
+    """Yield biases endlessly: first-order Gauss-Markov processes, every :data:`_WANDER_STEPS`."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + 7)
     keep = np.exp(-_WANDER_STEPS * PLANT_STEP_S / constants_s)
     fresh = np.sqrt(1.0 - keep * keep)

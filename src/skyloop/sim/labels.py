@@ -1,7 +1,7 @@
-"""True image boxes of what a simulated camera sees, with the share that is not hidden: for training, tests, benchmarks.
+"""True image boxes of objects in a simulated camera's view, with their visible share: for training, tests, benchmarks.
 
-Drawn with the renderer's own geometry, without colours: which target or crate each pixel shows, and which pixels it
-would cover with nothing in front.
+Drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the pixels that
+each would cover without occlusion.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import FigureTarget, TargetState, World
 
-CLASS_NAMES = ("person", "car", "box")  #: of labels; a board or a platform has its own, which is not among them
-_CLEAR_M = 0.35  # of a camera from solids
-_LONGEST_STEP_S = 20.0  # between two pictures of ``pictures``; tracks keep no more than 60 s
+CLASS_NAMES = ("person", "car", "box")  #: label classes; boards and platforms have other ones
+_CLEAR_M = 0.35  # between a camera and solids
+_LONGEST_STEP_S = 20.0  # between two pictures of ``pictures``; tracks keep only 60 s
 
 
 @dataclass(frozen=True, slots=True)
 class TargetBox:
-    """Where a thing is in an image.
+    """An object's box in an image.
 
     Attributes:
-        name: Of the target or box in its world.
+        name: Name of the target or box in its world.
         class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
-        box: x, y of the upper left corner, width and height [pixel], of all of it within the image, hidden or not.
-        visible: Share of its pixels within the image that nothing hides, 0 to 1.
+        box: x, y of the upper left corner, width and height [pixel], of its whole extent within the image.
+        visible: Share of its pixels within the image that are not occluded, 0 to 1.
         cut: Whether the image's edge may cut it off: it reaches the outermost pixels.
     """
 
@@ -50,10 +50,10 @@ class TargetBox:
 
 
 class Labeller:
-    """Finds the boxes of one scene. Keeps buffers, so it is for one thread at a time.
+    """Finds the boxes in one scene. Reuses buffers, so use it from one thread at a time.
 
     Args:
-        scene: What is seen.
+        scene: The scene.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -68,12 +68,12 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate that has a pixel in the image, hidden or not; targets first.
+        """Return the box of every target and crate with a pixel in the image, hidden or not; targets first.
 
         Args:
-            state: The poses of everything that moves.
-            pose: Of the camera.
-            model: Of the camera.
+            state: The poses of all moving objects.
+            pose: The camera's pose.
+            model: The camera's model.
 
         Raises:
             UsageError: The state does not fit the scene, or the model's distortion can't be inverted.
@@ -107,7 +107,7 @@ class Labeller:
 
 
 def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-    """Return the box of every target and crate that has a pixel in the image; see :meth:`Labeller.boxes`."""
+    """Return the box of every target and crate with a pixel in the image; see :meth:`Labeller.boxes`."""
     return Labeller(scene).boxes(state, pose, model)
 
 
@@ -121,22 +121,22 @@ def pictures(
     camera: CameraModel | None = None,
     tilt_rad: float | None = None,
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
-    """Yield images of a world from random places at random times, with their labels.
+    """Yield labelled images of a world from random positions at random times.
 
-    Cameras are 0.7 to 3 m high, outside of solids; two of three look roughly at some target. They are pitched by at
-    most 15° and hardly rolled, or as ``tilt_rad`` says.
+    Cameras are 0.7 to 3 m high, outside of solids; two thirds look roughly at a target. Pitch is at most 15° and roll
+    small, unless ``tilt_rad`` sets both.
 
     Args:
         world: The world.
-        seed: Decides places and times.
-        count: How many images.
+        seed: Determines positions and times.
+        count: Number of images.
         size: Width and height [pixel].
         focal_share: Focal length as a share of the width.
-        camera: The camera, instead of ``size`` and ``focal_share``; the flaws of its sensor are left out.
-        tilt_rad: Pitch and roll are anything within ± this.
+        camera: The camera, instead of ``size`` and ``focal_share``; without the flaws of its sensor.
+        tilt_rad: Pitch and roll are random within ± this.
 
     Raises:
-        UsageError: An argument is out of its range, or the world leaves no room for a camera.
+        UsageError: An argument is out of its range, or the world has no room for a camera.
     """
     width, height = size
     if isinstance(count, bool) or not isinstance(count, int) or count < 0:
@@ -186,4 +186,4 @@ def _camera(
         if tilt_rad is not None:
             pitch, roll = (float(angle) for angle in rng.uniform(-tilt_rad, tilt_rad, 2))
         return place, rotation_from_euler(roll, pitch, yaw)
-    raise UsageError(f"world {world.name!r} has no free place for a camera between 0.7 and 3 m")
+    raise UsageError(f"world {world.name!r} has no free position for a camera between 0.7 and 3 m")

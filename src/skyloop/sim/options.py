@@ -1,4 +1,4 @@
-"""Options of a simulated world and its drones, and how it keeps pace with a clock."""
+"""Options of a simulated world and its drones, and the pacing of a simulation by a clock."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-#: What simulated vehicles do by themselves; to places, and back to their start, the proxy flies them.
+#: The simulated vehicles' own actions; for positions and the return to the start the proxy flies them.
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
-MOST_LAG_S: Final = 0.25
+MOST_LAG_S: Final = 0.25  #: default lag behind the clock beyond which steps are skipped
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,22 +28,22 @@ class SimOptions:
 
     Attributes:
         world: Name of a shipped world, or path of a world file.
-        seed: Of all noise and gusts.
-        speed: Of simulated time, relative to real time.
-        cameras: Of each drone.
+        seed: Seed of all noise and gusts.
+        speed: Simulated time per real time.
+        cameras: The cameras of each drone.
         noise: Factor of the sensors' noise and biases.
         wind: Factor of the world's wind.
         battery: Charge at the start, 0 to 1.
-        quality: Of the images: ``fast``, ``smooth`` or ``best``.
+        quality: Image quality: ``fast``, ``smooth`` or ``best``.
         native: Actions that the drone's driver supports natively.
         position: Whether the drone reports its position.
-        velocity: Whether the drone reports its velocity; it flies by it all the same.
-        truth: Whether the drone reports its true state too.
-        rate_hz: Of the reports.
-        most_lag_s: How far the world may be behind the clock before it gives the rest up [s].
-        parameters: Of the vehicles.
+        velocity: Whether the drone reports its velocity, which it uses for its flight in any case.
+        truth: Whether the drone also reports its true state.
+        rate_hz: Reports per second.
+        most_lag_s: How far the world may fall behind the clock before it skips the rest [s].
+        parameters: The vehicles' parameters.
         autopilot: The real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
-        autopilot_folder: Where the firmware keeps its settings; None: they last as long as the drone.
+        autopilot_folder: The folder for the firmware's settings; None: they last as long as the drone.
     """
 
     world: str = "room"
@@ -68,7 +68,7 @@ class SimOptions:
         """Load the world.
 
         Raises:
-            UnknownNameError: There is no such world.
+            UnknownNameError: No such world.
             FileFormatError: The world's file is invalid.
         """
         return load_world(self.world, self.seed)
@@ -84,16 +84,16 @@ class SimOptions:
         return with_scaled_flaws(self.parameters, self.noise)
 
 
-_LONGEST_RUN_STEPS = 25
-SLOW_SHARE = 0.95  #: a simulation that reaches less of its speed is too slow,
-SLOW_NS = 5 * NS_PER_S  #: over this time,
-SLOW_AGAIN_NS = 60 * NS_PER_S  #: which is said again after this one
+_LONGEST_RUN_STEPS = 25  # per call at real time
+SLOW_SHARE = 0.95  #: a simulation below this share of its speed is too slow,
+SLOW_NS = 5 * NS_PER_S  #: measured over this time;
+SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
 
 
 class Pacer:
-    """Runs the steps that are due, by absolute deadlines: step k is due at start + k · STEP_S / speed.
+    """Runs the due steps by absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are caught up. Beyond ``most_lag_s`` of the clock, the rest is given up, counted in ``lost_s``, and the
+    Small delays are caught up. Beyond a lag of ``most_lag_s`` the rest is skipped, counted in ``lost_s``, and the
     deadlines move. Not thread-safe: one thread owns it::
 
         while not stop.wait(pacer.run_due()):
@@ -108,7 +108,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """``step(n)`` does n steps. ``speed`` is how many seconds of simulation a second of the clock is worth."""
+        """Take ``step(n)``, which does n steps, and ``speed``, the seconds of simulation per second of the clock."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step
@@ -118,13 +118,13 @@ class Pacer:
         self._most_lag_ns = most_lag_s * NS_PER_S
         self._start_ns = clock()
         self._done = 0
-        self.lost_s = 0.0  # of the clock, given up so far
+        self.lost_s = 0.0  # clock time skipped so far
 
     def run_due(self) -> float:
-        """Do the steps that are due, some at a time.
+        """Run the due steps in batches.
 
         Returns:
-            How long to wait until the next step [s]; 0 if one is due.
+            The time until the next step [s]; 0 if one is due.
         """
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
@@ -134,7 +134,7 @@ class Pacer:
             self._start_ns += round(excess)
             self.lost_s += excess / NS_PER_S
             behind -= round(excess)
-        # At high speeds a run is longer, so that the caller isn't asked for every step.
+        # At high speeds a batch is longer, so that the caller isn't called for every step.
         most = max(_LONGEST_RUN_STEPS, int(_LONGEST_RUN_STEPS * self._speed))
         steps = min(int(behind / self._ns_per_step) + 1, most)
         self._step(steps)
@@ -142,13 +142,13 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Convert a time of the simulation to the clock, by the present deadlines.
+        """Convert a simulation time to the clock, by the present deadlines.
 
         Args:
             time_s: Since this pacer's start.
 
         Returns:
-            When the simulation was, or will be, at that time.
+            The clock's time when the simulation was, or will be, at that time.
         """
         return self._due_ns(time_s / STEP_S)
 
@@ -157,10 +157,10 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Finds that a computer is too slow for a simulation, by what its :class:`Pacer` gave up. Pure.
+    """Detects a computer too slow for a simulation, from the time that its :class:`Pacer` skipped. Pure.
 
     Args:
-        now_ns: When the simulation begins.
+        now_ns: Start of the simulation.
     """
 
     def __init__(self, now_ns: int) -> None:
@@ -169,10 +169,10 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the share of its speed that the simulation reaches, when that is to be said; usually None.
+        """Return the achieved share of the simulation's speed when a warning is due; usually None.
 
         Args:
-            lost_s: What was given up so far.
+            lost_s: Time skipped so far.
             now_ns: The present time.
         """
         passed_ns = now_ns - self._since_ns

@@ -1,12 +1,12 @@
-"""Parameters of a simulated vehicle: of its flight, its rotors and its instruments.
+"""Parameters of a simulated vehicle: its flight, its rotors and its instruments.
 
-The defaults are an AR.Drone 2 with its indoor hull, as far as public sources state; a value without a source is an
-estimate and says so.
+The defaults are an AR.Drone 2 with its indoor hull, as far as public sources go; values without a source are marked as
+estimates.
 
 Sources: [P] Parrot, AR.Drone 2.0 technical specifications. [E] J. Engel, J. Sturm, D. Cremers, "Camera-Based
-Navigation of a Low-Cost Quadrocopter", IROS 2012, with the constants c1 … c7 identified from flights that its published
-program ``tum_ardrone`` uses. [C] I. C. Cheeseman, W. E. Bennett, "The Effect of the Ground on a Helicopter Rotor in
-Forward Flight", ARC R&M 3021, 1955. [S] AR.Drone SDK 2.0.1, default configuration.
+Navigation of a Low-Cost Quadrocopter", IROS 2012, with the constants c1 … c7 identified from flights, as used in its
+published program ``tum_ardrone``. [C] I. C. Cheeseman, W. E. Bennett, "The Effect of the Ground on a Helicopter Rotor
+in Forward Flight", ARC R&M 3021, 1955. [S] AR.Drone SDK 2.0.1, default configuration.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tu
 class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
-    ``noise`` is the standard deviation of a sample, ``bias`` that of an error that a flight starts with and that
-    wanders with the time constant, the gyro's with its own. ``docs/rotors.md`` says where the defaults come from.
+    ``noise`` is the standard deviation of a sample. ``bias`` is that of a flight's initial error, which wanders
+    with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
 
     Raises:
-        UsageError: A value is not finite or negative, or zero where it has to be more.
+        UsageError: A value is not finite, negative, or zero where it must be positive.
     """
 
     gyro_noise_rad_s: float = 0.002
@@ -71,25 +71,25 @@ class InstrumentParameters:
 class RotorParameters:
     """Rotors, air, inertia and power train of a quadrotor.
 
-    A rotor that turns at ω gives the thrust ``thrust_n_s2`` ω², and ``torque_m`` times that as torque. It follows its
-    command with a first-order lag. A command of 0 stops it; above, its speed is between ``idle_speed_rad_s`` and
-    ``full_speed_rad_s`` in proportion, both with a full battery: speed falls with the voltage.
+    A rotor that turns at ω produces the thrust ``thrust_n_s2`` ω², and a torque of ``torque_m`` times that. It follows
+    its command with a first-order lag. A command of 0 stops it; above, its speed is between ``idle_speed_rad_s`` and
+    ``full_speed_rad_s`` in proportion. Both are for a full battery: speed falls with the voltage.
 
     Attributes:
-        places_m: Of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
-        inertia_kg_m2: About the body's axes.
+        places_m: Positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
+        inertia_kg_m2: Moments of inertia about the body's axes.
         thrust_n_s2: Thrust per square of the speed.
         torque_m: Torque per thrust.
-        idle_speed_rad_s: Of a rotor that just turns.
-        full_speed_rad_s: Of a rotor at full command.
-        speed_up_s: Time constant of a rotor that gets faster.
-        speed_down_s: And of one that gets slower.
+        idle_speed_rad_s: Lowest speed of a running rotor.
+        full_speed_rad_s: Speed at full command.
+        speed_up_s: Time constant of an accelerating rotor.
+        speed_down_s: Time constant of a decelerating rotor.
         rotor_drag_kg: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the
-            rotors' speeds: blades flap, and their own drag is lopsided.
-        rotor_inflow_kg: The same along the rotors' axes: air from above takes thrust away.
+            rotors' speeds: from blade flapping and the blades' asymmetric drag.
+        rotor_inflow_kg: The same along the rotors' axes: air from above reduces thrust.
         body_drag_kg_m: Force per square of the airspeed, along the body's axes.
-        rotor_inertia_kg_m2: Of one rotor about its axis: a rotor that gets faster turns the body the other way.
-        efficiency: Share of the battery's power that the rotors' shafts give to the air as torque times speed.
+        rotor_inertia_kg_m2: Inertia of one rotor about its axis: an accelerating rotor turns the body the other way.
+        efficiency: Share of the battery's power that reaches the air as torque times speed of the rotors' shafts.
         instruments: Errors of the instruments.
 
     Raises:
@@ -167,32 +167,32 @@ class VehicleParameters:
     """
 
     # Body
-    mass_kg: float = 0.42  # with indoor hull [P]; only collisions between drones use it: all else is per mass
+    mass_kg: float = 0.42  # with indoor hull [P]; only collisions between drones use it: everything else is per mass
     radius_m: float = 0.26  # of the hull, 517 mm across [P]
     half_height_m: float = 0.06  # of the hull, estimate
     linear_drag_per_s: float = 0.45  # with the next: 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: as horizontally
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: three times the area seen from above
-    # How far the air that the vehicle flies into lifts its leading side, against attitude loops that don't take it out:
-    # this angle times the square of the horizontal airspeed, up to 3 m/s. Blades flap, and hulls catch the wind.
+    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it: this angle
+    # times the square of the horizontal airspeed, up to 3 m/s. Its causes are blade flapping and wind on the hull.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
     rotor_radius_m: float = 0.10  # 8 inch propellers [P]
-    rotor_height_m: float = 0.05  # of the rotors above the feet, estimate: what the ground effect goes by
+    rotor_height_m: float = 0.05  # of the rotors above the feet, for the ground effect; estimate
     ground_effect: float = 1.0  # share of the effect of one rotor of this radius [C]; 0 switches it off
     motor_time_constant_s: float = 0.06  # estimate
-    most_thrust: float = 1.9  # of the weight, battery full; estimate
-    least_thrust: float = 0.3  # of the weight, while the motors run; estimate
+    most_thrust: float = 1.9  # as a share of the weight, with a full battery; estimate
+    least_thrust: float = 0.3  # as a share of the weight, while the motors run; estimate
 
     # Inner loops
     attitude_frequency_rad_s: float = 16.0  # with the damping: a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
-    # By roll and pitch set-points near level, firmware may lean against the speed on its own: this deceleration per
-    # speed when the set-point is level, less in proportion to it, and none at the full tilt.
+    # With roll and pitch set-points near level, firmware may lean against the speed: this deceleration per speed at a
+    # level set-point, proportionally less with tilt, and none at the full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
@@ -209,8 +209,8 @@ class VehicleParameters:
     hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, less the electronics
     electronics_power_w: float = 5.0  # estimate
 
-    # Sensors: standard deviations of noise, and of biases that wander with the time constant. Estimates of the
-    # order of consumer parts.
+    # Sensors: standard deviations of noise, and of biases that wander with the time constant. Estimates for
+    # consumer parts.
     gyro_noise_rad_s: float = 0.01
     gyro_bias_rad_s: float = 0.005
     accelerometer_noise_m_s2: float = 0.15
@@ -226,12 +226,12 @@ class VehicleParameters:
     bias_time_constant_s: float = 40.0
 
     # Damage
-    crash_speed_m_s: float = 3.0  # into something solid, along its normal: faster is a crash, and the motors stop
-    restitution: float = 0.35  # share of the speed along the normal that is left after a bounce, estimate
+    crash_speed_m_s: float = 3.0  # along a solid's normal; a faster impact is a crash and stops the motors
+    restitution: float = 0.35  # share of the normal speed after a bounce, estimate
     friction: float = 0.5  # Coulomb, estimate
 
-    #: For a vehicle that is modelled down to its rotors (``docs/rotors.md``); None models its response as a whole. With
-    #: rotors, drag, motor time constant and hover power above have no effect: the rotors' own count.
+    #: For a vehicle modelled down to its rotors (``docs/rotors.md``); None models its response as a whole. With rotors,
+    #: the drag, motor time constant and hover power above have no effect; the rotors' own values count.
     rotors: RotorParameters | None = None
 
     def __post_init__(self) -> None:

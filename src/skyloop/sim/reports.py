@@ -1,4 +1,4 @@
-"""What a simulation reports about its drones: their own estimates, the truth, and what happened."""
+"""Reports of a simulation about its drones: their own estimates, the truth, and occurrences."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from skyloop.sim.world import Vec3
 
 @dataclass(frozen=True, slots=True)
 class VehicleFeedback:
-    """A drone's estimates, with the noise and biases of its sensors.
+    """A drone's estimates, with its sensors' noise and biases.
 
     Angles: roll right side down, pitch nose down, yaw counter-clockwise from east, within ±π.
     """
 
-    time_s: float  #: of the simulation
+    time_s: float  #: simulation time
     state: FlightState
-    emergency_reason: str  #: why the motors were cut; empty in other states
-    battery: float  #: charge left, 0 to 1
+    emergency_reason: str  #: reason for cut motors; empty in other states
+    battery: float  #: remaining charge, 0 to 1
     battery_v: float
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
-    altitude_m: float  #: of the feet above the floor
+    altitude_m: float  #: height of the feet above the floor
     velocity_m_s: Vec3  #: forward, left, up, in the levelled axes
     angular_velocity_rad_s: Vec3  #: about the body's axes
     acceleration_m_s2: Vec3  #: specific force along the body's axes: +g along z at rest
@@ -36,25 +36,25 @@ class VehicleTruth:
 
     time_s: float
     state: FlightState
-    position_m: Vec3  #: of the body's centre
+    position_m: Vec3  #: position of the body's centre
     velocity_m_s: Vec3
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
     quaternion: tuple[float, float, float, float]  #: x, y, z, w, world from body
     angular_velocity_rad_s: Vec3  #: about the body's axes
-    thrust: float  #: of the weight, before ground effect
+    thrust: float  #: as a share of the weight, before ground effect
     wind_m_s: Vec3
-    battery: float  #: charge left, 0 to 1
+    battery: float  #: remaining charge, 0 to 1
 
 
 class OccurrenceKind(StrEnum):
-    """What can happen to a drone."""
+    """Kinds of occurrences."""
 
     COLLISION = "collision"
     EMERGENCY = "emergency"
     BATTERY_LOW = "battery_low"
-    SLOW = "slow"  #: to all: the computer is too slow for the speed that was asked for
+    SLOW = "slow"  #: for all drones: the computer is too slow for the requested speed
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
-"""Formulas of the rotor-level model, written once for the numbers of one drone and for arrays of all. Pure.
+"""Formulas of the rotor-level model, for the numbers of one drone as well as for arrays of all. Pure.
 
-Body axes: forward x, left y, up z. Sums, products, quotients and square roots only, which give the same bits for
+Body axes: forward x, left y, up z. Only sums, products, quotients and square roots, which give the same bits for
 numbers and arrays.
 
 Sources: [M] R. Mahony, V. Kumar, P. Corke, "Multirotor Aerial Vehicles: Modeling, Estimation, and Control of
@@ -24,11 +24,11 @@ from skyloop.errors import UsageError
 from skyloop.sim.columns import N, Operations
 from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, VehicleParameters
 
-PLANT_STEP_S = 0.001  #: of the rotor-level model and its instruments
+PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # the mixer asks slower rotors for more than it wants, to have it with this time constant
+_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
 _YAW_SHARE = 0.25  # of the rotors' range of thrust that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -98,7 +98,7 @@ def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
     """Return a vehicle's rotors.
 
     Raises:
-        UsageError: It has none: it is modelled by its response as a whole.
+        UsageError: It has none, as its response is modelled as a whole.
     """
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
@@ -111,7 +111,7 @@ def constants_of(vehicle: VehicleParameters) -> Constants:
     ix, iy, iz = rotors.inertia_kg_m2
     mass, k = vehicle.mass_kg, rotors.thrust_n_s2
     (x1, y1), (x2, y2), (x3, y3), (x4, y4) = rotors.places_m
-    # What each rotor must give for a sum of thrusts and torques about x, y and z.
+    # Each rotor's share of a sum of thrusts and torques about x, y and z.
     rows = [[1.0] * 4, [y1, y2, y3, y4], [-x1, -x2, -x3, -x4], [rotors.torque_m * sign for sign in YAW_SIGNS]]
     share = np.linalg.inv(np.array(rows))
     roll, pitch, yaw = (share[:, 1] * ix).tolist(), (share[:, 2] * iy).tolist(), (share[:, 3] * iz).tolist()
@@ -193,7 +193,7 @@ def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Fou
     """Spin the rotors towards other speeds for a step of :data:`PLANT_STEP_S`.
 
     Returns:
-        Their speeds, and by how much the body turns faster about z for that, per time.
+        Their speeds, and the reaction on the body: its angular acceleration about z.
     """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
@@ -221,11 +221,11 @@ def advance(
         do: The operations.
         c: The constants.
         turning: Quaternion (w, x, y, z; world from body) and body rates.
-        speeds: Of the rotors, which hold through the step.
+        speeds: Rotor speeds, constant during the step.
         twist: See :func:`spin`.
         motion: Velocity of the air, position, velocity; world axes.
-        knock: Acceleration, world axes, by which what the body touches changed its velocity in the last step.
-        legs: Whether anything may stand, or lie, on something: then that turns it onto its feet.
+        knock: Acceleration, world axes, by which contacts changed the body's velocity in the last step.
+        legs: Whether any drone may stand or lie on something, which then turns it onto its feet.
 
     Returns:
         Quaternion and body rates; position and velocity; the specific force along the body's axes in the step; and the
@@ -237,7 +237,7 @@ def advance(
     knock_x, knock_y, knock_z = knock
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(w, x, y, z)
 
-    # The air along the body's axes, and at each rotor along its own: the force of a rotor is [M], less inflow [S].
+    # The air along the body's axes, and at each rotor along its own: a rotor's force is that of [M], less inflow [S].
     east, north, up = vx - air_x, vy - air_y, vz - air_z
     ahead = r00 * east + r10 * north + r20 * up
     aside = r01 * east + r11 * north + r21 * up
@@ -252,7 +252,7 @@ def advance(
     t4 = t4 - inflow * s4 * (along + p * c.y4 - q * c.x4)
     thrust = t1 + t2 + t3 + t4
 
-    # Near the floor it is raised by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow down.
+    # Near the floor it is raised by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow downwards.
     shortfall = c.ground_effect / do.most(pz + c.rotor_offset, c.rotor_height)
     lift = thrust / (1.0 - shortfall * shortfall * do.most(r22, 0.0))
     flapping = c.rotor_drag * (s1 + s2 + s3 + s4)
@@ -264,7 +264,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # They push with what carries the body, at arm's length at most.
+        # The legs push with the supporting force, at arm's length at most.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
@@ -293,18 +293,18 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the speeds to command to the rotors, so that they turn the body as wanted, and lift it.
+    """Return the rotor speeds to command, for turning the body as wanted and lifting it.
 
-    Where the rotors cannot do all, roll and pitch come first, then the thrust, and yaw has a share.
+    If the rotors cannot do everything, roll and pitch come first, then the thrust; yaw gets a share.
 
     Args:
         do: The operations.
         c: The constants.
-        rates: About the body's axes.
-        speeds: Of the rotors.
-        wanted: What they should be.
-        thrust: Per mass; at 0 the rotors stand.
-        sag: Voltage of the battery, as a share of a full one's.
+        rates: Rates about the body's axes.
+        speeds: Rotor speeds.
+        wanted: The target rates.
+        thrust: Per mass; at 0 the rotors stop.
+        sag: Voltage of the battery, as a share of the full one.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -314,7 +314,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
     dr = _within(do, (want_r - r) * c.yaw_gain, most) + c.gyroscopic_z * p * q
     k, slowest, fastest = c.thrust, c.idle_speed * sag, c.full_speed * sag
     least, range_n = k * slowest * slowest, k * (fastest * fastest - slowest * slowest)
-    # All four take the same share of yaw, so that one of them tells whether it is too much.
+    # All four have the same share of yaw, so that one of them shows whether it is too much.
     yaw = _within(do, dr * c.yaw1, range_n * _YAW_SHARE) / c.yaw1
     d1 = dp * c.roll1 + dq * c.pitch1 + yaw * c.yaw1
     d2 = dp * c.roll2 + dq * c.pitch2 + yaw * c.yaw2
@@ -339,7 +339,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
 
 
 def electric_power(c: Constants, speeds: Four) -> N:
-    """Return what the rotors at these speeds and the electronics take from the battery [W]."""
+    """Return the battery power for the rotors at these speeds and the electronics [W]."""
     s1, s2, s3, s4 = speeds
     return (s1 * s1 * s1 + s2 * s2 * s2 + s3 * s3 * s3 + s4 * s4 * s4) * c.shaft_power + c.electronics_power
 
@@ -350,12 +350,12 @@ def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tup
     Args:
         do: The operations.
         c: The constants.
-        power: That is taken [W].
+        power: Drawn from the battery [W].
         unloaded: Its voltage without load [V].
         voltage: Its voltage before.
     """
     current = power / do.most(voltage, 1.0)
-    # No battery gives more power than at half its voltage.
+    # A battery's power has its maximum at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current
 
 

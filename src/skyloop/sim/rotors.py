@@ -1,6 +1,6 @@
 """Bodies at the level of rotors: any attitude, four rotors each, in steps of 1 ms; flown by firmware or built-in loops.
 
-As in :mod:`skyloop.sim.dynamics`, many drones are computed in arrays and a few one by one, with the same bits.
+As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays and a few one by one, with the same bits.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from skyloop.sim.streams import Floats
 
 PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: steps of the plant in one of the simulation
 
-# Rows of the table of a body's state and inputs beside those of BodyTable.
+# Rows of the table of a body's state and inputs, in addition to those of BodyTable.
 _TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
 _TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
 _ROWS = 29
@@ -44,16 +44,16 @@ _ROTOR_MARGIN_M_S2 = 60.0  # of gravity, ground effect, and drag in a fast dive
 class RotorBodies(BodyTable):
     """Bodies with four rotors each.
 
-    Their state is a quaternion, body rates and rotor speeds; angles, their sines, cosines and derivatives follow from
-    it at the end of each step. The inputs ``attitude_command`` and ``thrust_command`` are followed by an attitude loop
-    (250 Hz), a rate loop and a mixer (1 kHz), except for drones that firmware flies.
+    Their state is a quaternion, body rates and rotor speeds; angles, their sines, cosines and derivatives are derived
+    at the end of each step. An attitude loop (250 Hz), a rate loop and a mixer (1 kHz) follow the inputs
+    ``attitude_command`` and ``thrust_command``, except for drones flown by firmware.
 
     Attributes:
         quaternion: World from body, w, x, y, z, (4, n).
         turning: Body rates, (3, n) [rad/s].
-        speeds: Of the rotors, (4, n) [rad/s].
-        voltage: Of the batteries under load, (n,) [V].
-        current: That the batteries give, (n,) [A].
+        speeds: Rotor speeds, (4, n) [rad/s].
+        voltage: Voltage of the batteries under load, (n,) [V].
+        current: Current of the batteries, (n,) [A].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
@@ -90,28 +90,28 @@ class RotorBodies(BodyTable):
     # Inputs ----------------------------------------------------------------------------------------------------
 
     def cut(self, drone: int) -> None:
-        """Stop the rotors: nothing holds the attitude any more."""
+        """Stop the rotors, so that nothing holds the attitude."""
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Do nothing: rotors that run hold the attitude, and so does what a drone stands on."""
+        """Do nothing: running rotors hold the attitude, and so does the ground under a drone."""
 
     def fly_by(self, drone: int, firmware: Firmware, instruments: Instruments) -> None:
-        """Let firmware fly a drone, from the next step on."""
+        """Let firmware fly a drone from the next step on."""
         self._pilots = {**self._pilots, drone: _Pilot(self, drone, firmware, instruments)}
         self._flown[drone] = True
         self._targets[:, drone] = 0.0
 
     def release(self, drone: int) -> None:
-        """Stop the rotors of a drone that firmware flew; the built-in loops fly it."""
+        """Stop the rotors of a drone flown by firmware and hand it to the built-in loops."""
         self._pilots = {number: pilot for number, pilot in self._pilots.items() if number != drone}
         self._flown[drone] = False
         self._targets[:, drone] = 0.0
         self.cut(drone)
 
     def command(self, drone: int, commands: Sequence[float]) -> None:
-        """Set the commands of a flown drone's rotors, 0 to 1, in the order of the rotors.
+        """Set the rotor commands of a drone flown by firmware, 0 to 1, in the order of the rotors.
 
         Raises:
             UsageError: They are not four finite numbers.
@@ -123,7 +123,7 @@ class RotorBodies(BodyTable):
         self._targets[:, drone] = [idle + span * min(one, 1.0) if one > 0.0 else 0.0 for one in commands]
 
     def idles(self, drone: int) -> bool:
-        """Whether no rotor of a flown drone is commanded more than what armed firmware idles with."""
+        """Return whether no rotor of a drone flown by firmware is commanded above the idle of armed firmware."""
         constants = self._constants[drone]
         idle = constants.idle_speed + _IDLE_COMMAND * (constants.full_speed - constants.idle_speed)
         return bool((self._targets[:, drone] <= idle + 1e-9).all())
@@ -133,7 +133,7 @@ class RotorBodies(BodyTable):
         self._open_voltage[:] = voltage
 
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Turn a body faster about the vertical by so much."""
+        """Change a body's turn rate about the vertical."""
         up = self.rotations()[drone, 2]
         self.turning[:, drone] += up * change_rad_s
         self.rates[2, drone] += change_rad_s
@@ -148,10 +148,10 @@ class RotorBodies(BodyTable):
         self.speeds[:, drone] = math.sqrt(thrust * constants.collective / constants.thrust)
         self._derive()
 
-    # Looking ---------------------------------------------------------------------------------------------------
+    # State -----------------------------------------------------------------------------------------------------
 
     def power(self) -> Floats:
-        """Return what each drone takes from its battery now, (n,) [W]."""
+        """Return each drone's present battery power, (n,) [W]."""
         power: Floats = electric_power(self._all, tuple(self.speeds))
         return power
 
@@ -165,7 +165,7 @@ class RotorBodies(BodyTable):
 
     @property
     def time_s(self) -> float:
-        """Time of the simulation, with the steps of the plant that are done."""
+        """Simulation time, including the finished steps of the plant."""
         return self.count * PLANT_STEP_S
 
     def rotations(self) -> Floats:
@@ -190,7 +190,7 @@ class RotorBodies(BodyTable):
         self._derive()
 
     def _begin(self) -> None:
-        """Prepare the inputs of a step: what collisions did, the attitude loop, the batteries."""
+        """Prepare the inputs of a step: effects of collisions, the attitude loop, the batteries."""
         np.subtract(self.velocity, self._after, out=self._knock)
         np.divide(self._knock, STEP_S, out=self._knock)
         np.copyto(self.velocity_before, self.velocity)
@@ -251,7 +251,7 @@ class RotorBodies(BodyTable):
 
     def _derive(self) -> None:
         """Derive angles, their sines, cosines and derivatives from the quaternions."""
-        # In arrays of their own, for a function of NumPy's need not give the same bits for other strides.
+        # In separate arrays, because NumPy's functions may give other bits for other strides.
         quaternion = np.ascontiguousarray(self.quaternion)
         (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation(*quaternion)
         level = np.sqrt(r21 * r21 + r22 * r22)
@@ -260,10 +260,10 @@ class RotorBodies(BodyTable):
         sin[0], sin[1], sin[2] = r21 / some, -r20, r10 / some
         cos[0], cos[1], cos[2] = r22 / some, level, r00 / some
         steep = level < _LEAST_COS
-        if steep.any():  # roll and yaw turn about the same axis: all of it counts as yaw
+        if steep.any():  # roll and yaw turn about the same axis; all of it counts as yaw
             sin[0, steep], sin[2, steep] = 0.0, -r01[steep]
             cos[0, steep], cos[1, steep], cos[2, steep] = 1.0, _LEAST_COS, r11[steep]
-        cos[0, cos[0] == 0.0] = _LEAST_COS  # thrust is divided by it
+        cos[0, cos[0] == 0.0] = _LEAST_COS  # a divisor of thrust
         self.angles[:] = np.arctan2(sin, cos)
         self.sin[:], self.cos[:] = sin, cos
         p, q, r = self.turning
@@ -283,7 +283,7 @@ class _Pilot:
     def exchange(self) -> None:
         bodies, drone = self._bodies, self._drone
         w, x, y, z = bodies.quaternion[:, drone].tolist()
-        # What it stands on carries it at the end of each step of the simulation only: in between it falls.
+        # The ground supports a drone at the end of each simulation step only; between these, the drone falls.
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,

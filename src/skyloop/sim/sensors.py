@@ -1,4 +1,4 @@
-"""The vehicles' own estimates: truth with noise, and with biases that wander slowly."""
+"""The vehicles' own estimates: truth with noise and slowly wandering biases."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Sensors:
     """The sensors of all drones.
 
     Attributes:
-        altitude: Of the feet above the floor, (n,) [m].
+        altitude: Height of the feet above the floor, (n,) [m].
         velocity: Forward, left, up, levelled axes, (3, n) [m/s].
-        numbers: Of a few drones: altitude and velocity.
+        numbers: For a few drones: altitude and velocity.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Sensors:
         np.add(self._bias, self._bias_fresh * self._bias_normals.take(), out=self._bias)
 
     def estimate(self) -> None:
-        """Measure altitude and velocity now."""
+        """Measure altitude and velocity."""
         bodies = self._bodies
         if self._few:
             for drone, half_height in self._each:
@@ -89,7 +89,7 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def put(self, drone: int) -> None:
-        """Measure a drone that was moved and is at rest: its last estimate was of another place."""
+        """Measure a drone that was moved and is at rest, as its last estimate was of another position."""
         height = self._bodies.position[2, drone] - self._half_height[drone]
         self._estimate[:, drone] = self._bias[9:, drone]
         self._estimate[0, drone] += height
@@ -97,12 +97,12 @@ class Sensors:
     def inertial(self, step: int) -> Floats:
         """Return the inertial sensors' values at the end of a step, shape (9, n).
 
-        They are gyro [rad/s] and accelerometer [m/s²] about and along the bodies' axes, and roll, pitch, yaw [rad] (yaw
-        not wrapped). They are computed once per step, for all drones.
+        Rows are gyro [rad/s] and accelerometer [m/s²] in body axes, and roll, pitch, yaw [rad] (yaw not wrapped). They
+        are computed once per step for all drones.
         """
         if step != self._inertial_step:
             bodies = self._bodies
-            # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.
+            # One drone after another from the step's stream, so that more drones leave the first ones' noise unchanged.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
             truth = np.concatenate([bodies.body_rates(), bodies.specific_force(), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals

@@ -1,6 +1,6 @@
 """A world with drones in it, stepped by its owner.
 
-Deterministic: the same world, seed, drones and commands at the same steps give the same bits. Nothing here reads a wall
+Deterministic: the same world, seed, drones and commands in the same steps give the same bits. Nothing here reads a wall
 clock; :class:`~skyloop.sim.options.Pacer` makes it run in real time.
 """
 
@@ -44,8 +44,8 @@ class Simulation:
 
     Attributes:
         world: The world.
-        parameters: Of each drone.
-        seed: Of all noise and gusts.
+        parameters: The parameters of each drone.
+        seed: Seed of all noise and gusts.
     """
 
     def __init__(
@@ -63,17 +63,17 @@ class Simulation:
 
         Args:
             world: The world.
-            drones: How many, 1 to 1000.
-            seed: Of all noise and gusts; together with the world's own seed it decides everything. None takes the
-                world's.
+            drones: Their number, 1 to 1000.
+            seed: Seed of all noise and gusts. Together with the world's own seed it determines the simulation. None
+                uses the world's seed.
             parameters: One for all drones or one for each.
             limits: One for all drones or one for each.
-            charge: Of the batteries at the start, above 0, at most 1.
+            charge: Initial charge of the batteries, above 0, at most 1.
             wind: Replaces the world's.
 
         Raises:
             UsageError: An argument is out of its range, some vehicles have rotors and others not, or the world has no
-                place for so many drones.
+                room for this many drones.
         """
         if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
             raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
@@ -113,12 +113,12 @@ class Simulation:
 
     @property
     def step_count(self) -> int:
-        """The number of steps done."""
+        """The number of finished steps."""
         return self._step
 
     @property
     def time_s(self) -> float:
-        """Time of the simulation: steps done, times :data:`~skyloop.sim.dynamics.STEP_S`."""
+        """Simulation time: finished steps times :data:`~skyloop.sim.dynamics.STEP_S`."""
         return self._step * STEP_S
 
     def step(self, n: int = 1) -> None:
@@ -147,7 +147,7 @@ class Simulation:
             self._autopilot.watch_firmware(self._rotors, self.time_s)
 
     def _supply(self) -> None:
-        """Give the rotors the batteries' present voltage."""
+        """Pass the batteries' present voltage to the rotors."""
         if self._rotors is not None:
             self._rotors.set_unloaded_voltage(self._batteries.open_voltage() * (self._batteries.charge > 0))
 
@@ -161,14 +161,14 @@ class Simulation:
             action: A set-point or an action.
 
         Returns:
-            What was applied: the action, a set-point within the limits, or :class:`~skyloop.messages.Idle` when the
-            drone ignores it in its present state (as firmware does): set-points before it hovers, a reset in the air.
+            The applied action: the action itself, a set-point within the limits, or :class:`~skyloop.messages.Idle` if
+            the drone ignores it in its present state, as firmware does: set-points before hovering, a reset in the air.
 
         Raises:
-            UsageError: There is no such drone, firmware flies it, or a number is not finite.
+            UsageError: No such drone, firmware flies it, or a number is not finite.
         """
         if not isinstance(action, Action):
-            raise UsageError(f"an action from skyloop.messages is wanted, not {action!r}")
+            raise UsageError(f"expected an action from skyloop.messages, got {action!r}")
         if not action.finite:
             raise UsageError(f"a set-point must be finite: {action!r}")
         with self._lock:
@@ -176,7 +176,7 @@ class Simulation:
             return self._autopilot.command(drone, action, self.time_s)
 
     def limits(self, drone: int) -> Limits:
-        """Return the limits in force of a drone."""
+        """Return a drone's limits in force."""
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
@@ -185,23 +185,23 @@ class Simulation:
             self._autopilot.set_limits(self._number(drone), limits)
 
     def fly_by(self, drone: int, firmware: Firmware) -> None:
-        """Let firmware fly a drone from now on, in place of the built-in autopilot, which refuses commands meanwhile.
+        """Let firmware fly a drone from now on; the built-in autopilot refuses commands meanwhile.
 
-        The drone counts as landed while it stands and no rotor is commanded more than 15 %, as armed firmware idles
-        with, and as flying otherwise. Collisions are reported as always, and stop no rotor.
+        The drone counts as landed while it is on the ground and no rotor command exceeds 15 %, the idle of armed
+        firmware, and as flying otherwise. Collisions are reported as usual and stop no rotor.
 
         Args:
-            drone: Its number. It stands on the ground; a drone in an emergency is reset.
-            firmware: Called once per millisecond of the simulation, on the thread that steps it.
+            drone: Its number. It must be on the ground; an emergency is reset.
+            firmware: Called once per millisecond of the simulation, on the stepping thread.
 
         Raises:
-            UsageError: There is no such drone, it has no rotors, firmware flies it already, or it is in the air.
+            UsageError: No such drone, it has no rotors, firmware flies it already, or it is in the air.
         """
         with self._lock:
             self._require_built_in(drone)
             if self._rotors is None:
                 raise UsageError(
-                    "firmware needs a drone that is modelled down to its rotors: "
+                    "firmware needs a drone modelled down to its rotors: "
                     "one of RACER, IRIS and CRAZYFLIE of skyloop.sim.vehicles, or parameters with rotors"
                 )
             if not self._autopilot.grounded(drone, self.time_s):
@@ -217,12 +217,12 @@ class Simulation:
             rotors.fly_by(drone, firmware, instruments)
 
     def release(self, drone: int) -> None:
-        """Take a drone away from its firmware: its rotors stop, and the built-in autopilot has it again.
+        """Take a drone back from its firmware: its rotors stop, and the built-in autopilot takes over.
 
         In the air it falls, in an emergency.
 
         Raises:
-            UsageError: There is no such drone, or no firmware flies it.
+            UsageError: No such drone, or no firmware flies it.
         """
         with self._lock:
             if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
@@ -231,12 +231,12 @@ class Simulation:
             self._autopilot.take_back(drone, self.time_s)
 
     def flown_by_firmware(self, drone: int) -> bool:
-        """Whether firmware flies a drone; see :meth:`fly_by`."""
+        """Return whether firmware flies a drone; see :meth:`fly_by`."""
         return self._number(drone) in self._autopilot.handed_over
 
     def _require_built_in(self, drone: int) -> None:
         if self._number(drone) in self._autopilot.handed_over:
-            raise UsageError(f"firmware flies drone {drone}: command that, or release the drone from it first")
+            raise UsageError(f"firmware flies drone {drone}: command the firmware, or release the drone first")
 
     # Conditions ------------------------------------------------------------------------------------------------
 
@@ -249,7 +249,7 @@ class Simulation:
         """Set a drone's battery charge.
 
         Raises:
-            UsageError: There is no such drone, or the charge is not from 0 to 1.
+            UsageError: No such drone, or the charge is not from 0 to 1.
         """
         if not 0 <= charge <= 1:
             raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
@@ -257,39 +257,39 @@ class Simulation:
             self._batteries.charge[self._number(drone)] = charge
 
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
-        """Move a flying drone, hovering, level and at rest: the start of another episode in one simulation.
+        """Move a flying drone, hovering, level and at rest, to start another episode in the same simulation.
 
         Args:
             drone: Its number.
-            position_m: Of its centre, world axes.
+            position_m: New position of its centre, world axes.
             yaw_rad: Its heading.
-            charge: Of its battery, 0 to 1.
+            charge: Charge of its battery, 0 to 1.
 
         Raises:
-            UsageError: The drone does not fly, or a number is out of its range.
+            UsageError: The drone is not flying, or a number is out of its range.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
-            raise UsageError(f"a place is three finite numbers and a heading, not {position_m!r}, {yaw_rad!r}")
+            raise UsageError(f"expected three finite coordinates and a heading, got {position_m!r}, {yaw_rad!r}")
         self.set_charge(drone, charge)
         with self._lock:
             self._require_built_in(drone)
             if self._autopilot.states[drone] not in (FlightState.HOVERING, FlightState.FLYING):
-                raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only one that flies can be put")
+                raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only a flying drone can be moved")
             self._bodies.put(drone, place, wrap_angle(yaw_rad), GRAVITY_M_S2)
             self._collisions.moved(drone)
             self._sensors.put(drone)
             altitude = position_m[2] - self.parameters[drone].half_height_m
             self._autopilot.hover_here(drone, altitude, self.time_s)
 
-    # Looking ---------------------------------------------------------------------------------------------------
+    # State -----------------------------------------------------------------------------------------------------
 
     def state(self, drone: int) -> FlightState:
         """Return a drone's flight state."""
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """Return a drone's estimates. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 12 ms older, as their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()
@@ -338,11 +338,11 @@ class Simulation:
             return self._bodies.position.T.copy(), self._bodies.rotations()
 
     def motions(self) -> tuple[Floats, Floats, Floats]:
-        """Return how all drones move, as new arrays: what a task needs of many at once.
+        """Return the motion of all drones as new arrays, for tasks with many drones.
 
         Returns:
-            True positions in world axes, shape (n, 3) [m]; velocities forward, left and up as the drones estimate them,
-            up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw, yaw within ±π, shape (n, 3) [rad].
+            True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up
+            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw, yaw within ±π, shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()
@@ -350,7 +350,7 @@ class Simulation:
             return self._bodies.position.T.copy(), self._sensors.velocity.T.copy(), angles
 
     def airborne(self) -> NDArray[np.bool_]:
-        """Return which drones fly, shape (n,); see :attr:`FlightState.airborne`."""
+        """Return whether each drone flies, shape (n,); see :attr:`FlightState.airborne`."""
         with self._lock:
             return np.array([state.airborne for state in self._autopilot.states])
 
@@ -358,7 +358,7 @@ class Simulation:
         """Return the states of the moving targets, in the world's order.
 
         Args:
-            time_s: Of the simulation; None is now.
+            time_s: Simulation time; None for now.
         """
         time = self.time_s if time_s is None else time_s
         return tuple(track.at(time) for track in self._tracks)
@@ -367,12 +367,12 @@ class Simulation:
         """Return the brightness of the world's light, at most 1; see :class:`~skyloop.sim.world.Light`.
 
         Args:
-            time_s: Of the simulation; None is now.
+            time_s: Simulation time; None for now.
         """
         return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
 
     def take_occurrences(self) -> list[Occurrence]:
-        """Return what happened since the last call, oldest first; only the newest 1000 are kept."""
+        """Return the occurrences since the last call, oldest first; only the newest 1000 are kept."""
         with self._lock:
             taken = list(self._autopilot.occurrences)
             self._autopilot.occurrences.clear()
@@ -393,10 +393,10 @@ def _one_each(given: T | Sequence[T], drones: int, what: str) -> list[T]:
 
 
 def _have_rotors(parameters: Sequence[VehicleParameters]) -> bool:
-    """Whether the vehicles are modelled down to their rotors."""
+    """Return whether the vehicles are modelled down to their rotors."""
     have = {vehicle.rotors is not None for vehicle in parameters}
     if len(have) > 1:
-        raise UsageError("vehicles with rotors (VehicleParameters.rotors) and without fly in simulations of their own")
+        raise UsageError("vehicles with and without rotors (VehicleParameters.rotors) need separate simulations")
     return have.pop()
 
 

@@ -1,4 +1,4 @@
-"""The solid things of a world: how far drones are from them or within them, and where drones find room to stand."""
+"""A world's solids: distances from drones to them, overlaps, and free positions for drones to stand."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Spawn, Vec
 
 
 class Overlap(NamedTuple):
-    """A drone within a solid (or outside of the room).
+    """A drone's overlap with a solid (or with the room's walls and ceiling).
 
     Attributes:
-        normal: The way out.
-        depth_m: How far.
+        normal: Direction out of the solid.
+        depth_m: Depth along it.
         surface_m_s: Velocity of the solid's surface at the drone's centre.
-        spin_rad_s: How fast the surface turns, counter-clockwise from above.
+        spin_rad_s: Turn rate of the surface, counter-clockwise from above.
     """
 
     normal: Vec3
@@ -33,7 +33,7 @@ class Overlap(NamedTuple):
 
 
 class Solids:
-    """Boxes, gate bars, platforms and figures that move, the walls and ceiling of the room; not the floor."""
+    """Boxes, gate bars, moving platforms and figures, and the room's walls and ceiling; not the floor."""
 
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
@@ -45,14 +45,14 @@ class Solids:
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
-        # The same as plain numbers, with which one box is looked at faster: centre, half the size, cosine and sine of
-        # yaw; and how fast each goes and turns.
+        # The same as plain numbers, faster for a single box: centre, half the size, cosine and sine of yaw; velocity
+        # and turn rate.
         self._boxes = [(0.0,) * 8 for _ in sizes]
         self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
             self._place(number, box.position_m, box.yaw_rad)
         self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
-        self._bounded_m = math.nan  # the radius for which these are
+        self._bounded_m = math.nan  # the radius they are valid for
         size_x, size_y, height = world.room.size_m
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
@@ -67,30 +67,30 @@ class Solids:
         return bool(self._movers)
 
     def __len__(self) -> int:
-        """Return the number of boxes, platforms and figures; they are numbered, and those that move come last."""
+        """Return the number of boxes, platforms and figures; they are numbered, and moving ones come last."""
         return len(self._boxes)
 
     @property
     def fixed(self) -> int:
-        """The number of those that don't move."""
+        """The number of fixed ones."""
         return self._fixed
 
     def move(self, time_s: float) -> None:
-        """Move the moving solids to where they are at a time."""
+        """Move the moving solids to their positions at a time."""
         for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
             state = track.at(time_s)
-            x, y, z = state.position_m  # of a platform's top, of a figure's foot print
+            x, y, z = state.position_m  # a platform's top, a figure's footprint
             half = float(self._half[2, number, 0])
             centre = (x, y, z - half if lifts else z + half)
             self._place(number, centre, state.yaw_rad, state.velocity_m_s, state.yaw_rate_rad_s)
 
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
-        """Return bounding boxes, low and high, each (3, boxes) [m]; not to be kept.
+        """Return bounding boxes, low and high, each (3, boxes) [m]; valid until the next call.
 
         Args:
-            seconds: For so long moving ones stay within theirs, from where they are now.
-            radius_m: Of hulls that meet a box only where their own bounding box meets this one. (A hull is as far from
-                the corner of a turned box as a square would be that is turned likewise.)
+            seconds: Moving solids stay within their boxes for this time, from their present positions.
+            radius_m: Radius of hulls that touch a box only if their own bounding box overlaps this one. (The distance
+                of a hull from a turned box's corner is that of a square turned the same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -100,7 +100,7 @@ class Solids:
         return self._bounds
 
     def _bound(self, which: slice, reach_m: float) -> None:
-        """Work out the bounding boxes of some solids, so much larger all round."""
+        """Compute the bounding boxes of some solids, enlarged by this reach on all sides."""
         c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
         x, y, z = self._half[:, which]
         corner = (c + s - 1.0) * self._bounded_m + reach_m
@@ -110,12 +110,12 @@ class Solids:
         high[:, which] = (self._centre[:, which] + around)[:, :, 0]
 
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
-        """Return which points are within a solid each: indices into ``points``, ascending.
+        """Return which points are inside their solids: indices into ``points``, ascending.
 
         Args:
             points: Shape (3, m), m at least 1.
             numbers: The solid of each point, shape (m,).
-            sizes: What :meth:`sizes` returns for the same numbers and the points' hulls.
+            sizes: From :meth:`sizes` for the same numbers and the points' hulls.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -131,10 +131,10 @@ class Solids:
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance to the nearest solid, wall or ceiling, (m,).
 
-        Never more than the true distance; negative within.
+        Never more than the true distance; negative inside.
 
         Args:
-            points: Of the drones, (3, m).
+            points: Positions of the drones, (3, m).
             hulls: Radius, radius, half height, (3, m).
         """
         room = np.minimum(points - self.room_low, self.room_high - points) - hulls
@@ -151,9 +151,9 @@ class Solids:
 
         Args:
             point: Its centre, three numbers [m].
-            radius: Of its hull [m].
-            half_height: Of its hull [m].
-            among: The solids to look at, beside the room; None is all.
+            radius: Radius of its hull [m].
+            half_height: Half height of its hull [m].
+            among: The solids to check, in addition to the room; None for all.
         """
         x, y, z = point
         wide, deep, tall = self._room
@@ -185,12 +185,12 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return how far it is to the first solid thing, the floor included; infinite without any [m].
+        """Return the distance to the first solid, including the floor; infinite without one [m].
 
         Args:
-            point: Where a beam starts; from below the floor it goes no way.
-            direction: Where it goes, a unit vector.
-            time_s: Of the simulation, at which moving solids are where they are.
+            point: Start of a beam; from below the floor its length is 0.
+            direction: Direction of the beam, a unit vector.
+            time_s: Simulation time, for the positions of moving solids.
         """
         if self._movers:
             self.move(time_s)
@@ -210,7 +210,7 @@ class Solids:
         x, y, z = direction
         starts = np.array([c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]])
         ways = np.array([c * x + s * y, c * y - s * x, np.full_like(c, z)])
-        # A beam along a face is taken as one that all but goes along it.
+        # Treat a beam parallel to a face as one nearly parallel to it.
         ways[np.abs(ways) < 1e-12] = 1e-12
         half = self._half[:, :, 0]
         one, other = (-half - starts) / ways, (half - starts) / ways
@@ -221,7 +221,7 @@ class Solids:
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
         if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
-            axis = 2  # a platform lifts what is on it, however it moves
+            axis = 2  # a platform lifts everything on it, whatever its motion
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
         if axis == 2:
@@ -244,7 +244,7 @@ class Solids:
         self._motions[number] = velocity, spin
 
     def _local(self, points: Floats) -> Floats:
-        """Points (3, m) in the axes of each box, (3, boxes, m)."""
+        """Return points (3, m) in the axes of each box, (3, boxes, m)."""
         away = points[:, None, :] - self._centre
         local = away.copy()
         local[0] = self._cos * away[0] + self._sin * away[1]
@@ -253,7 +253,7 @@ class Solids:
 
 
 def _top_speed(target: PlatformTarget | FigureTarget) -> float:
-    """Return a speed [m/s] that no point of a target exceeds, those at its corners included."""
+    """Return an upper bound of the speed [m/s] of all points of a target, corners included."""
     turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
     return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
 
@@ -262,26 +262,26 @@ Indices = NDArray[np.intp]
 
 
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
-    """Return the pairs of boxes that overlap, by sweeping over them along the axis on which they are spread most.
+    """Return the pairs of overlapping boxes, by a sweep along the axis of their largest spread.
 
     Args:
         low: Least coordinates of the boxes, shape (3, n) [m].
         high: Greatest coordinates, shape (3, n).
-        movable: Only pairs with at least one of the first so many boxes are wanted.
+        movable: Return only pairs that include one of this many first boxes.
 
     Returns:
-        The lesser and the greater number of each pair, in ascending order. Boxes that touch overlap.
+        The lower and the higher number of each pair, in ascending order. Boxes that touch overlap.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
     order = low[axis].argsort(kind="stable")
     begins, ends = low[axis, order], high[axis, order]
-    # In this order a box overlaps, along the axis, those after it that begin before it ends.
+    # In this order, a box overlaps along the axis with those after it that begin before it ends.
     numbers = np.arange(len(order))
     counts = begins.searchsorted(ends, side="right") - numbers - 1
     first = numbers.repeat(counts)
-    before = counts.cumsum() - counts  # pairs of the boxes before each
+    before = counts.cumsum() - counts  # number of pairs from the previous boxes
     second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
     one, other = order.take(first), order.take(second)
     for across in {0, 1, 2} - {axis}:
@@ -294,14 +294,14 @@ def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indic
     return lesser.take(wanted), greater.take(wanted)
 
 
-_MARGINS_M = (0.6, 0.3, 0.15)  # between hulls, and to what stands around: the first that leaves enough places
+_MARGINS_M = (0.6, 0.3, 0.15)  # between hulls, and to obstacles: the first that leaves enough room
 
 
 def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
-    """Return a free place at the start for each drone: the world's own first, then a grid around the first of them.
+    """Return a free starting position for each drone: the world's own first, then a grid around the first of them.
 
     Raises:
-        UsageError: There are not enough, or one of the world's own is within something solid.
+        UsageError: Not enough positions, or one of the world's own is inside a solid.
     """
     spawns = list(world.spawns[: len(parameters)])
     for spawn, drone in zip(spawns, parameters, strict=False):
@@ -313,7 +313,7 @@ def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids)
         placed = _fill(world, parameters, solids, spawns, margin)
         if len(placed) == len(parameters):
             return placed
-    raise UsageError(f"world {world.name!r} has place for {len(placed)} drones only, not for {len(parameters)}")
+    raise UsageError(f"world {world.name!r} has room for {len(placed)} drones only, not for {len(parameters)}")
 
 
 def _fill(
@@ -333,7 +333,7 @@ def _fill(
 
 
 def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[float, float]]:
-    """Points of a square grid over the floor, nearest to ``around`` first."""
+    """Return points of a square grid over the floor, nearest to ``around`` first."""
     x0, y0 = around.position_m[:2] if around else (0.0, 0.0)
     reach_x, reach_y = (math.ceil(world.room.size_m[axis] / spacing) for axis in (0, 1))
     points = [

@@ -1,6 +1,6 @@
-"""Independent streams of random numbers, one for each purpose and drone, all derived from one seed.
+"""Independent streams of random numbers, one per purpose and drone, all derived from one seed.
 
-So switching one thing on, or adding a drone, leaves the numbers of all others as they were.
+Adding a drone or enabling a feature therefore leaves all other streams unchanged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class Purpose(IntEnum):
-    """What a stream is for. The numbers are part of what a seed means: they must never change or be reused."""
+    """Purposes of streams. The numbers determine the meaning of a seed: they must never change or be reused."""
 
     TARGETS = 1
     WIND = 2
@@ -30,15 +30,15 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
-    """Return the stream of a purpose and a number (of a drone, a target, a camera, a step). Costs some 15 µs.
+    """Return the stream for a purpose and a number (of a drone, target, camera or step). Costs some 15 µs.
 
-    It is the same for the same arguments, in every version.
+    The same arguments give the same stream in every version.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), index)))
 
 
 class NormalBlocks:
-    """Standard normal numbers for many drones, ``rows`` each at a time. Each drone has its own stream.
+    """Standard normal numbers for many drones, ``rows`` at a time for each. Each drone has its own stream.
 
     They are drawn in blocks, because one call to a generator costs as much as a hundred numbers.
     """
@@ -51,7 +51,7 @@ class NormalBlocks:
         self._next = ahead
 
     def take(self) -> Floats:
-        """Return the next numbers, shape (rows, drones). The next block overwrites them: copy what must last."""
+        """Return the next numbers, shape (rows, drones). The next block overwrites them: copy those to keep."""
         if self._next == len(self._block):
             for drone, draw in enumerate(self._draws):
                 self._block[:, :, drone] = draw((len(self._block), self._rows))

@@ -1,6 +1,6 @@
 """Vehicles whose response was identified from recorded flights, and vehicles modelled down to their rotors.
 
-Parameters that are not given have their defaults. ``docs/rotors.md`` repeats those of the rotor-level ones in a table.
+Parameters not given here have their defaults. ``docs/rotors.md`` lists those of the rotor-level vehicles in a table.
 
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
@@ -20,13 +20,13 @@ from typing import Final
 
 from skyloop.sim.parameters import RotorParameters, VehicleParameters
 
-#: The Parrot AR.Drone: identified by ``scripts/identify_ardrone.py`` from the pitch steps of an AR.Drone 1 that are
-#: described in ``docs/ardrone-model.md``, fitted to five runs and judged on three that the fit has not seen.
+#: The Parrot AR.Drone: identified by ``scripts/identify_ardrone.py`` from pitch steps of an AR.Drone 1
+#: (``docs/ardrone-model.md``), fitted to five runs and tested on three others.
 AR_DRONE = VehicleParameters(
     attitude_frequency_rad_s=10.1,
     attitude_damping=0.65,
     linear_drag_per_s=0.396,
-    quadratic_drag_per_m=0.0,  # came out as zero beside airspeed_tilt, and was left out
+    quadratic_drag_per_m=0.0,  # the fit gave zero together with airspeed_tilt
     airspeed_tilt_rad_s2_per_m2=0.0147,
     level_brake_per_s=0.303,
 )
@@ -38,7 +38,7 @@ RACER = VehicleParameters(
     half_height_m=0.04,  # estimate
     rotor_radius_m=0.0648,  # 5.1 inch across [N]
     rotor_height_m=0.06,  # estimate
-    most_thrust=3.8,  # leaves a sixth of what the rotors give to the attitude, estimate
+    most_thrust=3.8,  # leaves a sixth of the rotors' thrust to the attitude, estimate
     least_thrust=0.15,  # estimate
     attitude_frequency_rad_s=22.0,  # estimate, for rotors as fast as these
     attitude_damping=0.8,
@@ -72,7 +72,7 @@ IRIS = VehicleParameters(
     half_height_m=0.055,  # 110 mm high [R]
     rotor_radius_m=0.1,  # [R]
     rotor_height_m=0.078,  # [R]: half the body's height, and 23 mm
-    most_thrust=1.45,  # leaves a tenth of what the rotors give to the attitude, estimate
+    most_thrust=1.45,  # leaves a tenth of the rotors' thrust to the attitude, estimate
     least_thrust=0.2,  # estimate
     attitude_frequency_rad_s=12.0,  # estimate
     attitude_damping=0.8,
@@ -105,7 +105,7 @@ CRAZYFLIE = VehicleParameters(
     half_height_m=0.0145,  # 29 mm high [B]
     rotor_radius_m=0.0231,  # 46 mm across [B]
     rotor_height_m=0.02,  # estimate
-    most_thrust=1.5,  # leaves a seventh of what the rotors give to the attitude, estimate
+    most_thrust=1.5,  # leaves a seventh of the rotors' thrust to the attitude, estimate
     least_thrust=0.3,  # estimate
     attitude_frequency_rad_s=17.0,  # with the damping: steps as the mean of the three of [D]
     attitude_damping=0.67,
@@ -115,7 +115,7 @@ CRAZYFLIE = VehicleParameters(
     battery_empty_v=3.0,
     battery_resistance_ohm=0.1,  # estimate
     electronics_power_w=0.5,  # estimate
-    crash_speed_m_s=5.0,  # estimate: it weighs little
+    crash_speed_m_s=5.0,  # estimate: it is light
     rotors=RotorParameters(
         places_m=((0.0325, 0.0325), (0.0325, -0.0325), (-0.0325, 0.0325), (-0.0325, -0.0325)),  # [F]
         inertia_kg_m2=(16.571710e-6, 16.655602e-6, 29.261652e-6),  # [F], the diagonal
@@ -132,7 +132,7 @@ CRAZYFLIE = VehicleParameters(
     ),
 )
 
-#: By the names that addresses, environments and command lines use.
+#: By the names in addresses, environments and command lines.
 VEHICLES: Final = {
     "quadrotor": VehicleParameters(),
     "ardrone": AR_DRONE,

@@ -18,7 +18,7 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Rgb = tuple[int, int, int]
 
-# The surfaces a renderer must be able to draw, by name. A world file that names another one is refused.
+# Surface names that a renderer must support. A world file with another name is refused.
 TEXTURES: tuple[str, ...] = (
     "asphalt",
     "books",
@@ -55,11 +55,11 @@ MARKER_DICTIONARIES: dict[str, int] = {
 
 @dataclass(frozen=True, slots=True)
 class FacePose:
-    """The pose of a flat thing (poster, marker, board).
+    """The pose of a flat object (poster, marker, board).
 
     ``yaw_rad`` and ``elevation_rad`` give the direction of the outward normal: its heading, and its angle above the
-    horizon (π/2 looks straight up, as a marker on the floor does). ``turn_rad`` turns the picture in its own plane,
-    counter-clockwise for someone looking at it.
+    horizon (π/2 points straight up, as for a marker on the floor). ``turn_rad`` turns the picture in its own plane,
+    counter-clockwise as seen from the front.
     """
 
     position_m: Vec3
@@ -68,7 +68,7 @@ class FacePose:
     turn_rad: float = 0.0
 
     def rotation(self) -> NDArray[np.float64]:
-        """World-from-face rotation, shape (3, 3): columns are the picture's right, its up, and the outward normal."""
+        """Return the world-from-face rotation, (3, 3): columns are the picture's right, its up, the outward normal."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         ce, se = math.cos(self.elevation_rad), math.sin(self.elevation_rad)
         right = np.array([-sy, cy, 0.0])
@@ -82,7 +82,7 @@ class FacePose:
 class Room:
     """The bounds of the world. Drones never leave them.
 
-    With ``enclosed`` false there is a ground and a sky but no walls or ceiling to see; the bounds then act as a net.
+    Without ``enclosed`` there is ground and sky, but no visible walls or ceiling; the bounds then act as a net.
     """
 
     size_m: Vec3  # x, y, z extents
@@ -94,7 +94,7 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A solid box standing upright: ``position_m`` is its centre, ``size_m`` its extents along its own x, y, z."""
+    """A solid upright box: ``position_m`` is its centre, ``size_m`` its extents along its own x, y, z."""
 
     name: str
     position_m: Vec3
@@ -104,7 +104,7 @@ class Box:
     colour: Rgb | None = None  # a plain colour instead of the texture
 
     def corners(self) -> NDArray[np.float64]:
-        """The eight corners in world axes, shape (8, 3); bit 0, 1, 2 of the row number choose +x, +y, +z."""
+        """Return the corners in world axes, shape (8, 3); bit 0, 1, 2 of the row number choose +x, +y, +z."""
         bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
         local = (bits - 0.5) * np.asarray(self.size_m)
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
@@ -133,7 +133,7 @@ class Gate:
     colour: Rgb = (235, 110, 20)
 
     def bars(self) -> tuple[Box, ...]:
-        """The solid parts: top, bottom, left and right bars, and two legs where the opening is off the floor."""
+        """Return the solid parts: top, bottom, left and right bars, and two legs if the opening is off the floor."""
         width, height = self.inner_size_m
         bar, x, y, z = self.frame_m, *self.position_m
         side = (width + bar) / 2
@@ -171,7 +171,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class MarkerPattern:
-    """What is printed: a marker of ``size_m`` (edge of the black square) with a white margin of ``margin_m`` around."""
+    """A printed marker of ``size_m`` (edge of the black square) with a white margin of ``margin_m``."""
 
     dictionary: str
     marker_id: int
@@ -180,13 +180,13 @@ class MarkerPattern:
 
     @property
     def card_size_m(self) -> float:
-        """Edge of the square card: the black square and the margin on both sides."""
+        """Return the edge of the square card: the black square and the margin on both sides."""
         return self.size_m + 2 * self.margin_m
 
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker that stays where it is. ``pose`` is of its centre; the picture's up is the marker's own."""
+    """A printed marker with a fixed pose. ``pose`` is that of its centre; the picture's up is the marker's own."""
 
     name: str
     pose: FacePose
@@ -195,7 +195,7 @@ class Marker:
 
 @dataclass(frozen=True, slots=True)
 class WaypointPath:
-    """Straight legs between points at a constant speed; ``closed`` goes round, otherwise there and back."""
+    """Straight legs between points at a constant speed; ``closed`` runs in a loop, otherwise back and forth."""
 
     points_m: tuple[Vec3, ...]
     speed_m_s: float
@@ -217,7 +217,7 @@ class CirclePath:
 class OvalPath:
     """A level race track at a constant speed: two straights along x, joined by half circles; counter-clockwise.
 
-    It starts ``start_m`` along the track from where the southern straight begins; clockwise, the northern one.
+    It starts ``start_m`` along the track from the beginning of the southern straight; clockwise, of the northern one.
     """
 
     centre_m: Vec3
@@ -243,8 +243,8 @@ class LissajousPath:
 class WalkPath:
     """A seeded random walk between points of a box, each leg at a speed drawn from a range.
 
-    The box is from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``), which may
-    lead some 0.1 m out of the box.
+    The box extends from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``),
+    which can leave the box by some 0.1 m.
     """
 
     low_m: Vec3
@@ -255,7 +255,7 @@ class WalkPath:
 
 @dataclass(frozen=True, slots=True)
 class RingWalkPath:
-    """A seeded random walk around a centre, within a ring; now and then it turns back. Rounded as ``WalkPath``."""
+    """A seeded random walk around a centre, within a ring, with occasional reversals. Rounded as ``WalkPath``."""
 
     centre_m: Vec2
     radius_m: Vec2  # least, greatest
@@ -266,7 +266,7 @@ class RingWalkPath:
 
 @dataclass(frozen=True, slots=True)
 class StillPath:
-    """Stays at a point: a parked car, somebody who waits."""
+    """A fixed point: a parked car, a waiting person."""
 
     position_m: Vec3
 
@@ -276,7 +276,7 @@ Path = WaypointPath | CirclePath | OvalPath | LissajousPath | WalkPath | RingWal
 
 @dataclass(frozen=True, slots=True)
 class FixedYaw:
-    """Always the same heading."""
+    """A constant heading."""
 
     yaw_rad: float
 
@@ -291,7 +291,7 @@ class AlongYaw:
 
 @dataclass(frozen=True, slots=True)
 class TowardsYaw:
-    """Looking at a point of the floor plan, turning no faster than the limit."""
+    """The heading towards a point of the floor plan, turning no faster than the limit."""
 
     point_m: Vec2
     turn_rate_rad_s: float
@@ -302,9 +302,9 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:
-    """An upright card with a marker that is carried along a path. Drones pass through it.
+    """An upright card with a marker, carried along a path. Drones pass through it.
 
-    The path is of the card's centre, and the yaw is the heading of its face.
+    The path is that of the card's centre, and the yaw is the heading of its face.
     """
 
     name: str
@@ -315,9 +315,9 @@ class BoardTarget:
 
 @dataclass(frozen=True, slots=True)
 class PlatformTarget:
-    """A solid slab that moves along a path, with a marker on its top. Drones can land on it.
+    """A solid slab with a marker on its top, moving along a path. Drones can land on it.
 
-    The path is of the centre of the top face, and the marker's up is the platform's heading.
+    The path is that of the top face's centre, and the marker's up is the platform's heading.
     """
 
     name: str
@@ -333,18 +333,18 @@ FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.
 
 @dataclass(frozen=True, slots=True)
 class FigureTarget:
-    """A solid dummy that moves along a path on the ground: a person whose legs and arms swing, or a car.
+    """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
-    The path is of the middle of its foot print (z is the ground it stands on), and the yaw is where it faces.
+    The path is that of the middle of its footprint (z is the ground below it), and the yaw is its heading.
 
     Attributes:
         name: The target's name.
         shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
-        path: Where it goes.
-        yaw: Where it faces.
-        size_m: Along its own x (ahead), y (left) and z.
-        look: What decides its colours and the pattern of its clothes: two of one shape and look are look-alikes.
-        colour: Of a person's top, or a car's body; None is the look's.
+        path: Its path.
+        yaw: Its heading.
+        size_m: Size along its own x (ahead), y (left) and z.
+        look: Determines its colours and the pattern of its clothes: equal shapes and looks are look-alikes.
+        colour: Colour of a person's top or a car's body; None for the look's colour.
     """
 
     name: str
@@ -361,11 +361,11 @@ Target = BoardTarget | PlatformTarget | FigureTarget
 
 @dataclass(frozen=True, slots=True)
 class TargetState:
-    """The state of a moving target at a time of the simulation, in world axes.
+    """The state of a moving target at a simulation time, in world axes.
 
-    Position [m], yaw [rad, within ±π] and velocity [m/s]; for a platform the position is that of the centre of its top
-    face, for a figure that of the ground it stands on. ``walked_m`` is the length of the way since the start, and
-    ``yaw_rate_rad_s`` how fast it turns.
+    Position [m], yaw [rad, within ±π] and velocity [m/s]. A platform's position is the centre of its top face, a
+    figure's the ground below it. ``walked_m`` is the distance travelled since the start, ``yaw_rate_rad_s`` the turn
+    rate.
     """
 
     name: str
@@ -377,16 +377,16 @@ class TargetState:
     yaw_rate_rad_s: float = 0.0
 
     def face(self, target: Target) -> FacePose:
-        """The pose of the target's marker at this time."""
+        """Return the pose of the target's marker at this time."""
         if isinstance(target, PlatformTarget):
-            # Looking up with the picture's up along the heading: see FacePose for the half turn.
+            # Facing up with the picture's up along the heading: see FacePose for the half turn.
             return FacePose(self.position_m, yaw_rad=self.yaw_rad + math.pi, elevation_rad=math.pi / 2)
         return FacePose(self.position_m, yaw_rad=self.yaw_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """Moving air: a mean velocity (where it blows to) and gusts.
+    """Moving air: a mean velocity (the direction it blows to) and gusts.
 
     Gusts are a first-order Gauss-Markov process per axis with ``gust_m_s`` as its standard deviation along each
     horizontal axis (half of it vertically).
@@ -399,16 +399,16 @@ class Wind:
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Daylight that changes slowly, as when clouds pass: between 1 - ``amplitude`` and 1 times the full brightness.
+    """Slowly changing daylight, as under passing clouds: between 1 - ``amplitude`` and 1 times the full brightness.
 
-    Two sines of ``period_s`` and of about a third of it, whose phases the world's seed decides.
+    The sum of two sines, of ``period_s`` and about a third of it, with phases from the world's seed.
     """
 
     amplitude: float = 0.0
     period_s: float = 60.0
 
     def at(self, time_s: float, seed: int = 0) -> float:
-        """Return the brightness at a time of the simulation [s], 1 - amplitude to 1; exactly 1 without amplitude."""
+        """Return the brightness at a simulation time [s], 1 - amplitude to 1; exactly 1 without amplitude."""
         if self.amplitude == 0.0:
             return 1.0
         first, second = stream(seed, Purpose.LIGHT).uniform(0.0, 2 * math.pi, 2).tolist()
@@ -419,7 +419,7 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Spawn:
-    """Where a drone stands at the start: ``position_m`` is on the ground under its centre."""
+    """A drone's starting position: ``position_m`` is on the ground below its centre."""
 
     name: str
     position_m: Vec3
@@ -428,7 +428,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` decides everything in it that is random (the walks of its targets)."""
+    """A whole world. ``seed`` determines everything random in it (the walks of its targets)."""
 
     name: str
     room: Room

@@ -1,7 +1,7 @@
-"""Reading worlds from TOML files.
+"""Read worlds from TOML files.
 
-Lengths are metres, speeds metres a second, angles **degrees** (their keys end in ``_deg``): people write these files,
-and this is the one place where degrees become radians. The files in ``worlds/`` show every table.
+Lengths are metres, speeds metres a second, angles **degrees** (with keys that end in ``_deg``), because people write
+these files; degrees become radians only here. The files in ``worlds/`` show every table.
 """
 
 from __future__ import annotations
@@ -79,15 +79,15 @@ from skyloop.sim.world_tables import (
 )
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
-_NEAREST_M = 0.01  # of two way points
-_WALL_GAP_M = 0.004  # posters and markers hang this far off their wall, so that the renderer need not choose
+_NEAREST_M = 0.01  # least distance of two waypoints
+_WALL_GAP_M = 0.004  # posters and markers are this far off their wall, so that the renderer has a clear order
 
 N = TypeVar("N", bound=Named)
 T = TypeVar("T")
 
 
 def shipped_worlds() -> tuple[str, ...]:
-    """Return the names of the worlds that come with Skyloop, in order."""
+    """Return the names of the shipped worlds, in order."""
     folder = resources.files("skyloop.sim") / "worlds"
     return tuple(sorted(e.name.removesuffix(".toml") for e in folder.iterdir() if e.name.endswith(".toml")))
 
@@ -96,11 +96,11 @@ def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
     """Load a world.
 
     Args:
-        name_or_path: A shipped world's name, or a file (anything that ends in ``.toml`` or has a separator).
-        seed: Of what is random in the world.
+        name_or_path: A shipped world's name, or a file (any name that ends in ``.toml`` or has a separator).
+        seed: Seed of everything random in the world.
 
     Raises:
-        UnknownNameError: No world of that name is shipped.
+        UnknownNameError: No shipped world has this name.
         FileFormatError: The file can't be read or understood.
         UsageError: The seed is not a whole number of at least 0.
     """
@@ -120,7 +120,7 @@ def parse_world(text: str, name: str = "world") -> World:
     """Parse a world from the text of a world file.
 
     Raises:
-        FileFormatError: The text is no valid world.
+        FileFormatError: The text is not a valid world.
     """
     return _read_world(text, f"{name}.toml", name)
 
@@ -164,7 +164,7 @@ def _read_world(text: str, source: str, name: str, seed: int = 0) -> World:
 
 def _box(table: BoxTable, name: str, room: Room, place: Place) -> Box:
     if table.stands_at is not None and table.position is not None:
-        raise place.error("position", "give it or 'stands_at', and not both")
+        raise place.error("position", "give either this or 'stands_at', not both")
     if table.stands_at is not None:
         key, position = "stands_at", (*table.stands_at, table.size[2] / 2)
     elif table.position is not None:
@@ -205,15 +205,15 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
     turn = math.radians(table.turn_deg)
     if table.on is None:
         if table.at is not None:
-            raise place.error("at", "unknown without 'on', which says on which face of the room it is")
+            raise place.error("at", "unknown without 'on', the face of the room")
         if table.position is None:
-            raise place.error("position", "missing; it must be a list of 3 numbers, or 'on' and 'at' given")
+            raise place.error("position", "missing; give a list of 3 numbers, or 'on' and 'at'")
         _require_inside(place, "position", table.position, room)
         yaw, elevation = math.radians(table.yaw_deg or 0.0), math.radians(table.elevation_deg or 0.0)
         return FacePose(table.position, yaw, elevation, turn)
     for key in ("position", "yaw_deg", "elevation_deg"):
         if getattr(table, key) is not None:
-            raise place.error(key, "unknown beside 'on', by which it hangs flat on a face of the room, at 'at'")
+            raise place.error(key, "unknown together with 'on', which mounts it flat on a face of the room, at 'at'")
     if table.at is None:
         raise place.error("at", "missing; it must be a list of 2 numbers")
     pose = _mounted(table.on, *table.at, turn, room)
@@ -222,7 +222,7 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
 
 
 def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room) -> FacePose:
-    """Return the pose of something that is mounted on a face of the room.
+    """Return the pose of an object on a face of the room.
 
     On a wall, ``along`` is x (north, south) or y (east, west) and ``other`` the height; on floor and ceiling they are x
     and y, and the image's up points east.
@@ -289,7 +289,7 @@ def _waypoints(table: WaypointsTable, room: Room, place: Place) -> Path:
     for point in points:
         _require_inside(place, "points", point, room)
     if len(set(points)) < len(points):
-        raise place.error("points", "a point stands twice in the list; each must differ from the others")
+        raise place.error("points", "a point is listed twice; all must differ")
     for one, other in itertools.pairwise([*points, points[0]] if table.closed else points):
         if math.dist(one, other) < _NEAREST_M:
             raise place.error("points", f"{list(one)} and {list(other)} are less than {_NEAREST_M:g} m apart")
@@ -333,7 +333,7 @@ def _spawn(table: SpawnTable, name: str, room: Room, place: Place) -> Spawn:
 
 def _require_order(place: Place, key: str, limits: Vec2) -> None:
     if limits[0] > limits[1]:
-        raise place.error(key, f"[{limits[0]:g}, {limits[1]:g}] is upside down; give [least, greatest]")
+        raise place.error(key, f"[{limits[0]:g}, {limits[1]:g}] is reversed; give [least, greatest]")
 
 
 def _require_inside(place: Place, key: str, point: Vec3, room: Room) -> None:
@@ -349,7 +349,7 @@ def _require_box_inside(place: Place, key: str, centre: Vec3, reach: Vec3, room:
         if c - r < low - 1e-9 or c + r > high + 1e-9:
             reached = f"{c - r:g} to {c + r:g}" if r else f"{c:g}"
             raise place.error(
-                key, f"{axis} = {reached} is outside of the room, where {axis} goes from {low:g} to {high:g}"
+                key, f"{axis} = {reached} is outside the room, where {axis} ranges from {low:g} to {high:g}"
             )
 
 
@@ -360,17 +360,17 @@ def _colour(text: str, place: Place) -> Rgb:
     return (int(digits[0:2], 16), int(digits[2:4], 16), int(digits[4:6], 16))
 
 
-_TRIES = 400  # for one thing's place
-_BEGINNINGS = 100  # of the whole: the first ones may have left no room for the last
+_TRIES = 400  # for the position of one object
+_BEGINNINGS = 100  # of the whole placement: the first objects may leave no room for the last
 
 Varied = BoxTable | GateTable | SpawnTable
 
 
 def place_varied(table: WorldTable, seed: int, place: Place) -> None:
-    """Move what varies to places that the seed decides, uniformly within its ranges.
+    """Move varied objects to positions determined by the seed, uniformly within their ranges.
 
     Raises:
-        FileFormatError: There is no room for all of it at the distance ``apart``.
+        FileFormatError: They do not fit at the distance ``apart``.
     """
     things = _varied(table)
     if not things:
@@ -398,7 +398,7 @@ def _varied(table: WorldTable) -> list[Varied]:
 
 
 def _places(things: list[Varied], apart_m: float, random: np.random.Generator) -> list[tuple[float, ...]] | None:
-    """Return a position for each thing, or None when one found no room."""
+    """Return a position for each object, or None if one found no room."""
     places: list[tuple[float, ...]] = []
     for thing in things:
         centre = _centre(thing)
@@ -413,7 +413,7 @@ def _places(things: list[Varied], apart_m: float, random: np.random.Generator) -
 
 
 def _centre(thing: Varied) -> tuple[float, float, float] | None:
-    """Return where it is written; None of a box without a place, which is refused later, by name."""
+    """Return the position in the file; None for a box without one, which is refused later, by name."""
     if isinstance(thing, BoxTable) and thing.stands_at is not None:
         return (*thing.stands_at, 0.0)
     return thing.position

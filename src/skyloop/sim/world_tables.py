@@ -1,4 +1,4 @@
-"""The tables of a world file, with what is allowed in each. Lengths [m], speeds [m/s], angles in degrees (``_deg``)."""
+"""The tables of a world file and their allowed values. Lengths [m], speeds [m/s], angles in degrees (``_deg``)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Cycles = Annotated[float, Meta(ge=0.0, le=20.0)]
 RingRadius = Annotated[float, Meta(ge=0.1)]
 RingHeight = Annotated[float, Meta(ge=0.0)]
 TurnRate = Annotated[float, Meta(ge=1.0, le=720.0)]
-#: Which there are depends on the dictionary.
+#: The valid ids depend on the dictionary.
 MarkerId = Annotated[Any, Meta(description="a whole number, a marker's in its dictionary")]
 
 
@@ -61,7 +61,7 @@ class WindTable(_Table, kw_only=True):
 
 
 class VariedTable(Named, kw_only=True):
-    """What the seed may place anywhere up to so far from where it is written."""
+    """An object that the seed may move up to this far from its position in the file."""
 
     vary: tuple[Amplitude, Amplitude, Amplitude] = (0.0, 0.0, 0.0)
     vary_yaw_deg: Annotated[float, Meta(ge=0.0, le=180.0)] = 0.0
@@ -190,7 +190,7 @@ class PlatformTable(BoardTable, kw_only=True, tag_field="kind", tag="platform"):
 
 
 class FigureTable(Named, kw_only=True, tag_field="kind", tag="figure"):
-    """The path is of the ground it stands on; the heading is that of the path unless given."""
+    """The path is on the ground below it; the heading is that of the path by default."""
 
     shape: Literal["person", "car"] = "person"
     path: PathTable
@@ -211,7 +211,7 @@ class SpawnTable(VariedTable, kw_only=True):
 
 
 class VaryTable(_Table, kw_only=True):
-    apart: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0  #: least distance in plan between what varies
+    apart: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0  #: least horizontal distance between varied objects
 
 
 class WorldTable(_Table, kw_only=True):

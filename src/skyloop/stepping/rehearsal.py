@@ -1,9 +1,9 @@
-"""Rehearsals: flights in simulated time, by a clock that stands still while the controller computes.
+"""Rehearsals: flights in simulated time, with a clock that stops while the controller computes.
 
 Simulator, driver, proxy and application share this process. Whenever the application waits, in
-:meth:`Controller.run`, for the next frame, or for a state, the time advances to what comes next. So a flight of a
-minute takes as long as its computation does, a slow machine misses nothing, and the same seeds give the same flight.
-Delay, loss and noise of the position between proxy and vehicle are simulated.
+:meth:`Controller.run`, for the next frame or for a state, time advances to the next event. A flight of a minute
+therefore takes as long as its computation, a slow machine misses nothing, and the same seeds give the same flight.
+Delay, loss and position noise between proxy and vehicle are simulated.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ from skyloop.vehicles.sim.options import options_of
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera, SteppedCameraPipeline
 
-_BEGIN_NS: Final = 10 * NS_PER_S
-_CONNECT_S: Final = 20.0
+_BEGIN_NS: Final = 10 * NS_PER_S  #: start of the simulated clock
+_CONNECT_S: Final = 20.0  #: limit for connecting
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Radio:
 
     command_delay_s: float = 0.04
     feedback_delay_s: float = 0.02
-    picture_delay_s: float = 0.02  #: of frames, in addition to the camera's own latency
+    picture_delay_s: float = 0.02  #: delay of frames, in addition to the camera's own latency
     drop: float = 0.05  #: probability that a command, a sample of feedback or a frame is lost
     position_noise_m: float = 0.01  #: standard deviation of each component of the position in feedback
     seed: int = 0
@@ -72,21 +72,21 @@ class Radio:
 def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
     """Connect as a pilot to a drone of a simulated world.
 
-    Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, without real time.
+    Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, not in real time.
 
     Args:
-        uri: As of ``sim://``, without ``speed``.
+        uri: A ``sim://`` address without ``speed``.
         radio: Between proxy and vehicle; None takes the defaults.
 
     Yields:
         The connected drone.
 
     Raises:
-        UsageError: The address is not one of ``sim://``, or has a ``speed``.
+        UsageError: The address is not a ``sim://`` address, or has a ``speed``.
     """
     address = parse_uri(uri)
     if address.scheme != "sim" or "speed" in address.options:
-        raise UsageError(f"{uri} can't be rehearsed: it must be an address as sim://?seed=3, without speed")
+        raise UsageError(f"{uri} can't be rehearsed: give an address such as sim://?seed=3, without speed")
     clock = ManualClock(_BEGIN_NS)
     host = SteppedHost(replace(options_of(address), speed=1.0), clock)
     driver = _RehearsalDriver(address, host, radio or Radio(), clock)
@@ -113,14 +113,14 @@ class _RehearsalDriver(SimDriver):
         self._radio = radio
         self._clock = clock
         self._random = random.Random(f"rehearsal/{radio.seed}")
-        # A generator of its own, so that cameras don't change the losses of commands and feedback.
+        # A separate generator, so that cameras don't change the losses of commands and feedback.
         self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
         self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap by time of arrival
         self._numbers = itertools.count()
 
     @property
     def due_ns(self) -> int | None:
-        """When the world is to be stepped, or something arrives."""
+        """When the next step or arrival is due."""
         assert isinstance(self.host, SteppedHost)
         step_ns = self.host.due_ns
         if step_ns is None or not self._on_the_way:
@@ -128,7 +128,7 @@ class _RehearsalDriver(SimDriver):
         return min(step_ns, self._on_the_way[0][0])
 
     def step(self) -> None:
-        """Do what is due: arrivals first."""
+        """Do the due work, arrivals first."""
         assert isinstance(self.host, SteppedHost)
         if self._on_the_way and self._on_the_way[0][0] <= self._clock.now_ns:
             heapq.heappop(self._on_the_way)[2]()
@@ -162,7 +162,7 @@ class _RehearsalDriver(SimDriver):
 
 
 class _NoisySink:
-    """A sink that adds noise to positions and passes on all else unchanged."""
+    """A sink that adds noise to positions and passes everything else on unchanged."""
 
     def __init__(self, sink: Sink, noise_m: float, chance: random.Random) -> None:
         self._sink = sink
@@ -185,17 +185,17 @@ _STEPS = round(TICK_S / STEP_S)
 class SteppedHost(SimHost):
     """A :class:`SimHost` without threads.
 
-    :meth:`step` advances by :data:`~skyloop.sim.host.TICK_S`, reports to the observers and delivers the frames that are
-    due, on the caller's thread. ``speed`` of the options has no effect.
+    :meth:`step` advances by :data:`~skyloop.sim.host.TICK_S`, reports to the observers and delivers due frames, on the
+    caller's thread. The option ``speed`` has no effect.
     """
 
     def __init__(self, options: SimOptions, clock: Clock, drones: int = 1) -> None:
         """Initialise the world.
 
         Args:
-            options: Of the simulation.
-            clock: Of the observers' samples; the caller moves it to :attr:`due_ns` before a step.
-            drones: How many drones the world has.
+            options: Options of the simulation.
+            clock: Clock of the observers' samples; the caller moves it to :attr:`due_ns` before a step.
+            drones: Number of drones in the world.
         """
         super().__init__(options, drones)
         self._clock = clock
@@ -203,7 +203,7 @@ class SteppedHost(SimHost):
 
     @property
     def due_ns(self) -> int | None:
-        """When the next step is due on the clock; None while no observer is attached."""
+        """When the next step is due on the clock; None without an observer."""
         return None if self._manual_stepper is None else self._manual_stepper.due_ns
 
     def step(self) -> None:
@@ -216,7 +216,7 @@ class SteppedHost(SimHost):
         return self._manual_stepper
 
     def ended(self) -> None:
-        """Forget the stepper: the last observer was detached."""
+        """Forget the stepper after the last observer was detached."""
         self._manual_stepper = None
 
 

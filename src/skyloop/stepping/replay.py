@@ -1,10 +1,9 @@
 """A replay in step with its application: ``skyloop.connect("replay://flight.mcap?speed=max")``.
 
-Proxy, recording and application share this process, and a clock that stands still while the application's code runs.
-Whenever the application waits, for the next frame, for a state, or in :meth:`Controller.run`, the clock advances to
-what comes next: a sample of the recording, a repeat of a command, a tick of the proxy. So each sample is consumed
-before the next one exists, the application sees the recording's times, and two runs of one controller give the same
-commands.
+Proxy, recording and application share this process, with a clock that stops while the application's code runs. Whenever
+the application waits, for the next frame, for a state or in :meth:`Controller.run`, the clock advances to the next
+event: a sample of the recording, a repeat of a command, a tick of the proxy. Each sample is therefore consumed before
+the next one exists, the application sees the recording's times, and two runs of one controller give the same commands.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from skyloop.stepping.transport import StepExecutor, SteppedServer
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
-LEAD_NS: Final = NS_PER_S  #: time before the recording starts: for connecting, which takes a few ticks
+LEAD_NS: Final = NS_PER_S  #: time before the recording starts, to connect in a few ticks
 
 
 def connector(uri: str) -> SteppedReplay | None:
@@ -30,7 +29,7 @@ def connector(uri: str) -> SteppedReplay | None:
         uri: The address, ``replay://…``.
 
     Returns:
-        The replay for ``speed=max``; None for any other, which a private proxy serves.
+        The replay for ``speed=max``; None for other addresses, which a private proxy serves.
 
     Raises:
         UsageError: The address or the recording is invalid.
@@ -40,13 +39,13 @@ def connector(uri: str) -> SteppedReplay | None:
 
 
 class SteppedReplay:
-    """The proxy of a replay, and the time that it shares with its one application."""
+    """The proxy of a replay, and the time shared with its one application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
         """Start the proxy.
 
         Args:
-            driver: Of the replay.
+            driver: The replay's driver.
         """
         self.reach = None
         self._executor = StepExecutor("skyloop-stepping")
@@ -65,8 +64,8 @@ class SteppedReplay:
         self._server = server
         self._ended = False
 
-    def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (it serves already)
-        """Return how to connect to the proxy, which serves already."""
+    def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (the proxy is already serving)
+        """Return a dialer for the proxy, which is already serving."""
         return self._server.dial
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Simulated time for a client: it advances while the application waits, and stands still while its code runs."""
+"""Simulated time for a client, which advances while the application waits and stops while its code runs."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _NEVER_NS: Final = 1 << 62
 
 
 class StepSource(Protocol):
-    """What makes time advance: the samples of a recording, or the steps of a simulated world."""
+    """Makes time advance: the samples of a recording, or the steps of a simulated world."""
 
     @property
     def due_ns(self) -> int | None:
         """When the next one is due; None after the last."""
 
     def step(self) -> None:
-        """Publish the next sample, or do the next step, which is due now."""
+        """Publish the next sample or do the next step, which is due now."""
 
 
 class StepScheduler(Scheduler):
@@ -47,10 +47,10 @@ class StepScheduler(Scheduler):
         """Initialise the time.
 
         Args:
-            clock: The clock that is advanced.
+            clock: The clock to advance.
             executor: The thread that runs everything but the application's code.
             proxy: Its ticks are part of the time.
-            source: Returns what is to be published or stepped; None while there is nothing yet.
+            source: Returns the source of samples or steps; None while there is none yet.
             begin_ns: Start of the recording.
         """
         super().__init__(clock)
@@ -62,9 +62,9 @@ class StepScheduler(Scheduler):
         self._supervisor: ConnectionSupervisor | None = None
         self._supervisor_due_ns = 0
         self._tick_due_ns = clock.now_ns
-        self._begun = False  # the recording runs: the application is connected
+        self._begun = False  # the application is connected and the recording runs
         self._end_ns = _NEVER_NS
-        self._turn = threading.Lock()  # held by the one thread for which the time advances
+        self._turn = threading.Lock()  # held by the one thread that advances the time
         self._interrupted = False
 
     def notifier(self) -> Notifier:
@@ -76,32 +76,32 @@ class StepScheduler(Scheduler):
         return StepNotifier(self)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
-        """Store the supervisor of the connection, which is called as the time advances."""
+        """Store the connection's supervisor, which is called as the time advances."""
         self._supervisor = supervisor
 
     def opened(self) -> None:
-        """Advance to the recording's start; from here on its samples are published."""
+        """Advance to the recording's start; from now on its samples are published."""
         self.wait_for(lambda: False, (self._begin_ns - self._time.now_ns) / NS_PER_S, lambda: False)
         self._begun = True
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None, sleep: Callable[[], bool]) -> bool:
         """Advance the time until ``ready()`` is true.
 
-        Where another thread waits already, the time advances for that one, and ``sleep()`` waits as usual.
+        If another thread is already waiting, it advances the time, and ``sleep()`` waits here as usual.
 
         Args:
             ready: Evaluated after each step, on the executor's thread.
-            timeout_s: Of the recording's time; None waits until 60 s after the recording's end.
+            timeout_s: In the recording's time; None waits until 60 s after the recording's end.
             sleep: Waits in real time.
 
         Returns:
             Whether it became ready.
 
         Raises:
-            UsageError: Called on the executor's thread, that is from an inline callback.
+            UsageError: Called on the executor's thread, as from an inline callback.
         """
         if self._executor.is_current:
-            raise UsageError("this is called for a sample in step with the recording, and can't wait for the next one")
+            raise UsageError("a callback in step with the recording can't wait for the next sample")
         if not self._turn.acquire(blocking=False):
             return sleep()
         try:
@@ -124,7 +124,7 @@ class StepScheduler(Scheduler):
         return True
 
     def _step(self, until_ns: int) -> bool:
-        """Do what comes next; return False if that is later than the time given, or if nothing comes any more."""
+        """Process the next event; return False if it is later than the given time, or if there is none."""
         supervisor, steps, time = self._supervisor, self._source(), self._time
         if supervisor is not None and (supervisor.connection.poked or self._supervisor_due_ns <= time.now_ns):
             self._attend(supervisor)
@@ -174,7 +174,7 @@ class StepNotifier(Notifier):
 
         Args:
             ready: Whether the wait is over.
-            timeout_s: Of the recording's time; None sets no limit.
+            timeout_s: In the recording's time; None sets no limit.
 
         Returns:
             Whether it became ready within that time.

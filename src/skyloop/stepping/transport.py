@@ -1,4 +1,4 @@
-"""A transport within one thread: what one end sends is delivered to the other before anything else happens."""
+"""A transport within one thread: a packet reaches the other end before anything else happens."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _log = logging.getLogger("skyloop")
 
 
 class StepExecutor:
-    """One thread that runs everything but the application's own code, in the order in which it was posted."""
+    """One thread that runs everything but the application's own code, in the order of posting."""
 
     def __init__(self, name: str) -> None:
         """Start the thread.
 
         Args:
-            name: Of the thread.
+            name: Name of the thread.
         """
         self._jobs: SimpleQueue[Job | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -44,22 +44,22 @@ class StepExecutor:
 
     @property
     def is_current(self) -> bool:
-        """Whether the calling thread is the executor's."""
+        """Whether this is the executor's thread."""
         return threading.current_thread() is self._thread
 
     def post(self, job: Job) -> None:
-        """Run a job after what was posted before.
+        """Queue a job.
 
         Args:
-            job: An exception that it raises is logged.
+            job: Its exceptions are logged.
         """
         self._jobs.put(job)
 
     def call(self, job: Job, interrupt: Job) -> None:
-        """Run a job after what was posted before, and wait until it has returned.
+        """Queue a job and wait until it has returned.
 
         Args:
-            job: What to run; what it raises is raised here.
+            job: The job; its exceptions are raised here.
             interrupt: Called on the calling thread after Ctrl-C, to make ``job`` return.
         """
         done = threading.Lock()
@@ -85,7 +85,7 @@ class StepExecutor:
             raise raised[0]
 
     def run_pending(self) -> None:
-        """Run all posted jobs, and those that they post. To be called on the executor's thread only."""
+        """Run all posted jobs and those that they post. Call it only on the executor's thread."""
         while True:
             try:
                 job = self._jobs.get_nowait()
@@ -97,7 +97,7 @@ class StepExecutor:
             _run_logged(job)
 
     def close(self) -> None:
-        """End the thread after what was posted before. Idempotent."""
+        """Run the posted jobs, then end the thread. Idempotent."""
         self._jobs.put(None)
         if not self.is_current:
             self._thread.join()
@@ -139,9 +139,7 @@ class SteppedServer(TransportServer):
         if server is None:
             raise LinkError("the replay has ended")
         if self._client is not None:
-            raise LinkError(
-                "a replay with speed=max is in step with one application, and that one is connected already"
-            )
+            raise LinkError("a replay with speed=max is in step with one application, which is already connected")
         self._number += 1
         peer = Peer(self._number, "this process")
         client = self._client = SteppedClient(self, self._executor, peer, handler)
@@ -150,7 +148,7 @@ class SteppedServer(TransportServer):
 
     def start(self, handler: ServerHandler) -> None:
         if self._handler is not None:
-            raise UsageError("the replay is served already")
+            raise UsageError("the replay is already being served")
         self._handler = handler
 
     def stop(self) -> None:
@@ -196,12 +194,12 @@ class SteppedServer(TransportServer):
         return ADDRESS
 
     def receive(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet of the client. To be called on the executor's thread."""
+        """Handle a packet of the client. Call it only on the executor's thread."""
         if self._handler is not None:
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection, once; each end's handler is called after what was sent before."""
+        """End a connection, once; each end's handler is called after the earlier packets."""
         if self._client is not client:
             return
         self._client = None

@@ -1,7 +1,7 @@
-"""A tracker that notices when it lost its target, and a memory of looks, by which it finds that and nothing else.
+"""A tracker that notices when it has lost its target, and a memory of appearances that recognises it again.
 
-The division into tracking, a memory that verifies, and detection by that memory is that of Kalal, Mikolajczyk and
-Matas, "Tracking-learning-detection", TPAMI 34, 2012.
+The division into tracking, a verifying memory and detection by that memory follows Kalal, Mikolajczyk and Matas,
+"Tracking-learning-detection", TPAMI 34, 2012.
 """
 
 from __future__ import annotations
@@ -32,63 +32,63 @@ from skyloop.vision.tracking import (
     patch,
 )
 
-_VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box is the target's
-_SURE: Final = 0.6  # from which its appearance is learned
-_FOUND: Final = 0.55  # from which a place is worth a trial, while the target is lost
-_UNLIKE_OTHERS: Final = 0.15  # by which a place must be more similar than any other one, and than known look-alikes
-_LOOK_ALIKE: Final = 0.4  # from which something beside the target is remembered as its look-alike
-_PATIENCE: Final = 10  # images without verification after which the target is searched for everywhere
-_TRIAL: Final = 3  # images in which a place that was found must be verified
-_LEARN_EACH: Final = 5  # images
-_LOOK_AROUND_EACH: Final = 15  # images
-_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # of the last one, searched in turn, one in each image
+_VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box counts as verified
+_SURE: Final = 0.6  # similarity from which the appearance is learned
+_FOUND: Final = 0.55  # similarity from which a place is worth a trial while the target is lost
+_UNLIKE_OTHERS: Final = 0.15  # margin by which a place must be more similar than any other place and known look-alike
+_LOOK_ALIKE: Final = 0.4  # similarity from which something beside the target is remembered as a look-alike
+_PATIENCE: Final = 10  # images without verification before the whole image is searched
+_TRIAL: Final = 3  # images in which a found place must be verified
+_LEARN_EACH: Final = 5  # learn at most every this many images
+_LOOK_AROUND_EACH: Final = 15  # look for look-alikes every this many images
+_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # shares of the target's last size, searched one per image
 
-# Score, and the share of such boxes that overlapped the target by a half: `python -m benchmarks.tracking_street`.
+# Score, and share of such boxes with an overlap of at least a half: `python -m benchmarks.tracking_street`.
 _CONFIDENCE: Final = ((0.45, 0.857), (0.55, 0.946), (0.65, 0.974), (0.75, 0.986), (0.85, 0.986), (0.95, 0.989))
-_PLACES: Final = 5  # across a box, at which its colours are taken
-_ASIDE: Final = 0.12  # of its width, from one to the next
-_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # from the top, as shares of its height
-_SIZE: Final = (24, 24)  # of the stored patch, whatever the target's shape
+_PLACES: Final = 5  # strips across a box in which its colours are sampled
+_ASIDE: Final = 0.12  # offset between neighbouring strips, of the box's width
+_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as shares of the height
+_SIZE: Final = (24, 24)  # stored patch, regardless of the target's shape
 _GRADIENTS: Final = 7  # the first channels of the features
-_COLOUR_WEIGHT: Final = 1.2
-_KEPT: Final = 12  # appearances, and as many look-alikes
-_NEW_BELOW: Final = 0.9  # an appearance that is more similar to a known one adds nothing
-_SEARCHED_PX: Final = 16.0  # side of the target in the shrunk image that is searched
+_COLOUR_WEIGHT: Final = 1.2  # how fast the similarity falls with the colour distance
+_KEPT: Final = 12  # appearances kept, and as many look-alikes
+_NEW_BELOW: Final = 0.9  # an appearance more similar to a known one is not added
+_SEARCHED_PX: Final = 16.0  # side of the target in the shrunk search image
 _LEAST_MATCH: Final = 0.35  # correlation of a place worth a look
-_WORTH_NUDGING: Final = 0.2  # similarity; a fifth of the size aside it is more
-_NUDGE: Final = 0.08  # of the target's size
-_GROWTH: Final = (0.9, 1.1)
+_WORTH_NUDGING: Final = 0.2  # similarity from which to refine a place; a fifth of the size aside it is higher
+_NUDGE: Final = 0.08  # step of the refinement, of the target's size
+_GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:
-    """Return the estimated chance, 0 to 1, that a box of a score overlaps the target by a half or more; monotone."""
+    """Return the estimated chance, 0 to 1, that a box with a score overlaps the target by at least a half; monotone."""
     return float(np.interp(score, [at for at, _ in _CONFIDENCE], [share for _, share in _CONFIDENCE]))
 
 
 class _State(Enum):
     TRACKING = "tracking"
-    ON_TRIAL = "on trial"  # found again, and not yet believed
+    ON_TRIAL = "on trial"  # found again, not yet trusted
     LOST = "lost"
 
 
 class LongTermTracker(Tracker):
-    """Tracks a target, says when it is lost, and finds it again anywhere in the image.
+    """Tracks a target, reports its loss, and finds it again anywhere in the image.
 
-    Another tracker follows the target. Each box that it returns is compared with a memory of the target's appearances,
-    which learns when it is sure, and with that of look-alikes seen beside it. A box that is not verified is not
-    returned: the result is lost. After ten such images the whole image is searched, for one size in each. A place that
-    is similar enough, clearly more so than any other place and than every known look-alike, is tracked on trial and
-    returned after three images.
+    Another tracker follows the target. Each of its boxes is compared with a memory of the target's appearances, learned
+    from boxes that match well, and with look-alikes seen beside it. A box that is not verified is not returned: the
+    result is lost. After ten such images the whole image is searched, one size per image. A place that is similar
+    enough, and clearly more so than any other place and any known look-alike, is tracked on trial and returned after
+    three images.
 
-    So a target that was hidden beside a twin stays lost, as nothing tells them apart: start again with a new box. The
-    score is the similarity to the nearest appearance, and the confidence is calibrated on the simulator's figures.
+    A target that was hidden beside a twin therefore stays lost, because nothing distinguishes them: start again with a
+    new box. The score is the similarity to the nearest appearance; its confidence is calibrated on simulated figures.
     """
 
     def __init__(self, tracker: Callable[[], Tracker] = CorrelationTracker) -> None:
         """Prepare the tracker.
 
         Args:
-            tracker: Makes the tracker that follows the target; it is started again after each loss.
+            tracker: Creates the tracker that follows the target; restarted after each loss.
 
         Raises:
             MissingExtraError: OpenCV is not installed.
@@ -97,40 +97,40 @@ class LongTermTracker(Tracker):
         self._tracker = tracker()
 
     def shift(self, right: float, down: float) -> None:
-        """Look for the target so much farther right and down in the next image [px], unless it is lost."""
+        """Search for the target shifted by this much to the right and down in the next image [px], unless lost."""
         if self._shape is not None and self._state is not _State.LOST:
             self._tracker.shift(right, down)
 
     def similarity(self, image: Image, box: Sequence[float]) -> float:
-        """Return how much what is in a box looks like the target, 0 to 1; 0 if it looks more like a known look-alike.
+        """Return the similarity of a box's content to the target, 0 to 1; 0 if a known look-alike fits better.
 
         Args:
             image: As in :meth:`update`.
             box: x, y, width, height [px].
 
         Raises:
-            UsageError: The tracker was not started, or the box is not one.
+            UsageError: The tracker was not started, or the box is invalid.
         """
         pixels, checked = self._known(image, box)
         seen = self._memory.judged(pixels, checked)
         return 0.0 if _is_other(seen) else seen.similarity
 
     def resume(self, image: Image, box: Sequence[float]) -> None:
-        """Go on from a box, in which something else found the target, with all that is remembered of its looks.
+        """Continue from a box in which another detector found the target, keeping all remembered appearances.
 
         Args:
             image: As in :meth:`update`, which is called with the next one.
             box: x, y, width, height [px].
 
         Raises:
-            UsageError: The tracker was not started, or the box is not one.
+            UsageError: The tracker was not started, or the box is invalid.
         """
         pixels, checked = self._known(image, box)
         self._tracker.start(pixels, checked)
         self._state, self._count, self._size = _State.TRACKING, 0, checked[2:]
 
     def refuse(self) -> None:
-        """Take the target for lost, because something else shows that what was followed is not the target.
+        """Mark the target as lost, because other evidence shows that the tracked thing is not the target.
 
         Raises:
             UsageError: The tracker was not started.
@@ -170,7 +170,7 @@ class LongTermTracker(Tracker):
         return TrackResult(seen.box, seen.similarity, confidence(seen.similarity))
 
     def _doubt(self, seen: Candidate | None) -> TrackResult:
-        """Go on for a while with a target that is not verified; give up at once on one on trial, or another one."""
+        """Keep an unverified target for a while; drop a target on trial, or a clear look-alike, at once."""
         self._count += 1
         mistaken = seen is not None and _is_other(seen)
         if self._state is _State.ON_TRIAL or mistaken or self._count >= _PATIENCE:
@@ -202,13 +202,13 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Whether it is clearly a look-alike; an exact twin is not: while it is tracked, continuity tells them apart."""
+    """Return whether a place clearly shows a look-alike; an exact twin is distinguished only by tracking."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
-    """What was in a box once."""
+    """The appearance of a box's content in one image."""
 
     pixels: Image  #: the patch, 24×24
     texture: Floats  #: its gradients in cells, of length 1
@@ -216,7 +216,7 @@ class Appearance:
 
     @classmethod
     def of(cls, cv: Any, image: Image, box: Box) -> Appearance:
-        """Take what is in a box of an image."""
+        """Take the appearance of a box in an image."""
         pixels = patch(cv, image, box, _SIZE)
         cells = features(cv, pixels)
         gradients, rest = cells[:_GRADIENTS].ravel(), cells[_GRADIENTS:]
@@ -225,17 +225,17 @@ class Appearance:
         return cls(pixels, np.asarray(both / math.sqrt(2), np.float32), rest[1:])
 
     def similarity(self, other: Appearance) -> float:
-        """Return how much they look alike, 0 to 1: texture and colour must both agree."""
+        """Return the similarity of two appearances, 0 to 1: texture and colour must both agree."""
         texture = within(float(self.texture @ other.texture), 0.0, 1.0)
         colour = float(np.abs(self.colour - other.colour).mean()) if self.colour.size else 0.0
         return texture * math.exp(-_COLOUR_WEIGHT * colour)
 
 
 def colours(image: Image, box: Box) -> Floats:
-    """Return the colours of the upper and the lower half of what is in a box, (5, 6) float32: L, a, b of each (CIELAB).
+    """Return the colours of a box's upper and lower half, (5, 6) float32: L, a, b of each (CIELAB).
 
-    Five times, each of a third of its width, from left to right: with an arm or a leg stretched out, a person is not in
-    the middle of the box, and what is there is background.
+    One row for each of five strips, a third of the width each, from left to right: a person with an arm or a leg
+    stretched out is not in the middle of the box, where the background shows instead.
 
     Args:
         image: uint8, (h, w, 3) BGR or (h, w) grey.
@@ -259,7 +259,7 @@ def colours(image: Image, box: Box) -> Floats:
 
 
 def _within(low: float, high: float, most: int) -> tuple[int, int]:
-    """Return the pixels from low to high that are within the image, one at least."""
+    """Return the range of pixels from low to high within the image, at least one pixel."""
     first = min(max(0, math.floor(low)), most - 1)
     return first, min(max(first + 1, math.ceil(high)), most)
 
@@ -274,9 +274,9 @@ class Candidate:
 
 
 class TargetMemory:
-    """Several appearances of one target, and what was seen beside it that looks like it.
+    """Several appearances of one target, and look-alikes seen beside it.
 
-    The first appearance is what the user pointed at, and is never forgotten.
+    The first appearance, which the user selected, is never forgotten.
     """
 
     def __init__(self, cv: Any, image: Image, box: Box) -> None:
@@ -287,28 +287,28 @@ class TargetMemory:
         self._turn = 0
 
     def judged(self, image: Image, box: Box) -> Candidate:
-        """Compare what is in a box with everything that is remembered."""
+        """Compare the content of a box with everything remembered."""
         seen = Appearance.of(self._cv, image, box)
         return Candidate(box, _nearest(seen, self._appearances), _nearest(seen, self._look_alikes))
 
     def learn(self, image: Image, box: Box) -> None:
-        """Remember the target's present appearance, unless it is known."""
+        """Remember the target's current appearance, unless it is known."""
         _add(self._appearances, Appearance.of(self._cv, image, box), keep_first=True)
 
     def learn_look_alike(self, image: Image, box: Box) -> None:
-        """Remember something else that looks like the target."""
+        """Remember a look-alike."""
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Look for the target in the whole image, each time with another one of its appearances.
+        """Search the whole image for the target, each time by another of its appearances.
 
         Args:
             image: The image.
-            size: Width and height to look for [px].
-            besides: Places that share more than a tenth with this box are left out.
+            size: Width and height of the target [px].
+            besides: Skip places that share more than a tenth with this box.
 
         Returns:
-            The three best places at most, the most similar first.
+            At most the three best places, the most similar first.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
         rows, columns = image.shape[:2]
@@ -325,7 +325,7 @@ class TargetMemory:
         found = []
         for _ in range(3):
             _, best, _, (x, y) = cv.minMaxLoc(match)
-            if not best >= _LEAST_MATCH:  # not a number in a part without texture
+            if not best >= _LEAST_MATCH:  # NaN in a part without texture
                 break
             box = (x / wide, y / high, float(size[0]), float(size[1]))
             if besides is None or overlap(box, besides) < 0.1:
@@ -335,7 +335,7 @@ class TargetMemory:
         return sorted(found, key=lambda one: -one.similarity)
 
     def _nudged(self, image: Image, box: Box) -> Candidate:
-        """Return the most similar of the boxes near a box, unless it is nothing like it: the search was coarse."""
+        """Refine the coarse search: return the most similar of the boxes nearby, unless the place is hopeless."""
         rough = self.judged(image, box)
         if rough.similarity < _WORTH_NUDGING:
             return rough

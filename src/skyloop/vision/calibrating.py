@@ -1,9 +1,9 @@
-"""Calibration of a camera from views of a board, and the boards: printed, and detected in images.
+"""Calibration boards, printed and detected in images, and the calibration of a camera from views of a board.
 
-ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a part of the board is
-enough (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
-Pattern Recognition 47(6), 2014; detection is OpenCV's). A chessboard must be seen as a whole (Duda and Frese, "Accurate
-Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
+ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a partial view suffices
+(Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
+Pattern Recognition 47(6), 2014; detection is OpenCV's). A plain chessboard must be entirely in view (Duda and Frese,
+"Accurate Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
 
 Calibration: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
 for both models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
@@ -28,16 +28,16 @@ from skyloop.vision.opencv import marker_dictionary, opencv
 Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
-_MARKER_SHARE = 0.74  # of a square's side
-_LEAST_CORNERS = 8  # of a ChArUco board in an image
+_MARKER_SHARE = 0.74  # marker's side, as a share of a square's side
+_LEAST_CORNERS = 8  # corners of a ChArUco board needed in an image
 Model = Literal["pinhole", "fisheye"]
 
-LEAST_VIEWS: Final = 6
+LEAST_VIEWS: Final = 6  #: needed for a calibration
 GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
-_WORST_SHARE: Final = 2.5  # a view whose error is more than so many times the median is removed,
-_WORST_PX: Final = 0.3  # if it is larger than this
-_NEW_SHARE: Final = 0.08  # of the image's width: a view whose corners moved less than this is no new one
-_STEPS: Final = (60, 1e-8)
+_WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
+_WORST_PX: Final = 0.3  # ... and above this
+_NEW_SHARE: Final = 0.08  # share of the image's width: a view is new only if its corners moved at least this far
+_STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class BoardView:
 
     points: Array  #: (n, 3) on the board [m]
     pixels: Array  #: (n, 2) in the image
-    name: str = ""  #: of the image, for messages
+    name: str = ""  #: name of the image, for messages
 
     @property
     def centre(self) -> Array:
@@ -64,9 +64,9 @@ class Board:
 
     columns: int = 7
     rows: int = 5
-    square_m: float = 0.033  #: side of a square as it was printed: measure it
+    square_m: float = 0.033  #: side of a printed square: measure it
     kind: Kind = "charuco"
-    dictionary: str = "4x4_50"  #: of a ChArUco board's markers
+    dictionary: str = "4x4_50"  #: dictionary of a ChArUco board's markers
 
     def __post_init__(self) -> None:
         for name, least in (("columns", 3), ("rows", 3)):
@@ -84,7 +84,7 @@ class Board:
         return (self.columns - 1) * (self.rows - 1)
 
     def picture(self, square_px: int = 100) -> NDArray[np.uint8]:
-        """Draw the board with a margin of half a square of white.
+        """Draw the board with a white margin of half a square.
 
         Args:
             square_px: Side of a square.
@@ -115,7 +115,7 @@ class Board:
             dpi: Resolution; it is adapted slightly so that a square has a whole number of pixels.
 
         Raises:
-            UsageError: The ending is another one, or a square would not have 20 to 2000 pixels.
+            UsageError: The file name has another ending, or a square would not have 20 to 2000 pixels.
             MissingExtraError: Pillow or OpenCV is not installed.
         """
         file = Path(path)
@@ -128,9 +128,9 @@ class Board:
         square_px = round(self.square_m * 1000 / MM_PER_INCH * dpi)
         if not 20 <= square_px <= 2000:
             raise UsageError(
-                f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, not 20 to 2000"
+                f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, and must be 20 to 2000"
             )
-        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # makes a square exactly its size
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # gives a square exactly its size
         with replacing(file) as part:
             if file.suffix.lower() == ".pdf":
                 Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)
@@ -142,7 +142,7 @@ class Board:
         needed, there = self.columns * self.rows // 2, markers.bytesList.shape[0]
         if needed > there:
             raise UsageError(
-                f"a board of {self.columns}x{self.rows} squares needs {needed} markers, and there are {there}"
+                f"a board of {self.columns}x{self.rows} squares needs {needed} markers, but the dictionary has {there}"
             )
         side = self.square_m * _MARKER_SHARE
         return cv.aruco.CharucoBoard((self.columns, self.rows), self.square_m, side, markers)
@@ -152,7 +152,7 @@ class BoardFinder:
     """Detects one board in images. Holds OpenCV's scratch memory: use one finder per thread.
 
     Attributes:
-        board: The board that is detected.
+        board: The board to detect.
     """
 
     def __init__(self, board: Board) -> None:
@@ -175,13 +175,13 @@ class BoardFinder:
 
         Args:
             image: (h, w, 3) BGR or (h, w) grey, uint8.
-            name: Of the image; the view keeps it.
+            name: Name of the image, kept in the view.
 
         Returns:
-            The board's corners; None if it is not seen well enough.
+            The board's corners; None if it is not visible enough.
 
         Raises:
-            UsageError: The array has another shape or type, or is empty.
+            UsageError: The array has a wrong shape or type, or is empty.
         """
         pixels = np.asarray(image)
         if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
@@ -213,7 +213,7 @@ class BoardFinder:
 
 
 class Collector:
-    """Selects, from many images of a board, views that differ enough from the ones selected before. Pure.
+    """Selects views of a board that differ enough from those selected before. Pure.
 
     Attributes:
         views: The selected views.
@@ -223,11 +223,11 @@ class Collector:
     def __init__(self, width: int, height: int) -> None:
         """Initialise an empty collection for images of one size [px]."""
         self.views: list[BoardView] = []
-        self.size = (width, height)  #: of the images
+        self.size = (width, height)  #: width and height of the images [px]
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
-        """Select a view if it shows the board elsewhere, nearer, farther or at another tilt.
+        """Select a view if it shows the board at a new place, distance or tilt.
 
         Returns:
             Whether it was selected.
@@ -250,9 +250,9 @@ def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
     """Return the share of the cells of a grid over the image that hold a corner, 0 to 1.
 
     Args:
-        views: Of one camera.
-        width: Of the images [px].
-        height: Of the images [px].
+        views: Views of one camera.
+        width: Width of the images [px].
+        height: Height of the images [px].
     """
     cells = np.zeros(GRID, dtype=bool)
     for view in views:
@@ -269,10 +269,10 @@ def calibrate(
 
     Args:
         views: At least 6, with the board at different places and tilts.
-        width: Of the images [px].
-        height: Of the images [px].
+        width: Width of the images [px].
+        height: Height of the images [px].
         model: ``"pinhole"`` or ``"fisheye"``.
-        camera: The camera's name, which the calibration keeps.
+        camera: The camera's name, stored in the calibration.
 
     Returns:
         The calibration, and the views that were removed as outliers.
@@ -286,7 +286,7 @@ def calibrate(
     kept, rejected = list(views), list[BoardView]()
     while True:
         if len(kept) < LEAST_VIEWS:
-            more = f" ({len(rejected)} did not go with the others)" if rejected else ""
+            more = f" ({len(rejected)} did not fit the others)" if rejected else ""
             raise UsageError(
                 f"{len(kept)} views of the board are too few{more}: show it at least {LEAST_VIEWS} times, tilted"
             )
@@ -319,7 +319,7 @@ class _Fit(NamedTuple):
     rms: float
     matrix: Array
     distortion: Array
-    errors: Array  # of each view [px], RMS
+    errors: Array  # RMS error of each view [px]
     fx_deviation: float | None
 
 
@@ -342,8 +342,8 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # Without k3: from few images it is mostly noise, and bends the corners, where nothing was seen. Lenses that need it
-    # are fisheyes.
+    # Without k3: estimated from few images it is mostly noise, and bends the image's corners, where nothing was seen.
+    # Lenses that need it are fisheyes.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )
@@ -366,12 +366,12 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """OpenCV 4 has flags of its own for fisheyes, with other values; OpenCV 5 has one set."""
+    """Return a fisheye flag: OpenCV 4 has separate ones with other values, OpenCV 5 has one set."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 
 def _mark(view: BoardView) -> Array:
-    """Return what distinguishes two views: where four points of the board are in the image, (8,) [px]."""
+    """Return a signature to compare views: the pixels of four points of the board, (8,) [px]."""
     cv = opencv("calibration")
     ends = np.array([view.points.min(axis=0)[:2], view.points.max(axis=0)[:2]])
     homography, _ = cv.findHomography(view.points[:, :2], view.pixels)

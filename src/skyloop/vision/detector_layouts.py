@@ -1,9 +1,9 @@
-"""How the ONNX files of the YOLO and DETR families lay out what they found, told apart and decoded. Pure.
+"""Output layouts of ONNX files of the YOLO and DETR families: recognition and decoding. Pure.
 
-What the exports of each family write: YOLOv5 and v7 rows of centre, size, objectness and class scores; YOLOv8, v9 and
-v11 the same without objectness, a row per number; YOLOv10 and other exports without suppression corners, score and
-class; YOLOX offsets on the grid of its strides, unless exported with ``--decode_in_inference``; DETR's descendants
-boxes as shares of the image, with logits or scores beside them.
+The exports' outputs: YOLOv5 and v7 rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 the same
+without objectness and transposed; YOLOv10 and other exports without suppression corners, score and class; YOLOX offsets
+on the grid of its strides, unless exported with ``--decode_in_inference``; DETR's descendants boxes as shares of the
+image, with logits or scores beside them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from skyloop.vision.object_tracks import Floats
 
 
 class Layout(StrEnum):
-    """What the outputs of a network mean, and which input goes with that."""
+    """The meaning of a network's outputs, and the input that it expects."""
 
     YOLO5 = "yolo5"  #: (1, n, 5 + classes), pixels, objectness: YOLOv5, v6 and v7
     YOLO8 = "yolo8"  #: (1, 4 + classes, n), pixels: YOLOv8, v9, v11
@@ -39,10 +39,10 @@ class Layout(StrEnum):
 STRETCHED: Final = frozenset({Layout.RT_DETR, Layout.DETR, Layout.RF_DETR})
 #: Layouts whose input is BGR of 0 to 255 instead of RGB of 0 to 1.
 RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
-#: Layouts whose boxes may overlap: of these only the surest are kept.
+#: Layouts with overlapping boxes, which need suppression.
 SUPPRESSED: Final = frozenset({Layout.YOLO5, Layout.YOLO8, Layout.YOLOX, Layout.YOLOX_DECODED})
 
-_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))
+_STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # grids of YOLOX models [px]
 _FEW: Final = 1000  # queries of a network without suppression: 100 to 900, mostly 300
 
 Array = NDArray[np.generic]
@@ -51,7 +51,7 @@ Outputs = Mapping[str, Array]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Rows of a network's output: what may be a thing."""
+    """Rows of a network's output: candidate detections."""
 
     corners: Floats  #: (n, 4) left, top, right, bottom, in pixels of the network's input
     scores: Floats  #: (n,) 0 to 1
@@ -59,26 +59,26 @@ class Found:
 
 
 def grid_places(width: int, height: int) -> tuple[int, ...]:
-    """Return the possible numbers of places on the grids of an input [px]: strides to 32, and to 64."""
+    """Return the possible numbers of grid cells of an input [px]: with strides up to 32 and up to 64."""
     return tuple(sum((width // s) * (height // s) for s in strides) for strides in _STRIDES)
 
 
 def describe(outputs: Outputs) -> str:
-    """Say the names and shapes of outputs, for error messages."""
+    """Describe the names and shapes of outputs, for error messages."""
     return ", ".join(f"{name} {tuple(value.shape)}" for name, value in outputs.items()) or "none"
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Tell by a network's outputs which family it is of.
+    """Recognise a network's layout from its outputs.
 
     Args:
-        outputs: By name, of one run on any image.
-        width: Of the network's input [px].
-        height: Of the network's input [px].
-        classes: How many class names are known; None: none.
+        outputs: Outputs by name, of one run on any image.
+        width: Width of the network's input [px].
+        height: Height of the network's input [px].
+        classes: Number of known class names; None: none.
 
     Raises:
-        FileFormatError: The outputs are those of no family, or of more than one.
+        FileFormatError: The outputs fit no family, or more than one.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -102,8 +102,8 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
         if not _decoded(_numbers(values)[0], width, height):
             return Layout.YOLOX
         raise FileFormatError(
-            f"its output ({describe(outputs)}) is in pixels and may be of YOLOX or of YOLOv6, which differ in their "
-            f"input: say layout={Layout.YOLOX_DECODED.value!r} or layout={Layout.YOLO5.value!r}"
+            f"its output ({describe(outputs)}) is in pixels and may be from YOLOX or YOLOv6, which differ in their "
+            f"input: give layout={Layout.YOLOX_DECODED.value!r} or layout={Layout.YOLO5.value!r}"
         )
     if rows in [3 * each for each in places] and columns >= 6:
         return Layout.YOLO5
@@ -111,7 +111,7 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
         if classes == 2 and _shares(_numbers(values)[0, :, :4]):
             raise FileFormatError(
                 f"its output ({describe(outputs)}) may be corners, score and class, or a box and the scores of two "
-                f"classes: say layout={Layout.END_TO_END.value!r} or layout={Layout.RT_DETR.value!r}"
+                f"classes: give layout={Layout.END_TO_END.value!r} or layout={Layout.RT_DETR.value!r}"
             )
         return Layout.END_TO_END
     if rows <= _FEW and columns >= 5 and _shares(_numbers(values)[0, :, :4]):
@@ -120,7 +120,7 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
 
 
 def class_count(layout: Layout, outputs: Outputs) -> int | None:
-    """Return of how many classes the outputs have scores; None where they name the class by its number."""
+    """Return the number of classes with scores; None if the outputs give class numbers instead."""
     if layout in (Layout.END_TO_END, Layout.LISTS):
         return None
     if layout in (Layout.DETR, Layout.RF_DETR):
@@ -132,13 +132,13 @@ def class_count(layout: Layout, outputs: Outputs) -> int | None:
 
 
 def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
-    """Turn a network's outputs into boxes, scores and classes. Rows that are not finite remain as they are.
+    """Turn a network's outputs into boxes, scores and classes. Rows with values that are not finite pass unchanged.
 
     Args:
-        layout: What the outputs mean.
-        outputs: By name.
-        width: Of the network's input [px].
-        height: Of the network's input [px].
+        layout: Layout of the outputs.
+        outputs: Outputs by name.
+        width: Width of the network's input [px].
+        height: Height of the network's input [px].
 
     Raises:
         FileFormatError: The outputs don't have the shapes of this layout.
@@ -172,14 +172,14 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
 
 def _unknown(outputs: Outputs) -> FileFormatError:
     return FileFormatError(
-        f"its outputs ({describe(outputs)}) are of no known layout: one output of YOLOv5 to v11, YOLOX or RT-DETR, "
+        f"its outputs ({describe(outputs)}) have no known layout: one output of YOLOv5 to v11, YOLOX or RT-DETR, "
         "boxes and logits of a DETR, or boxes, scores and labels; for bare detection, one image at a time. "
-        "layout= decides where they can't be told apart: " + ", ".join(each.value for each in Layout)
+        "If they are ambiguous, give layout=, one of " + ", ".join(each.value for each in Layout)
     )
 
 
 def _single(outputs: Outputs, layout: Layout) -> Array:
-    """Return the only output, of one image; other outputs (of a training head) are not read if the first fits."""
+    """Return the only output, of one image; if the first fits, ignore others (of a training head)."""
     values = next(iter(outputs.values()), None)
     if values is None or values.ndim != 3 or values.shape[0] != 1:
         raise FileFormatError(
@@ -200,11 +200,11 @@ def _numbers(values: Array) -> Floats:
     try:
         return np.asarray(values, np.float64)
     except (TypeError, ValueError):
-        raise FileFormatError(f"its output is of {values.dtype} and must be of numbers") from None
+        raise FileFormatError(f"its output is {values.dtype} and must be numeric") from None
 
 
 def _pair(outputs: Outputs) -> tuple[Array, Array]:
-    """Tell boxes from logits, by name where both may be boxes."""
+    """Distinguish boxes from logits, by name if both may be boxes."""
     shapes = [value.shape for value in outputs.values()]
     if len(shapes) != 2 or any(len(s) != 3 or s[0] != 1 for s in shapes) or shapes[0][1] != shapes[1][1]:
         raise _unknown(outputs)
@@ -218,7 +218,7 @@ def _pair(outputs: Outputs) -> tuple[Array, Array]:
 
 
 def _lists(outputs: Outputs) -> tuple[Floats, Floats, Floats]:
-    """Return boxes (n, 4), scores (n) and labels (n), which may have an axis of one image before them."""
+    """Return boxes (n, 4), scores (n) and labels (n), without a leading axis of one image."""
     single = {name.lower(): _numbers(value) for name, value in outputs.items()}
     single = {name: value[0] if value.ndim > 1 and value.shape[0] == 1 else value for name, value in single.items()}
     boxes = [value for name, value in single.items() if "box" in name]
@@ -234,13 +234,13 @@ def _lists(outputs: Outputs) -> tuple[Floats, Floats, Floats]:
 
 
 def _shares(boxes: Floats) -> bool:
-    """Whether centres and sizes are shares of the image: those of queries that found nothing, too."""
+    """Return whether centres and sizes are shares of the image, even for queries that found nothing."""
     finite = boxes[np.isfinite(boxes).all(axis=1)]
     return bool(len(finite)) and bool(((finite >= -0.5) & (finite <= 1.5)).all())
 
 
 def _as_scores(values: Floats) -> Floats:
-    """Return scores as they are, and logits through a sigmoid: a network gives logits if one is outside 0 to 1."""
+    """Return scores unchanged and logits through a sigmoid; values outside 0 to 1 mean logits."""
     finite = values[np.isfinite(values)]
     if len(finite) and (finite.min() < 0.0 or finite.max() > 1.0):
         return np.asarray(1.0 / (1.0 + np.exp(-values)), np.float64)
@@ -257,7 +257,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's surest class; NaN is taken for the surest, so that the row is dropped."""
+    """Take each row's best class; NaN counts as the best, so that the row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)
@@ -269,7 +269,7 @@ def _whole(labels: Floats) -> NDArray[np.int64]:
 
 
 def _grid(rows: int, width: int, height: int, outputs: Outputs) -> tuple[Floats, Floats]:
-    """Return the corner of each place of the grid and its stride [px], (n, 2) and (n, 1)."""
+    """Return each grid cell's corner and stride [px], (n, 2) and (n, 1)."""
     for strides, places in zip(_STRIDES, grid_places(width, height), strict=True):
         if places == rows:
             return _places(strides, width, height)
@@ -290,7 +290,7 @@ def _places(strides: Sequence[int], width: int, height: int) -> tuple[Floats, Fl
 
 
 def _decoded(rows: Floats, width: int, height: int) -> bool:
-    """Whether centres are in pixels, near the places that found them, rather than offsets from these."""
+    """Return whether centres are in pixels, near their grid cells, rather than offsets from these."""
     strides = _STRIDES[grid_places(width, height).index(len(rows))]
     corners, sizes = _places(strides, width, height)
     with np.errstate(invalid="ignore"):

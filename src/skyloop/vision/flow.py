@@ -1,10 +1,10 @@
 """Visual odometry of a camera that looks down, by the optical flow of the ground.
 
 Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from frame to frame by pyramidal
-Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forth and back.
-Each ray is levelled by the attitude and meets the ground at the height that the vehicle measures. A corner that was
-first seen from a known position gives the vehicle's present one, and the median of all corners is taken. The position
-drifts only as corners leave the image and new ones replace them.
+Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forward and back.
+The attitude levels each ray, which meets the ground at the height that the vehicle measures. A corner first seen from a
+known position gives the vehicle's current one; the result is the median of all corners. The position drifts only as
+corners leave the image and new ones replace them.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from skyloop.vision.planar import checked
 
 Array = NDArray[np.float64]
 
-_MOST: Final = 80  # corners
-_ENOUGH: Final = 8
-_REFILL: Final = 50  # with fewer, new ones are detected
-_APART_PX: Final = 12
-_RETURN_PX: Final = 0.7  # a corner tracked forth and back must come back so near
-_LOWEST_M: Final = 0.15  # nearer to the ground there is nothing to track
+_MOST: Final = 80  # corners tracked
+_ENOUGH: Final = 8  # corners needed for a position
+_REFILL: Final = 50  # detect new corners when fewer remain
+_APART_PX: Final = 12  # least distance between corners
+_RETURN_PX: Final = 0.7  # a corner tracked forward and back must return within this distance
+_LOWEST_M: Final = 0.15  # closer to the ground there is nothing to track
 
 
 class GroundTracker:
@@ -42,10 +42,10 @@ class GroundTracker:
         """Initialise the tracker.
 
         Args:
-            camera: How the camera is mounted.
+            camera: The camera, with its mounting.
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
             MissingExtraError: OpenCV is not installed.
         """
         self._cv: Any = opencv("optical flow")
@@ -53,16 +53,16 @@ class GroundTracker:
         self._offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m, np.float64)
         self._grey: NDArray[np.uint8] | None = None
         self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
-        self._ground = np.empty((0, 2))  # where they are on the ground, in the axes of `place`
-        self.place = np.zeros(2)  #: of the vehicle, along yaw 0 and to its left [m], as of the last frame
+        self._ground = np.empty((0, 2))  # their places on the ground, in the axes of `place`
+        self.place = np.zeros(2)  #: the vehicle's position, along yaw 0 and to its left [m], as of the last frame
 
     @property
     def points(self) -> tuple[tuple[float, float], ...]:
-        """The corners that are tracked, pixels in the last frame."""
+        """The tracked corners, pixels in the last frame."""
         return tuple((float(x), float(y)) for x, y in self._corners)
 
     def forget(self) -> None:
-        """Forget all corners; the next frame restarts at the present position."""
+        """Forget all corners; the next frame restarts at the current position."""
         self._grey, self._corners, self._ground = None, np.empty((0, 2), np.float32), np.empty((0, 2))
 
     def see(
@@ -73,26 +73,26 @@ class GroundTracker:
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
             at_capture: Feedback with attitude and altitude at the capture.
-            intrinsics: Of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None takes the frame's.
 
         Returns:
-            Position (2,) [m] along yaw 0 and to its left, and the number of corners; None for the first frame, where
-            too few corners were found again, and where attitude or height are not known. Then tracking restarts at
-            the last position.
+            Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too
+            few corners were found again, and if attitude or height is unknown; tracking then restarts at the last
+            position.
 
         Raises:
-            UsageError: The array has another shape or type, or there are no intrinsics.
+            UsageError: The array has a wrong shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
         height = at_capture.altitude_m
         known = (height, at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
-        # What is not finite would stay in the position for good.
+        # A value that is not finite would stay in the position for good.
         if height is None or height < _LOWEST_M or any(one is None or not math.isfinite(one) for one in known):
             self.forget()
             return None
         if self._grey is not None and self._grey.shape != grey.shape:
-            self.forget()  # another size: its corners are elsewhere
+            self.forget()  # the image size changed: the corners are elsewhere
         began = self._grey is None
         self._track(grey)
         below, good = self._below(self._corners, at_capture, intrinsics)
@@ -137,7 +137,7 @@ class GroundTracker:
     def _below(
         self, corners: NDArray[Any], at_capture: Feedback, intrinsics: Intrinsics
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return where the corners' rays meet the ground, from the vehicle, (n, 2) [m], and which of them do."""
+        """Return where the corners' rays meet the ground, relative to the vehicle, (n, 2) [m], and which rays do."""
         if not len(corners):
             return np.empty((0, 2)), np.empty(0, np.bool_)
         rays = normalised(np.asarray(corners, np.float64), intrinsics)

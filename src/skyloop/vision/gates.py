@@ -1,9 +1,9 @@
-"""Detection of things of one colour in an image, of gates of a known size with their poses, and of upright poles.
+"""Detection of things of one colour, of gates of a known size with their poses, and of upright poles.
 
-A gate is a frame of one colour around an opening. Of what has that colour, a hole that is bounded by four straight
-sides is an opening. The sides are fitted to the hole's edge after the lens distortion is removed (OpenCV's ``fitLine``
-with Huber's weights), so that the corners, where they meet, are better than a pixel. The pose is IPPE (Collins and
-Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
+A gate is a frame of one colour around an opening. A hole in that colour's mask that is bounded by four straight sides
+is an opening. After the lens distortion is removed, lines are fitted to the hole's edge (OpenCV's ``fitLine`` with
+Huber's weights), so that the corners, their intersections, are accurate to less than a pixel. The pose is IPPE (Collins
+and Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, re
 
 Rgb = tuple[int, int, int]
 
-_HUE_DEG: Final = 16.0  # on each side of the colour's own
-_SATURATION: Final = 0.5  # of the colour's own: paint in the light and in the shade
-_LEAST_SATURATION: Final = 80  # of 255: a colour with less is too grey to be distinguished from others
-_LEAST_VALUE: Final = 35  # of 255: darker pixels have no hue worth the name
+_HUE_DEG: Final = 16.0  # tolerance on each side of the colour's own hue
+_SATURATION: Final = 0.5  # share of the colour's own saturation: covers paint in light and shade
+_LEAST_SATURATION: Final = 80  # 0 to 255: a colour with less is too grey to distinguish
+_LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # smaller openings say little about the distance
-_FARTHEST_M: Final = 8.0  # a farther one is more likely a patch of the same colour
-_SIDE_SHARE: Final = 0.15  # of each side, at both ends, that is not fitted: the corners are round
-_FILLED: Final = 0.6  # of the four-sided hull: something of the same colour behind the gate may reach into the hole
-_OFF_PX: Final = 1.5  # the edge's root mean square distance from its four sides
-_LEAST_HEIGHT_PX: Final = 20
-_SLIM: Final = 3.0  # so much higher than wide
-_ABOVE_PX: Final = 6
-_COLOURFUL: Final = 100  # of 255
-_LEAST_SHARE: Final = 0.8  # of the rows in its middle where it is one piece: two behind each other aren't
+_FARTHEST_M: Final = 8.0  # anything further away is more likely a patch of the same colour
+_SIDE_SHARE: Final = 0.15  # share of each side left out at both ends, because corners look round
+_FILLED: Final = 0.6  # least share of the four-sided hull: a like-coloured thing behind may reach into the hole
+_OFF_PX: Final = 1.5  # greatest root mean square distance of the edge from its four sides
+_LEAST_HEIGHT_PX: Final = 20  # least height of a pole
+_SLIM: Final = 3.0  # least ratio of a pole's height to its width
+_ABOVE_PX: Final = 6  # searched above a pole for something that hides its top
+_COLOURFUL: Final = 100  # saturation, 0 to 255
+_LEAST_SHARE: Final = 0.8  # least share of a pole's rows that are one piece; two overlapping poles are not
 
 
 class ColourMask:
-    """Selects pixels by their colour: by the hue, with enough saturation, at any brightness."""
+    """Selects pixels by hue, with enough saturation, at any brightness."""
 
     def __init__(self, colour: Rgb) -> None:
         """Prepare the mask.
@@ -49,7 +49,7 @@ class ColourMask:
             colour: Red, green, blue, 0 to 255.
 
         Raises:
-            UsageError: That is no colour, or too grey to have a hue.
+            UsageError: The colour is invalid, or too grey to have a hue.
             MissingExtraError: OpenCV is not installed.
         """
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
@@ -57,14 +57,14 @@ class ColourMask:
         self._cv = opencv("finding a colour")
         hue, saturation, _ = self._cv.cvtColor(np.array([[colour[::-1]]], np.uint8), self._cv.COLOR_BGR2HSV)[0, 0]
         if saturation < _LEAST_SATURATION:
-            raise UsageError(f"colour {colour!r} is too grey to be distinguished from its surroundings")
+            raise UsageError(f"colour {colour!r} is too grey to distinguish from its surroundings")
         self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
 
     def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the mask of a BGR image (h, w, 3): 255 where it has the colour, 0 elsewhere, (h, w), uint8."""
         cv = self._cv
         hsv = cv.cvtColor(cv.GaussianBlur(pixels, (3, 3), 0), cv.COLOR_BGR2HSV)
-        reach = round(_HUE_DEG / 2)  # OpenCV's hue goes round in 180 steps
+        reach = round(_HUE_DEG / 2)  # OpenCV's hue has 180 steps per turn
         turned = hsv.copy()
         turned[..., 0] = (hsv[..., 0].astype(np.int16) - self._hue + 90) % 180
         mask = cv.inRange(turned, (90 - reach, self._saturation, _LEAST_VALUE), (90 + reach, 255, 255))
@@ -77,7 +77,7 @@ class BlobSighting:
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: its left edge, from the optical axis, positive to the left
-    right_rad: float  #: its right edge, the same way: less than the left one
+    right_rad: float  #: its right edge, likewise: less than the left one
 
     @property
     def bearing_rad(self) -> float:
@@ -104,10 +104,10 @@ class BlobDetector:
 
         Args:
             colour: Red, green, blue, 0 to 255.
-            least_px: Narrower or lower areas are left out.
+            least_px: Ignore areas narrower or lower than this.
 
         Raises:
-            UsageError: That is no colour, or too grey to have a hue.
+            UsageError: The colour is invalid, or too grey to have a hue.
             MissingExtraError: OpenCV is not installed.
         """
         self._mask = ColourMask(colour)
@@ -119,13 +119,13 @@ class BlobDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None takes the frame's.
 
         Returns:
             The sightings, the widest first.
 
         Raises:
-            UsageError: The array has another shape or type, or there are no intrinsics.
+            UsageError: The array has a wrong shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics, colour=True)
         count, _, boxes, _ = self._cv.connectedComponentsWithStats(self._mask.of(pixels))
@@ -142,11 +142,11 @@ class BlobDetector:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GateSighting(PlanarSighting):
-    """One gate's opening in one image; its face is the side that the camera sees."""
+    """One gate's opening in one image; its face is the visible side."""
 
 
 class GateDetector:
-    """Detects gates of one colour whose opening has one size, in images that are upright within about 30°.
+    """Detects gates of one colour and one opening size, in images that are upright within about 30°.
 
     Attributes:
         colour: Red, green, blue, 0 to 255.
@@ -161,7 +161,7 @@ class GateDetector:
             inner_size_m: Width and height of the opening.
 
         Raises:
-            UsageError: That is no colour with a hue, or no size.
+            UsageError: The colour has no hue, or the size is invalid.
             MissingExtraError: OpenCV is not installed.
         """
         if not (len(inner_size_m) == 2 and all(math.isfinite(side) and side > 0 for side in inner_size_m)):
@@ -177,13 +177,13 @@ class GateDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None takes the frame's.
 
         Returns:
             The sightings, the nearest first.
 
         Raises:
-            UsageError: The array has another shape or type, or there are no intrinsics.
+            UsageError: The array has a wrong shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics, colour=True)
         found = (self._sighting(hole, intrinsics) for hole in self._holes(self._mask.of(pixels)))
@@ -201,7 +201,7 @@ class GateDetector:
         ]
 
     def _sighting(self, edge: Array, intrinsics: Intrinsics) -> GateSighting | None:
-        """Return the opening that a hole's edge bounds; None if it is none."""
+        """Return the opening bounded by a hole's edge; None if the hole is not an opening."""
         rough = self._four_corners(edge)
         if rough is None:
             return None
@@ -209,7 +209,7 @@ class GateDetector:
         if rays is None:
             return None
         pose = PlanarPose.of(self._cv, self._outline, rays, self._cv.SOLVEPNP_IPPE)
-        if pose is None or pose.position[2] > _FARTHEST_M or pose.rotation[1, 1] > -0.7:  # its up is the picture's
+        if pose is None or pose.position[2] > _FARTHEST_M or pose.rotation[1, 1] > -0.7:  # upright in the image
             return None
         corners = project(np.column_stack([rays, np.ones(len(rays))]), intrinsics)
         return GateSighting(corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)
@@ -231,7 +231,7 @@ class GateDetector:
         return np.asarray(np.roll(clockwise, -first, axis=0), np.float64)
 
     def _meeting_sides(self, edge: Array, rough: Array, intrinsics: Intrinsics) -> Array | None:
-        """Return x/z and y/z of the corners, (4, 2), where the sides' lines meet; None unless all are straight."""
+        """Return x/z and y/z of the corners where the sides' lines meet, (4, 2); None unless all sides are straight."""
         lines = []
         for begin, end in zip(rough, np.roll(rough, -1, axis=0), strict=True):
             side = _along(edge, begin, end)
@@ -248,7 +248,7 @@ class GateDetector:
             off = (flat - (x, y)) @ normal * intrinsics.fx
             if math.sqrt(float(np.mean(off**2))) > _OFF_PX:
                 return None
-            # The edge's pixels are the frame's last ones: the opening begins half a pixel further in.
+            # The edge's pixels still belong to the frame: the opening begins half a pixel further in.
             lines.append(np.array([*normal, -float(normal @ (x, y)) - 0.5 / intrinsics.fx]))
         meeting = [np.cross(before, after) for before, after in zip(lines[-1:] + lines[:-1], lines, strict=True)]
         if any(abs(point[2]) < 1e-6 for point in meeting):
@@ -257,7 +257,7 @@ class GateDetector:
 
 
 def _along(edge: Array, begin: Array, end: Array) -> Array:
-    """Return the edge's points along one side, without its ends, (n, 2)."""
+    """Return the edge's points along one side, without the ends, (n, 2)."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length < 1.0:
@@ -275,8 +275,8 @@ class PoleSighting:
 
     Attributes:
         top: The middle of its upper end, (2,) pixels.
-        ray: Through that, in optical axes, (3,), z = 1.
-        width_px: In the middle of its height.
+        ray: Ray through the top, in optical axes, (3,), z = 1.
+        width_px: Width at half its height.
     """
 
     top: Array
@@ -299,7 +299,7 @@ class PoleDetector:
             colour: Red, green, blue, 0 to 255.
 
         Raises:
-            UsageError: That is no colour, or too grey to have a hue.
+            UsageError: The colour is invalid, or too grey to have a hue.
             MissingExtraError: OpenCV is not installed.
         """
         self._cv = opencv("pole detection")
@@ -310,13 +310,13 @@ class PoleDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None takes the frame's.
 
         Returns:
             The sightings, the widest first.
 
         Raises:
-            UsageError: The array has another shape or type, or there are no intrinsics.
+            UsageError: The array has a wrong shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics, colour=True)
         count, labels, boxes, _ = self._cv.connectedComponentsWithStats(self._mask.of(pixels))
@@ -324,7 +324,7 @@ class PoleDetector:
         for label, (x, y, width, height, area) in enumerate(boxes[:count].tolist()):
             if label == 0 or height < _LEAST_HEIGHT_PX or area * _SLIM > height * height:
                 continue
-            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # not the whole of it is seen, nor its top
+            if x == 0 or y == 0 or x + width == pixels.shape[1]:  # cut off at the side or the top
                 continue
             line = _line(labels[y : y + height, x : x + width] == label)
             if line is None:
@@ -339,14 +339,14 @@ class PoleDetector:
         return sorted(found, key=lambda one: -one.width_px)
 
     def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
-        """Return whether something colourful is right above: a gate's bar that hides the top, more likely than not."""
+        """Return whether something colourful is right above: probably a gate's bar that hides the top."""
         column = min(max(round(x), 0), pixels.shape[1] - 1)
         above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
         return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())
 
 
 def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Return where a leaning pole ends at the top, from the left, and its width; None for what is not one piece."""
+    """Return a leaning pole's top, from the left, and its width; None if it is not one piece."""
     rows = np.arange(len(shape))
     first, last = shape.argmax(axis=1), shape.shape[1] - 1 - shape[:, ::-1].argmax(axis=1)
     whole = shape.any(axis=1) & (shape.sum(axis=1) == last - first + 1)

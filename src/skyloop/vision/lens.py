@@ -18,11 +18,11 @@ from skyloop.messages import Intrinsics
 from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
-_WIDEST = 1e-9  # z over distance below this: beside or behind the camera
-_STEEPEST = 3.0  # x/z, 72°: an ideal camera that saw more would show little else than its edges
-_DISTANCES = np.linspace(0.0, 20.0, 20_001)  # of x/z, at which a distortion is looked at
-_RETURN_PX = 0.01
-_ITERATIONS = (40, 1e-10)  # of the inverse of a distortion
+_WIDEST = 1e-9  # z over distance; below this a point is beside or behind the camera
+_STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little but its edges
+_DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which a distortion is sampled
+_RETURN_PX = 0.01  # greatest error of an inverted distortion when projected back
+_ITERATIONS = (40, 1e-10)  # iterations and accuracy of a distortion's inverse
 
 
 def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
@@ -30,14 +30,14 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
 
     Args:
         points: Shape (n, 3) in optical axes; points or directions of any length.
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
 
     Returns:
-        Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole, or beyond the angle at
-        which the polynomial of the lens turns back.
+            Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole, or beyond the angle at
+            which the lens polynomial turns back.
 
     Raises:
-        UsageError: The shape is another one, or the model is unknown.
+        UsageError: The shape is wrong, or the model is unknown.
     """
     given = _rows(points, 3)
     if _is_fisheye(intrinsics):
@@ -55,17 +55,17 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Return unit vectors (n, 3) in optical axes to what pixels see.
+    """Return the viewing directions of pixels as unit vectors (n, 3) in optical axes.
 
     Args:
         pixels: Shape (n, 2).
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
 
     Returns:
-        NaN where the model has no such direction.
+        The directions; NaN where the model has none.
 
     Raises:
-        UsageError: The shape is another one, or the model is unknown.
+        UsageError: The shape is wrong, or the model is unknown.
     """
     given = _rows(pixels, 2)
     if _is_fisheye(intrinsics):
@@ -75,17 +75,17 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Return x/z and y/z (n, 2) of what pixels (n, 2) see.
+    """Return x/z and y/z (n, 2) of the viewing directions of pixels.
 
     Args:
         pixels: Shape (n, 2).
-        intrinsics: Of the camera.
+        intrinsics: Intrinsics of the camera.
 
     Returns:
-        NaN also for what is beside or behind the camera.
+        The values; NaN also for directions beside or behind the camera.
 
     Raises:
-        UsageError: The shape is another one, or the model is unknown.
+        UsageError: The shape is wrong, or the model is unknown.
     """
     if not _is_fisheye(intrinsics):
         return _ideal(_rows(pixels, 2), intrinsics)
@@ -101,12 +101,12 @@ def undistort(
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
-        intrinsics: Of the camera; None takes the frame's.
-        balance: From 0, which shows only what the whole image knows, to 1, which shows all that was seen, with black
+        intrinsics: Intrinsics of the camera; None takes the frame's.
+        balance: From 0, which shows only valid pixels, to 1, which shows everything that the camera saw, with black
             around it.
 
     Returns:
-        The image as an ideal pinhole camera would have taken it, and that camera's intrinsics.
+        The image of an ideal pinhole camera, and that camera's intrinsics.
 
     Raises:
         UsageError: An argument is out of its range, or there are no intrinsics.
@@ -124,14 +124,14 @@ def undistort(
     if not 0.0 <= balance <= 1.0:
         raise UsageError(f"balance is {balance!r} and must be from 0 to 1")
     ideal, across, down = _maps(intrinsics, pixels.shape[1], pixels.shape[0], balance)
-    cv = opencv("taking out distortion")
+    cv = opencv("removing distortion")
     return np.asarray(cv.remap(pixels, across, down, cv.INTER_LINEAR), dtype=np.uint8), ideal
 
 
 @lru_cache(maxsize=8)
 def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tuple[Intrinsics, Any, Any]:
-    """Return the ideal camera, and where each of its pixels is sampled; cached for each camera."""
-    cv, size, turn = opencv("taking out distortion"), (width, height), np.eye(3)
+    """Return the ideal camera and the sampling maps of its pixels; cached for each camera."""
+    cv, size, turn = opencv("removing distortion"), (width, height), np.eye(3)
     focal = _focal_length(intrinsics, width, height, balance)
     ideal = Intrinsics(focal, focal, intrinsics.cx, intrinsics.cy)
     lens = cv.fisheye if _is_fisheye(intrinsics) else cv
@@ -142,9 +142,9 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Return the focal length of a pinhole with the same axis, between no unknown pixels and all that was seen."""
+    """Return the focal length of the ideal pinhole, between only valid pixels and the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
-    reach = []  # how far from the axis each side is in the picture, and by the least and the greatest direction on it
+    reach = []  # distance of each side from the axis, with the least and greatest direction on it
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
         side = np.full((len(along), 2), at)
         side[:, 1 - axis] = along
@@ -159,7 +159,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
     """Return x/z and y/z of a pinhole's pixels."""
     if not len(pixels):
         return np.empty((0, 2))
-    cv, given = opencv("taking out distortion"), pixels.reshape(-1, 1, 2)
+    cv, given = opencv("removing distortion"), pixels.reshape(-1, 1, 2)
     matrix, distortion = intrinsics.matrix, _distortion(intrinsics)
     criteria = (cv.TERM_CRITERIA_COUNT | cv.TERM_CRITERIA_EPS, *_ITERATIONS)
     if hasattr(cv, "undistortPointsIter"):  # OpenCV 4
@@ -167,7 +167,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
     else:
         flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
     found = np.asarray(flat, dtype=np.float64).reshape(-1, 2)
-    # Beyond the fold of a lens the iteration ends anywhere: what does not come back was not seen there.
+    # Beyond a lens's fold the iteration ends anywhere; reject results that don't project back.
     back = project(np.column_stack([found, np.ones(len(found))]), intrinsics)
     found[~(np.abs(back - pixels).max(axis=1) < _RETURN_PX)] = np.nan
     return found
@@ -175,7 +175,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 @lru_cache(maxsize=64)
 def _fold(distortion: tuple[float, ...]) -> float:
-    """Return the distance from the axis, for f = 1, from which on a pinhole's distortion brings pixels back."""
+    """Return the distance from the axis, for f = 1, beyond which a pinhole's distortion folds back."""
     k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * 8)[:8]
     if not any(distortion):
         return np.inf
@@ -186,7 +186,7 @@ def _fold(distortion: tuple[float, ...]) -> float:
 
 
 def _bent(points: Array, intrinsics: Intrinsics) -> Array:
-    """Return a fisheye's pixels of directions."""
+    """Return the pixels of directions in a fisheye."""
     aside = np.hypot(points[:, 0], points[:, 1])
     angle = np.arctan2(aside, points[:, 2])
     radius, slope = _polynomial(angle, intrinsics)
@@ -196,7 +196,7 @@ def _bent(points: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return unit vectors to what a fisheye's pixels see, by Newton's method on the angle to the axis."""
+    """Return the viewing directions of a fisheye's pixels, by Newton's method on the angle to the axis."""
     flat = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     radius = np.hypot(flat[:, 0], flat[:, 1])
     angle = np.minimum(radius, np.pi)
@@ -212,7 +212,7 @@ def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _polynomial(angle: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
-    """Return the distance from the axis in the image, for f = 1, by the angle to the axis, and its derivative."""
+    """Return the image distance from the axis, for f = 1, at an angle to the axis, and its derivative."""
     k1, k2, k3, k4 = _distortion(intrinsics)
     square = angle * angle
     value = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
@@ -233,5 +233,5 @@ def _distortion(intrinsics: Intrinsics) -> Array:
 def _rows(values: ArrayLike, columns: int) -> Array:
     rows = np.asarray(values, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != columns:
-        raise UsageError(f"an array of shape (n, {columns}) is wanted, not {rows.shape}")
+        raise UsageError(f"the array must have shape (n, {columns}), got {rows.shape}")
     return np.ascontiguousarray(rows)

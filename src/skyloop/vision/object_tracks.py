@@ -1,11 +1,10 @@
-"""Detections, which all detectors have in common, and objects: detections of one image after the other. Pure.
+"""Detections, common to all detectors, and objects: detections matched from image to image. Pure.
 
-Detections are joined into objects that keep their number
-in the way of Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022: sure
-detections are matched with all objects first, unsure ones then with the objects that are left, since what is half
-hidden is detected with a low score; only sure ones start an object. Each object has a Kalman filter of constant
-velocity on its box, here with real times instead of counted images, so that a missed frame does no harm. The pairs
-are those of SciPy's ``linear_sum_assignment``.
+Detections are joined into objects with lasting numbers as in Zhang et al., "ByteTrack: Multi-Object Tracking by
+Associating Every Detection Box", ECCV 2022: confident detections are matched with all objects first, uncertain ones
+then with the remaining objects, because half-hidden things get low scores; only confident ones start an object. Each
+object has a Kalman filter of constant velocity on its box, here with real times instead of image counts, so that a
+missed frame does no harm. The pairs come from SciPy's ``linear_sum_assignment``.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ from skyloop.vision.tracking import Box, Image, outline
 Floats = NDArray[np.float64]
 # Shares of the box's height, as in ByteTrack's filter, which counts 30 images a second.
 _POSITION: Final = 1 / 20  # standard deviation of a detection
-_SPEED: Final = 1.5  # of the velocity at first [1/s]
-_WANDERING: Final = 0.8  # of the velocity within a second
+_SPEED: Final = 1.5  # initial standard deviation of the velocity [1/s]
+_WANDERING: Final = 0.8  # change of the velocity within a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +33,9 @@ class Detection:
     """One thing that a detector found in one image."""
 
     box: Box  #: x, y, width, height [px] in the image, within its edges
-    score: float  #: 0 to 1, how sure the detector is; a score, not a probability
-    class_id: int  #: the detector's number of the class
-    class_name: str  #: the name of the class; the number as text where the detector has no names
+    score: float  #: 0 to 1, the detector's confidence; a score, not a probability
+    class_id: int  #: the detector's class number
+    class_name: str  #: class name; the number as text if the detector has no names
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -52,10 +51,10 @@ class Detection:
 
 @runtime_checkable
 class ObjectDetector(Protocol):
-    """Finds things of known classes in an image. Call one detector from one thread."""
+    """Finds things of known classes in an image. Call a detector from one thread only."""
 
     def detect(self, image: Image) -> list[Detection]:
-        """Return what is in the image, surest first.
+        """Return the things in the image, the most confident first.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
@@ -64,7 +63,7 @@ class ObjectDetector(Protocol):
 
 
 def overlaps(one: Floats, others: Floats) -> Floats:
-    """Return how well each of the boxes agrees with one: the shared area over that of both together, 0 to 1.
+    """Return each box's overlap with one box: intersection over union, 0 to 1.
 
     Args:
         one: (4,) left, top, right, bottom.
@@ -79,16 +78,16 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 
 
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
-    """Keep the surest of the boxes that overlap, class by class (non-maximum suppression).
+    """Keep the best of overlapping boxes, class by class (non-maximum suppression).
 
     Args:
         corners: (n, 4) left, top, right, bottom.
         scores: (n,).
-        classes: (n,) number of the class.
-        iou: Boxes of a class that agree better than this are the same thing.
+        classes: (n,) class numbers.
+        iou: Boxes of a class with a larger overlap are the same thing.
 
     Returns:
-        The rows that are kept, surest first.
+        The rows kept, the best first.
     """
     left = np.argsort(-scores, kind="stable")
     kept: list[int] = []
@@ -104,11 +103,11 @@ def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: f
 class TrackedObject:
     """One object at the time of the newest update."""
 
-    id: int  #: from 1; never given to another object
-    detection: Detection  #: the last one, with its box
+    id: int  #: from 1; never reused
+    detection: Detection  #: the last detection, with its box
     box: Box  #: x, y, width, height [px], filtered; predicted while the object is not seen
-    velocity: tuple[float, float]  #: of the box's centre, right and down [px/s]
-    seen: bool  #: whether it was detected in this image
+    velocity: tuple[float, float]  #: velocity of the box's centre, right and down [px/s]
+    seen: bool  #: whether the object was detected in this image
     age_s: float  #: since it was first detected [s]
     unseen_s: float  #: since it was last detected [s]
 
@@ -126,7 +125,7 @@ class _Object:
 
 
 class ObjectTracks:
-    """Gives detections of one image after the other numbers that stay with their objects. Not thread-safe."""
+    """Gives the detections of successive images numbers that stay with their objects. Not thread-safe."""
 
     def __init__(
         self,
@@ -140,12 +139,12 @@ class ObjectTracks:
         """Start without objects.
 
         Args:
-            sure: Score from which a detection may start an object, 0 to 1. Let the detector give lower ones, too
+            sure: Score from which a detection can start an object, 0 to 1. Let the detector return lower scores too
                 (``OnnxDetector(…, score=0.1)``): they continue objects.
-            overlap: Least overlap of an object's predicted box with a sure detection, 0 to 1.
-            overlap_unsure: The same with an unsure one.
+            overlap: Least overlap of an object's predicted box with a confident detection, 0 to 1.
+            overlap_unsure: The same with an uncertain one.
             confirm: Detections after which an object is returned; 1 or more.
-            keep_s: How long an object that is not detected is remembered [s].
+            keep_s: How long an undetected object is remembered [s].
 
         Raises:
             UsageError: An argument is out of its range.
@@ -166,11 +165,11 @@ class ObjectTracks:
         self._next = 1
 
     def update(self, detections: Sequence[Detection], time_s: float) -> list[TrackedObject]:
-        """Match the detections of the next image, and return the objects, also those not seen now, by number.
+        """Match the next image's detections; return all objects, including those not seen now, by number.
 
         Args:
-            detections: Of one image; those that are not finite or empty are left out.
-            time_s: When the image was taken [s], on any clock that does not run backwards.
+            detections: Detections in one image; those not finite or empty are ignored.
+            time_s: Capture time of the image [s], on any clock that never runs backwards.
 
         Raises:
             UsageError: The time is not finite, or before that of the last update.
@@ -187,7 +186,7 @@ class ObjectTracks:
         usable = [each for each in detections if _is_usable(each)]
         sure = [each for each in usable if each.score >= self._sure]
         unsure = [each for each in usable if each.score < self._sure]
-        # What is not confirmed comes last, so that a stray detection takes nothing from a known object.
+        # Unconfirmed objects come last, so that they take no detection from a known object.
         known = [each for each in self._objects if each.hits >= self._confirm]
         young = [each for each in self._objects if each.hits < self._confirm]
         known, sure = self._match(known, sure, self._overlap, time_s)
@@ -202,13 +201,13 @@ class ObjectTracks:
     def _match(
         self, objects: list[_Object], detections: list[Detection], least: float, time_s: float
     ) -> tuple[list[_Object], list[Detection]]:
-        """Update the objects that are found among the detections; return what is left of both."""
+        """Update the objects found among the detections; return the unmatched ones of both."""
         if not objects or not detections:
             return objects, detections
         corners = np.array([_corners(each.box) for each in detections])
         agreement = np.stack([overlaps(each.corners, corners) for each in objects])
         classes = np.array([[a.detection.class_id == b.class_id for b in detections] for a in objects])
-        # Another class, or too little overlap, costs more than any sum of pairs that are allowed.
+        # Another class, or too little overlap, costs more than any sum of allowed pairs.
         allowed = classes & (agreement > least)
         cost = np.where(allowed, 1.0 - agreement, float(len(objects) + len(detections) + 1))
         pairs = [(int(i), int(j)) for i, j in zip(*self._assign(cost), strict=True) if allowed[i, j]]
@@ -258,7 +257,7 @@ def _correct(each: _Object, detection: Detection, time_s: float) -> None:
 
 
 def _place(each: _Object) -> None:
-    each.state[0, 2:] = np.maximum(each.state[0, 2:], 1.0)  # a box that shrinks does not vanish
+    each.state[0, 2:] = np.maximum(each.state[0, 2:], 1.0)  # a shrinking box must not vanish
     centre, size = each.state[0, :2], each.state[0, 2:]
     each.corners = np.concatenate([centre - size / 2, centre + size / 2])
 

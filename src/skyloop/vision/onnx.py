@@ -1,6 +1,6 @@
-"""Networks from ONNX files, run on the processor by ONNX Runtime, or by OpenCV as trackers.
+"""Networks from ONNX files, run on the CPU by ONNX Runtime, or by OpenCV as trackers.
 
-A file is a program of a stranger's: before it is loaded here, a child process loads and runs it within limits.
+A network file is a stranger's program: before it is loaded here, a child process loads and runs it within limits.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, Final
 
 from skyloop.errors import FileFormatError, MissingExtraError
 
-CPU_S: Final = 20  #: to load a network and to run it once
-MEMORY: Final = 4 << 30  #: bytes of address space, beside four times the file's size
-_WAIT_S: Final = 300.0  # on a busy computer
-_REFUSED: Final = 3  # exit code of a child that says why
+CPU_S: Final = 20  #: CPU time to load a network and run it once
+MEMORY: Final = 4 << 30  #: bytes of address space, on top of four times the file's size
+_WAIT_S: Final = 300.0  # wall-clock limit, for a busy computer
+_REFUSED: Final = 3  # exit code of a child that printed the reason
 _OWN: Final = Path(__file__).with_name("weights")
-#: Modules are looked up where this process does, and not in the working directory: strangers' files may lie there.
+#: The child uses this process's module path, not the working directory, which may hold a stranger's files.
 _CHILD: Final = (
     "import sys; sys.path[:] = sys.argv[3:]; "
     "from skyloop.vision.onnx import run_alone; run_alone(int(sys.argv[1]), *sys.argv[2].splitlines())"
@@ -26,19 +26,19 @@ _CHILD: Final = (
 
 
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
-    """Load a network, once a child process has loaded it and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
+    """Load a network after a child process has loaded it and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
     Args:
         path: The ONNX file.
-        threads: Of the processor for one run.
-        purpose: What needs it; a noun phrase for the error message.
+        threads: CPU threads of one run.
+        purpose: The feature that needs it; a noun phrase for the error message.
 
     Returns:
         The exceptions that running it raises, and ONNX Runtime's session.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
-        FileFormatError: It is no ONNX file, not one that ONNX Runtime takes, or it needs more than the limits.
+        FileFormatError: It is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
     """
     try:
         import onnxruntime
@@ -58,7 +58,7 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
 def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.log_severity_level = 4  # what is wrong is in the exception
+    options.log_severity_level = 4  # the exception has the reason
     return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
@@ -66,21 +66,21 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits.
 
     Args:
-        files: One; of a tracker one or two.
-        tracker: Name of OpenCV's tracker that they are the weights of; empty: ONNX Runtime loads the file.
+        files: One file; one or two for a tracker.
+        tracker: Name of the OpenCV tracker whose weights they are; empty: ONNX Runtime loads the file.
 
     Raises:
-        FileFormatError: It can't be loaded, or not within the limits.
+        FileFormatError: It can't be loaded within the limits.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
-    limits = f"{CPU_S} s of the processor and {MEMORY >> 30} GiB of memory to load it and to run it once"
+    limits = f"{CPU_S} s of CPU time and {MEMORY >> 30} GiB of memory to load it and run it once"
     try:
         ended = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_WAIT_S, check=False, text=True
         )
     except subprocess.TimeoutExpired:
-        raise FileFormatError(f"{path} is refused: it was not ready within {_WAIT_S:g} s") from None
+        raise FileFormatError(f"{path} is refused: it did not load within {_WAIT_S:g} s") from None
     if ended.returncode == _REFUSED:
         kind = f"the weights of {tracker}" if tracker else "an ONNX file"
         raise FileFormatError(f"{path} can't be loaded as {kind}: {ended.stdout.strip()}")
@@ -91,18 +91,18 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
 
 
 def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
-    """Load a network and run it on zeros, within limits; the whole of a child process's life."""
+    """Load a network and run it on zeros within limits; the main function of the child process."""
     if sys.platform != "win32":
         import resource
 
         memory = MEMORY + 4 * sum(Path(path).stat().st_size for path in files)
         for kind, most in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_AS, memory)):
-            _, allowed = resource.getrlimit(kind)  # who is allowed less can't ask for more
+            _, allowed = resource.getrlimit(kind)  # a lower hard limit can't be raised
             limit = most if allowed == resource.RLIM_INFINITY else min(most, allowed)
             resource.setrlimit(kind, (limit, limit))
     try:
         run = _tracker(tracker, files) if tracker else _network(files[0])
-    except Exception as error:  # noqa: BLE001  it is raised again where the network was asked for
+    except Exception as error:  # noqa: BLE001  the parent raises it again
         print(reason(error))
         sys.exit(_REFUSED)
     try:
@@ -113,7 +113,7 @@ def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
 
 
 def _network(path: str) -> Callable[[], object]:
-    """Load a network, and return what runs it on zeros."""
+    """Load a network; return a function that runs it on zeros."""
     import numpy as np
     import onnxruntime
 
@@ -130,7 +130,7 @@ def _network(path: str) -> Callable[[], object]:
 
 
 def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
-    """Load a tracker's weights, and return what tracks with them in a black image."""
+    """Load a tracker's weights; return a function that tracks with them in a black image."""
     import numpy as np
 
     from skyloop.vision.opencv import opencv
@@ -140,7 +140,7 @@ def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
 
 
 def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
-    """Return OpenCV's tracker of a name with its weights: one file of ViTTrack, two of NanoTrack."""
+    """Create an OpenCV tracker by name with its weights: one file for ViTTrack, two for NanoTrack."""
     settings = getattr(cv, f"{name}_Params")()
     if len(files) == 1:
         (settings.net,) = files
@@ -151,4 +151,4 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return the text of an exception on one line, shortened."""
-    return " ".join(str(error).split())[:300]  # OpenCV's attribute `err` is the class's: of its last error anywhere
+    return " ".join(str(error).split())[:300]  # OpenCV's `err` belongs to the class and holds the last error anywhere

@@ -1,4 +1,4 @@
-"""Detectors of the YOLO and DETR families from an ONNX file of the user's, run by ONNX Runtime on the processor."""
+"""Detectors of the YOLO and DETR families from a user's ONNX file, run by ONNX Runtime on the CPU."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import Image
 
-_GREY: Final = 114  # what YOLO's networks were trained with around a letterboxed image
+_GREY: Final = 114  # padding of letterboxed images, as in the training of YOLO networks
 _MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's, for RF-DETR
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
-_SIDE: Final = 640  # of a network that takes any size and names none
-_MOST_SIDE: Final = 4096
-_MOST: Final = 1000  # surest boxes that are compared with one another
+_SIDE: Final = 640  # default side of a network that takes any size
+_MOST_SIDE: Final = 4096  # limit of an input image [px]
+_MOST: Final = 1000  # best boxes compared with one another
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 class OnnxDetector:
-    """Detects with a network of the YOLO or DETR family, told apart by its outputs. Call it from one thread.
+    """Detects with a network of the YOLO or DETR family, recognised by its outputs. Call it from one thread.
 
     Attributes:
         layout: The layout of the network's outputs.
         names: Names of the classes by number.
         size: Width and height of the network's input [px].
-        dropped: Detections that were dropped because they were not finite, or their score not within 0 and 1.
+        dropped: Number of detections dropped because they were not finite, or their score was outside 0 to 1.
     """
 
     def __init__(
@@ -60,22 +60,22 @@ class OnnxDetector:
         layout: Layout | str | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        """Load the network and run it once on an empty image, by which its layout is told.
+        """Load the network and recognise its layout from a run on an empty image.
 
         Args:
             path: The ONNX file.
-            score: Detections that are less sure are dropped, 0 to 1.
-            iou: Boxes of one class that overlap more (shared area over that of both) are one detection, 0 to 1.
-            names: Names of the classes: a list, a mapping from numbers, or a text file with one a line. None: those
-                in the file's metadata, as Ultralytics writes them, or the numbers.
-            threads: Of the processor for one image; more than 1 takes them from the rest of a flight.
-            layout: What the outputs mean, where the file does not show it.
-            size: Width and height of the input [px], for a network that takes any.
+            score: Drop detections with a lower score, 0 to 1.
+            iou: Merge boxes of one class that overlap more (intersection over union), 0 to 1.
+            names: Class names: a list, a mapping from numbers, or a text file with one per line. None: those in the
+                file's metadata, as Ultralytics writes them, or the numbers.
+            threads: CPU threads per image; more than 1 takes CPU time from the rest of the flight.
+            layout: Layout of the outputs, if ambiguous.
+            size: Width and height of the input [px], for a network that takes any size.
 
         Raises:
             MissingExtraError: ONNX Runtime or OpenCV is not installed.
             UsageError: An argument is out of its range, or there is no such file.
-            FileFormatError: The file is no ONNX file, or not one of a known family.
+            FileFormatError: The file is not an ONNX file, or not of a known family.
         """
         for name, value in (("score", score), ("iou", iou)):
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
@@ -94,11 +94,11 @@ class OnnxDetector:
         metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         task = metadata.get("task", "detect")
         if task != "detect":
-            raise FileFormatError(f"{path} is a network for {task!r}, and only those for 'detect' are read")
+            raise FileFormatError(f"{path} is a network for {task!r}, and must be one for 'detect'")
         self.names: dict[int, str] = _names(metadata.get("names"), self._path) if names is None else _given(names)
         self._input, self._type, self.size = self._check_inputs(size, metadata)
         self.dropped = 0
-        self.layout = Layout.YOLO8 if wanted is None else wanted  # the blank image is the same in each
+        self.layout = Layout.YOLO8 if wanted is None else wanted  # a blank image is the same in every layout
         blank = self._run(np.full((self.size[1], self.size[0], 3), _GREY, np.uint8))
         try:
             if wanted is None:
@@ -109,13 +109,13 @@ class OnnxDetector:
             raise FileFormatError(f"{path}: {error}") from None
 
     def detect(self, image: Image) -> list[Detection]:
-        """Return what is in the image, surest first.
+        """Return the things in the image, the most confident first.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey, of any size.
 
         Raises:
-            UsageError: The image has another shape or type.
+            UsageError: The image has a wrong shape or type.
             FileFormatError: The network can't be run.
         """
         pixels = pixels_of(image)
@@ -126,7 +126,7 @@ class OnnxDetector:
         return self._detections(found, scale, shift, (pixels.shape[1], pixels.shape[0]))
 
     def _fit(self, pixels: Image) -> tuple[Image, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the image in the input's size, its scale and where its corner is, x and y each."""
+        """Return the image fitted to the input size, its scale and its corner, x and y each."""
         width, height = self.size
         rows, columns = pixels.shape[:2]
         if self.layout in STRETCHED:
@@ -152,7 +152,7 @@ class OnnxDetector:
         tensor = np.ascontiguousarray(values[None], self._type)
         feed: dict[str, Any] = {self._input: tensor}
         for other in self._session.get_inputs():
-            if other.name != self._input:  # RT-DETR with its postprocessor: the size that its boxes are in
+            if other.name != self._input:  # RT-DETR with its postprocessor: the image size of its boxes
                 feed[other.name] = np.array([self.size], np.int64)
         try:
             results = self._session.run(None, feed)
@@ -160,7 +160,7 @@ class OnnxDetector:
             raise FileFormatError(f"{self._path} can't be run on {_shape(tensor.shape)}: {reason(error)}") from error
         named = dict(zip((each.name for each in self._session.get_outputs()), results, strict=True))
         if not all(isinstance(each, np.ndarray) for each in results):
-            raise FileFormatError(f"{self._path} returns sequences, and must return arrays")
+            raise FileFormatError(f"{self._path} returns sequences and must return arrays")
         return named
 
     def _detections(
@@ -187,17 +187,17 @@ class OnnxDetector:
     def _check_inputs(
         self, size: tuple[int, int] | None, metadata: Mapping[str, str]
     ) -> tuple[str, Any, tuple[int, int]]:
-        """Return the input's name, its type, and the size of images that it takes."""
+        """Return the input's name, its type and its image size."""
         inputs = self._session.get_inputs()
         extra = [each.name for each in inputs[1:] if each.name != "orig_target_sizes"]
         shown = ", ".join(f"{each.name} {each.type} {tuple(each.shape)}" for each in inputs) or "none"
         if not inputs or extra:
-            raise FileFormatError(f"{self._path} has the inputs {shown}, and must have one: an image")
+            raise FileFormatError(f"{self._path} has the inputs {shown} and must have one, an image")
         first = inputs[0]
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
             raise FileFormatError(
-                f"{self._path} has the input {shown}, and must have (1, 3, height, width) of float, float16 or uint8"
+                f"{self._path} has the input {shown} and must have (1, 3, height, width) of float, float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
             raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for one")
@@ -207,21 +207,21 @@ class OnnxDetector:
             both = [int(each) for each in asked] if _is_pair(asked) else [_SIDE, _SIDE]
             size = both[1], both[0]  # Ultralytics writes the height first
         elif any(own is not None and own != given for own, given in zip(fixed, size, strict=True)):
-            raise UsageError(f"size is {size!r} and {self._path} takes only {_shape(shape)}: leave size out")
+            raise UsageError(f"size is {size!r}, but {self._path} takes only {_shape(shape)}: leave size out")
         width, height = (given if own is None else own for own, given in zip(fixed, size, strict=True))
         if not (0 < width <= _MOST_SIDE and 0 < height <= _MOST_SIDE):
-            raise FileFormatError(f"{self._path} takes {width}×{height} pixels, and at most {_MOST_SIDE} are allowed")
+            raise FileFormatError(f"{self._path} takes {width}×{height} pixels, but the limit is {_MOST_SIDE}")
         return first.name, _TYPES[first.type], (width, height)
 
     def _check_names(self, classes: int | None) -> None:
-        # A DETR has one class more, for no object.
+        # A DETR has an extra class for "no object".
         spare = 1 if self.layout in (Layout.DETR, Layout.RF_DETR) else 0
         if classes is not None and self.names and max(self.names) >= classes + spare:
-            raise FileFormatError(f"it has {classes} classes, and {len(self.names)} names were given for them")
+            raise FileFormatError(f"it has {classes} classes, but {len(self.names)} names")
 
 
 def _names(text: str | None, path: Path) -> dict[int, str]:
-    """Read the names in a file's metadata: a dict or list in Python's notation, as Ultralytics writes it."""
+    """Read the class names in a file's metadata: a dict or list in Python notation, as Ultralytics writes it."""
     if text is None:
         return {}
     value = _literal(text)
@@ -239,7 +239,7 @@ def _given(names: Sequence[str] | Mapping[int, str] | Path | str) -> dict[int, s
         try:
             lines = read_text(names, "the names", MAX_TEXT).splitlines()
         except FileFormatError as error:
-            raise UsageError(f"names is {str(names)!r}, which can't be read as a text file: {error}") from error
+            raise UsageError(f"names is {str(names)!r} and can't be read as a text file: {error}") from error
         names = [line.strip() for line in lines if line.strip()]
     pairs: dict[Any, Any] = dict(names) if isinstance(names, Mapping) else dict(enumerate(names))
     sound = all(isinstance(k, int) and k >= 0 and isinstance(v, str) and v for k, v in pairs.items())
@@ -249,7 +249,7 @@ def _given(names: Sequence[str] | Mapping[int, str] | Path | str) -> dict[int, s
 
 
 def _literal(text: str | None) -> Any:
-    """Return a value in Python's notation; None if it is none, or too long to be one."""
+    """Parse a value in Python notation; None if malformed or too long."""
     if text is None or len(text) > 1_000_000:
         return None
     try:

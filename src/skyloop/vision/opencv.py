@@ -1,4 +1,4 @@
-"""OpenCV, imported when it is used, and its dictionaries of markers."""
+"""OpenCV, imported on first use, and its marker dictionaries."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def opencv(what: str) -> Any:
     """Import OpenCV.
 
     Args:
-        what: What needs it; a noun phrase for the error message.
+        what: The feature that needs it; a noun phrase for the error message.
 
     Returns:
         The module ``cv2``.
@@ -31,7 +31,7 @@ def marker_dictionary(cv: Any, dictionary: str) -> Any:
 
     Args:
         cv: The module ``cv2``.
-        dictionary: Its name, with or without ``DICT_``, in any case.
+        dictionary: Name, with or without ``DICT_``, in upper or lower case.
 
     Raises:
         UnknownNameError: OpenCV has no such dictionary.

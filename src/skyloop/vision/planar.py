@@ -1,4 +1,4 @@
-"""Flat things of known size in an image, as gates are, and the detection of markers (ArUco and AprilTag).
+"""Poses of flat things of known size, such as gates, and detection of markers (ArUco and AprilTag).
 
 Camera axes are optical: x right, y down, z forward. A flat thing's own axes are x right, y up, z out of its face.
 
@@ -34,10 +34,10 @@ Array = NDArray[np.float64]
 class PlanarSighting:
     """One flat thing in one image."""
 
-    corners: Array  #: (4, 2) pixels: its own top left, top right, bottom right, bottom left
+    corners: Array  #: (4, 2) pixels: the thing's top left, top right, bottom right, bottom left
     position_m: Array  #: (3,) its centre in the camera's optical axes [m]
     rotation: Array  #: (3, 3) from its own axes (x right, y up, z out of its face) to optical axes
-    ambiguity: float  #: how well the second best pose explains the corners: 0 not at all, 1 as well as the best
+    ambiguity: float  #: fit of the second-best pose relative to the best: 0 not at all, 1 equally good
 
     @property
     def normal(self) -> Array:
@@ -67,7 +67,7 @@ class PlanarSighting:
         """Return its centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
         return mounting_rotation(camera) @ self.position_m + offset
@@ -76,7 +76,7 @@ class PlanarSighting:
         """Return the unit vector out of its face in body axes, shape (3,).
 
         Raises:
-            UsageError: The camera does not say how it is mounted.
+            UsageError: The camera's mounting is unknown.
         """
         return mounting_rotation(camera) @ self.normal
 
@@ -100,7 +100,7 @@ class PlanarPose:
             method: One of OpenCV's IPPE methods.
 
         Returns:
-            The best pose; None if nothing in front of the camera explains the corners.
+            The best pose; None if no pose in front of the camera fits the corners.
         """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
@@ -123,15 +123,15 @@ def rectangle(width_m: float, height_m: float) -> Array:
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image, and return its pixels as a plain array with its intrinsics.
+    """Check an image; return its pixels as a plain array, and its intrinsics.
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        intrinsics: Of the camera; None takes the frame's.
-        colour: Whether a grey image is refused.
+        intrinsics: Intrinsics of the camera; None takes the frame's.
+        colour: Whether to refuse grey images.
 
     Raises:
-        UsageError: The array has another shape or type, is empty, or there are no intrinsics.
+        UsageError: The array has a wrong shape or type or is empty, or there are no intrinsics.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -141,14 +141,14 @@ def checked(
 
 
 def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
-    """Check an image, and return its pixels as a plain array, the same memory.
+    """Check an image; return its pixels as a plain array in the same memory.
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        colour: Whether a grey image is refused.
+        colour: Whether to refuse grey images.
 
     Raises:
-        UsageError: The array has another shape or type, or is empty.
+        UsageError: The array has a wrong shape or type, or is empty.
     """
     pixels = np.asarray(image)
     grey = pixels.ndim == 2 and not colour
@@ -160,14 +160,14 @@ def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.u
     return pixels
 
 
-#: The largest dictionary of each family, which holds the smaller ones' markers under the same ids.
+#: The largest dictionary of each family; it contains the smaller ones' markers under the same ids.
 _FAMILIES: Final = (
     *("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original"),
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images; a try takes some 2 ms at 320×240, and only as long as nothing was found
-_FEW_IMAGES: Final = 30  #: of which nothing can be said
+_OTHERS_EVERY: Final = 8  #: images between tries (some 2 ms each at 320×240), only until a marker is found
+_FEW_IMAGES: Final = 30  #: images before a diagnosis
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -181,7 +181,7 @@ class MarkerDetector:
     """Detects markers of one dictionary and one size. Holds OpenCV's scratch memory: use one detector per thread.
 
     Attributes:
-        dictionary: As it was given.
+        dictionary: The dictionary's name, as given.
         size_m: Edge of the black square.
     """
 
@@ -189,7 +189,7 @@ class MarkerDetector:
         """Prepare the detector.
 
         Args:
-            dictionary: OpenCV's name of it, with or without ``DICT_``.
+            dictionary: OpenCV's name, with or without ``DICT_``.
             size_m: Edge of the black square.
 
         Raises:
@@ -203,39 +203,39 @@ class MarkerDetector:
         self.size_m = float(size_m)
         self._cv = opencv("marker detection")
         self._detector = _make_detector(self._cv, dictionary)
-        # The order and axes that SOLVEPNP_IPPE_SQUARE asks for: x right, y up, z out of the face.
+        # The order and axes that SOLVEPNP_IPPE_SQUARE expects: x right, y up, z out of the face.
         self._square = rectangle(self.size_m, self.size_m)
         self._images = self._seen = 0
         self._others: Counter[tuple[str, int]] = Counter()  # tags of other dictionaries, by family and id
 
     def why_nothing(self) -> str:
-        """Return what a person should know who wonders why nothing was found.
+        """Explain why no marker was found.
 
-        Where no image had a marker, some of them are searched for those of other dictionaries meanwhile.
+        While no image has a marker, some of them are also searched for markers of other dictionaries.
 
         Returns:
-            In words; empty after few images, or if a marker was found in one of them.
+            An explanation; empty after few images, or if any image had a marker.
         """
         if self._seen or self._images < _FEW_IMAGES:
             return ""
         nothing = f"no marker of {self.dictionary} was found in {self._images} images"
         if not self._others:
-            return f"{nothing}, nor one of another dictionary: is it in view, lit, and printed with a white margin?"
+            return f"{nothing}, nor of another dictionary: is it in view, lit and printed with a white margin?"
         tags = ", ".join(f"{number} of {_smallest(family, number)}" for family, number in sorted(self._others))
-        return f"{nothing}, but others were, of other dictionaries: {tags}"
+        return f"{nothing}, but markers of other dictionaries were: {tags}"
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[MarkerSighting]:
         """Detect all markers in an image.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            intrinsics: Of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None takes the frame's.
 
         Returns:
-            The sightings, in the order of their ids.
+            The sightings, ordered by id.
 
         Raises:
-            UsageError: The array has another shape or type, or there are no intrinsics.
+            UsageError: The array has a wrong shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
@@ -253,18 +253,18 @@ class MarkerDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
-        """Look for the markers of one other family, each time of the next one."""
+        """Search for markers of another family, the next one each time."""
         known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
         parameters = self._cv.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0  # a square of the room must not pass for a tag
+        parameters.errorCorrectionRate = 0.0  # a square in the room must not pass for a tag
         markers = marker_dictionary(self._cv, family)
         _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
         self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
 
     def _sighting(self, number: int, corners: Array, intrinsics: Intrinsics) -> MarkerSighting | None:
-        """Return the marker's pose; None if no square in front of the camera explains the corners."""
+        """Return the marker's pose; None if no square in front of the camera fits the corners."""
         rays = normalised(corners, intrinsics)
         if not np.isfinite(rays).all():
             return None
@@ -285,10 +285,10 @@ def _smallest(family: str, number: int) -> str:
 def _make_detector(cv: Any, dictionary: str) -> Any:
     markers = marker_dictionary(cv, dictionary)
     parameters = cv.aruco.DetectorParameters()
-    # Corners to a fraction of a pixel: the range of a marker is only as good as its edges.
+    # Refine corners to a fraction of a pixel: a marker's range is only as good as its edges.
     parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
-    # Half a cell each way: at OpenCV's 0.3 corners are 0.46 px off (median over 150 noisy poses), at this 0.31 px.
+    # Half a cell each way: with OpenCV's 0.3, corners are 0.46 px off (median of 150 noisy poses), with this 0.31 px.
     parameters.relativeCornerRefinmentWinSize = 0.5
-    # The edge of the white card is a square of its own near the marker's; at OpenCV's 0.125 it can hide the marker.
+    # The white card's edge is another square near the marker's; with OpenCV's 0.125 it can hide the marker.
     parameters.minMarkerDistanceRate = 0.05
     return cv.aruco.ArucoDetector(markers, parameters)

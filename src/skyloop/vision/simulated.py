@@ -1,4 +1,4 @@
-"""The detector that is part of Skyloop: of people, cars and crates as the simulator draws them, and of nothing else."""
+"""Skyloop's own detector: people, cars and crates as the simulator draws them, and nothing else."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SIMULATED_WEIGHTS: Final = Path(__file__).with_name("weights") / "figures.onnx"
 def simulated_detector(*, score: float = 0.4, iou: float = 0.5, threads: int = 1) -> OnnxDetector:
     """Return a detector of the simulator's figures: ``person``, ``car``, and ``box`` for a crate.
 
-    It was trained with drawn pictures alone and is of no use on a real drone's.
+    It was trained only on rendered images and is useless on a real drone's.
 
     Args:
-        score: Detections that are less sure are dropped, 0 to 1.
-        iou: Boxes of one class that overlap more are one detection, 0 to 1.
-        threads: Of the processor for one image.
+        score: Drop detections with a lower score, 0 to 1.
+        iou: Merge boxes of one class that overlap more, 0 to 1.
+        threads: CPU threads per image.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.

@@ -1,6 +1,6 @@
-"""Trackers of a box from one image to the next: by a correlation filter, by the flow of points, and learned ones.
+"""Trackers of a box from image to image: by a correlation filter, by the flow of points, and learned ones.
 
-**Correlation.** A filter is learned whose correlation with the patch around the target is a narrow peak at its middle.
+**Correlation.** A filter is learned whose correlation with the patch around the target has a narrow peak at its middle.
 It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
 correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
 (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
@@ -8,9 +8,9 @@ linear kernel). The size is tracked by a second, one-dimensional filter over pat
 and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
-2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half that comes back nearest
-to where it began, of those the half whose surroundings look most alike, give the motion by the median of their
-displacements, and the scale by the median of how their distances changed.
+2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. Of the half that returns closest
+to its start, the half whose surroundings look most alike give the motion by the median of their displacements, and the
+scale by the median change of their distances.
 
 **Learned.** ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) two: backbone, and neck and
 head.
@@ -33,27 +33,27 @@ from skyloop.vision.tracking import CELL, Box, Floats, Image, Tracker, TrackResu
 
 Spectrum = NDArray[np.complex64]
 
-_AREA_PX: Final = 128.0**2  # of the patch around the target, sampled
-_CONTEXT: Final = 1.5  # times the root of the target's area, added to its width and height
-_RATE: Final = 0.02  # how much of each image is learned
-_SCALE_RATE: Final = 0.02
-_REGULARISATION: Final = 0.02  # of the mean energy of the spectrum
-_SPREAD: Final = 0.08  # of the peak, of the target's size
-_SCALES: Final = 17
-_SCALE_STEP: Final = 1.03
+_AREA_PX: Final = 128.0**2  # size of the sampled patch around the target
+_CONTEXT: Final = 1.5  # margin added to width and height, times the root of the target's area
+_RATE: Final = 0.02  # learning rate per image
+_SCALE_RATE: Final = 0.02  # learning rate of the size per image
+_REGULARISATION: Final = 0.02  # share of the spectrum's mean energy
+_SPREAD: Final = 0.08  # width of the peak, as a share of the target's size
+_SCALES: Final = 17  # sizes tried per image
+_SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
 _SCALE_SPREAD: Final = 1.0  # steps
-_SCALE_AREA_PX: Final = 32.0**2
-_SMALLEST: Final = 0.2  # times the size at the start
-_LARGEST: Final = 6.0  # times the size at the start
-_LEAST_PX: Final = 4.0
+_SCALE_AREA_PX: Final = 32.0**2  # size of the sampled patch of each size
+_SMALLEST: Final = 0.2  # times the initial size
+_LARGEST: Final = 6.0  # times the initial size
+_LEAST_PX: Final = 4.0  # smallest side of a target
 _GRID: Final = 10  # points along each side
-_WINDOW: Final = (11, 11)
-_LEVELS: Final = 3
-_AROUND: Final = (9, 9)  # pixels of a point's surroundings that are compared
-_ENOUGH: Final = 6  # points
-_RETURN_PX: Final = 5.0  # a median that comes back farther away is a failure
-_SPREAD_PX: Final = 0.35  # of the box's smaller side: more disagreement among the displacements is a failure
-_SMALLEST_PX: Final = 6.0
+_WINDOW: Final = (11, 11)  # window of Lucas-Kanade [px]
+_LEVELS: Final = 3  # levels of its image pyramid
+_AROUND: Final = (9, 9)  # pixels of a point's surroundings to compare
+_ENOUGH: Final = 6  # points needed
+_RETURN_PX: Final = 5.0  # a larger median return distance is a failure
+_SPREAD_PX: Final = 0.35  # share of the box's smaller side: a larger spread of the displacements is a failure
+_SMALLEST_PX: Final = 6.0  # a smaller box is a failure
 
 
 class _Filter:
@@ -66,7 +66,7 @@ class _Filter:
         self._below: Floats | None = None
 
     def learn(self, spectrum: Spectrum) -> None:
-        """Learn from a patch's spectrum, channels first: the first one wholly, the others a little."""
+        """Learn from a patch's spectrum, channels first: the first one fully, later ones by the learning rate."""
         above = np.conj(self._wanted) * spectrum
         below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
         if self._above is None or self._below is None:
@@ -84,11 +84,11 @@ class _Filter:
 
 
 class CorrelationTracker(Tracker):
-    """Tracks place and size of a target by correlation filters: fast, and the default.
+    """Tracks a target's place and size by correlation filters; fast, and the default.
 
-    It follows what changes slowly, and moves by less than half of its size from image to image. The score is the height
-    of the correlation peak: about 1 on the image that it was learned from, and below ``lost_below`` the target counts
-    as lost. While it is lost it is looked for where it was last. For loss, memory and search, see
+    It follows a target that changes slowly and moves by less than half its size from image to image. The score is the
+    height of the correlation peak: about 1 on the image that it was learned from; below ``lost_below`` the target
+    counts as lost. A lost target is searched for where it was last. For loss detection, memory and search, see
     :class:`LongTermTracker`.
     """
 
@@ -104,10 +104,10 @@ class CorrelationTracker(Tracker):
         """
         self._cv: Any = opencv("tracking")
         self._lost_below, self._learn_above = lost_below, learn_above
-        self._centre: NDArray[np.float64] = np.zeros(2)  # of the target [px]
+        self._centre: NDArray[np.float64] = np.zeros(2)  # the target's centre [px]
 
     def shift(self, right: float, down: float) -> None:
-        """Look for the target so much farther right and down in the next image [px]; it was started before."""
+        """Search for the target shifted by this much to the right and down in the next image [px]."""
         self._centre = np.add(self._centre, (right, down))
 
     def _start(self, image: Image, box: Box) -> None:
@@ -121,7 +121,7 @@ class CorrelationTracker(Tracker):
         self._scale_sampled = _in_cells(self._size, _SCALE_AREA_PX)
         columns, rows = self._sampled[0] // CELL, self._sampled[1] // CELL
         self._window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1]).astype(np.float32)
-        cells = np.array([columns, rows]) * self._size / self._around  # of the target
+        cells = np.array([columns, rows]) * self._size / self._around  # the target's size in cells
         wanted = np.outer(_peak(rows, _SPREAD * cells[1] + 0.5), _peak(columns, _SPREAD * cells[0] + 0.5))
         self._filter = _Filter(np.asarray(np.fft.rfft2(wanted), np.complex64), _RATE)
         self._steps = _SCALE_STEP ** (np.arange(_SCALES) - _SCALES // 2)
@@ -171,7 +171,7 @@ class CorrelationTracker(Tracker):
         return np.asarray(np.fft.rfft2(features(self._cv, pixels) * self._window), np.complex64)
 
     def _scale_spectrum(self, image: Image) -> Spectrum:
-        """The spectrum over the sizes of each feature of the target, (features, _SCALES // 2 + 1)."""
+        """Return the spectrum over the sizes of each feature of the target, (features, _SCALES // 2 + 1)."""
         width, height = self._scale_sampled
         largest = float(self._steps[-1])
         finer = (round(width * largest * 1.5), round(height * largest * 1.5))
@@ -180,13 +180,13 @@ class CorrelationTracker(Tracker):
         for step in self._steps / largest:
             part = (finer[0] * (1 - step) / 2, finer[1] * (1 - step) / 2, finer[0] * step, finer[1] * step)
             sizes.append(patch(self._cv, whole, part, self._scale_sampled))
-        cells = features(self._cv, np.concatenate(sizes))  # all sizes one below the other
+        cells = features(self._cv, np.concatenate(sizes))  # all sizes stacked vertically
         each = cells.reshape(len(cells), _SCALES, -1).transpose(0, 2, 1).reshape(-1, _SCALES)
         return np.asarray(np.fft.rfft(each * self._scale_window, axis=1), np.complex64)
 
 
 def _in_cells(size: NDArray[np.float64], area_px: float) -> tuple[int, int]:
-    """Return width and height with about this area and the shape of a size, in whole cells, an even number of them."""
+    """Return width and height of about this area and a size's shape, as an even number of whole cells."""
     share = math.sqrt(area_px / float(size[0] * size[1]))
     width, height = (max(2, round(float(side) * share / CELL / 2) * 2) * CELL for side in size)
     return width, height
@@ -203,18 +203,18 @@ def _signed(place: float, count: int) -> float:
 
 
 def _refined(values: NDArray[np.floating[Any]], at: int) -> float:
-    """Return the place of a peak between the values of a ring, from the parabola through it and its neighbours."""
+    """Refine the place of a peak in a ring of values by the parabola through it and its neighbours."""
     before, here, after = float(values[at - 1]), float(values[at]), float(values[(at + 1) % len(values)])
     bend = before - 2 * here + after
     return at if bend >= 0 else at + 0.5 * (before - after) / bend
 
 
 class MedianFlowTracker(Tracker):
-    """Tracks place and size of a target from each image to the next, and remembers no appearance.
+    """Tracks a target's place and size from each image to the next, without remembering its appearance.
 
-    It is exact while the target is in view and moves smoothly, and notices at once when that fails. Then it stays lost
-    until it is started again. It drifts, as it never compares with the beginning. The score says how many points came
-    back, and how near.
+    It is exact while the target is in view and moves smoothly, and notices a failure at once; it then stays lost until
+    restarted. It drifts, because it never compares with the first image. The score says how many points returned, and
+    how closely.
     """
 
     def __init__(self) -> None:
@@ -271,7 +271,7 @@ class MedianFlowTracker(Tracker):
         return found, min(score, 1.0)
 
     def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return where the points are now, how far from their start they come back, and which could be tracked."""
+        """Return the points' new places, their return distances, and which of them could be tracked."""
         cv = self._cv
         points = before.reshape(-1, 1, 2)
         after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
@@ -299,7 +299,7 @@ def _grid(box: Box) -> Floats:
 
 
 def _stretch(before: Floats, after: Floats) -> float:
-    """Return by how much the distances between the points grew: the median over all pairs."""
+    """Return the growth of the distances between the points: the median over all pairs."""
     one, other = np.triu_indices(len(before), k=1)
     old = np.linalg.norm(before[one] - before[other], axis=1)
     new = np.linalg.norm(after[one] - after[other], axis=1)
@@ -307,7 +307,7 @@ def _stretch(before: Floats, after: Floats) -> float:
 
 
 class LearnedTracker(Tracker):
-    """Tracks by a neural network, through OpenCV, on the processor. The score is the network's own.
+    """Tracks by a neural network, through OpenCV, on the CPU. The score is the network's own.
 
     The weights are not part of Skyloop: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, the repository
     of NanoTrack its two files.
@@ -324,9 +324,9 @@ class LearnedTracker(Tracker):
         Raises:
             MissingExtraError: OpenCV is not installed.
             UnsupportedError: This OpenCV was built without that tracker.
-            UsageError: A file is not there.
-            FileFormatError: A file is not the weights of that tracker, or takes too much to load (tried in a child
-                process, as in :func:`skyloop.vision.onnx.load_network`).
+            UsageError: A file does not exist.
+            FileFormatError: A file is not the weights of that tracker, or exceeds the limits of loading (tested in a
+                child process, as in :func:`skyloop.vision.onnx.load_network`).
         """
         self._cv: Any = opencv("tracking")
         self._lost_below = lost_below
@@ -357,12 +357,12 @@ class LearnedTracker(Tracker):
         return TrackResult(None if lost else (x, y, width, height), score)
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        """Call OpenCV's tracker; a file with another network often loads, and fails here."""
+        """Call OpenCV's tracker; a file with another network often loads and only fails here."""
         try:
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:
             raise FileFormatError(
-                f"{self._given} does not work as the weights of {self._name}: {onnx.reason(error)}"
+                f"{self._given} does not work as weights of {self._name}: {onnx.reason(error)}"
             ) from error
 
     def _coloured(self, image: Image) -> Any:

@@ -1,4 +1,4 @@
-"""What all trackers of a box have in common: how they start, are updated and what they return; and patches of an image.
+"""The base of all trackers of a box: start, update and result; and patches of an image.
 
 A box is x, y, width and height in pixels: its left and top edge, and its size, as in OpenCV. A box of whole numbers
 covers the columns x to x + width − 1 and the rows y to y + height − 1.
@@ -21,8 +21,8 @@ from skyloop.vision.planar import pixels_of
 Box = tuple[float, float, float, float]  #: x, y, width, height [px]
 Image = NDArray[np.uint8]
 
-LEAST_PX: Final = 6.0  #: sides of a box: a smaller one has too little in it to be found again
-_IN_VIEW: Final = 0.5  # of the box, at the start
+LEAST_PX: Final = 6.0  #: least side of a box; a smaller one has too little texture to be found again
+_IN_VIEW: Final = 0.5  # least share of the initial box inside the image
 Floats = NDArray[np.float32]
 
 CELL: Final = 4  #: pixels of a patch along a side of a cell
@@ -30,11 +30,11 @@ CELL: Final = 4  #: pixels of a patch along a side of a cell
 
 @dataclass(frozen=True, slots=True)
 class TrackResult:
-    """Where the target is in one image."""
+    """The target's place in one image."""
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
-    score: float  #: 0 to 1, how much it looks like the target; a score, not a probability
-    confidence: float | None = None  #: chance that the box overlaps the target by a half or more; None: no estimate
+    score: float  #: 0 to 1, similarity to the target; a score, not a probability
+    confidence: float | None = None  #: chance of an overlap of at least a half; None: no estimate
 
     @property
     def lost(self) -> bool:
@@ -56,23 +56,23 @@ class TrackResult:
 
 
 class Tracker(ABC):
-    """Follows what is in a box from image to image: :meth:`start` once, then :meth:`update` with each new image.
+    """Follows the content of a box from image to image: :meth:`start` once, then :meth:`update` with each new image.
 
-    It may be started again at any time, with images of another size, too. It is not thread-safe: call it from one
-    thread, such as a controller's or a processor's.
+    It can be restarted at any time, even with images of another size. It is not thread-safe: call it from one thread,
+    such as a controller's or a processor's.
     """
 
     _shape: tuple[int, ...] | None = None
 
     def start(self, image: Image, box: Sequence[float]) -> None:
-        """Start to track what is in the box, and forget what was tracked before.
+        """Start tracking the content of a box, and forget the previous target.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            box: x, y, width, height [px]. At least half of it is in the image.
+            box: x, y, width, height [px]. At least half of it must be in the image.
 
         Raises:
-            UsageError: The array has another shape or type, or the box is empty, not finite or outside of the image.
+            UsageError: The array has a wrong shape or type, or the box is empty, not finite or outside the image.
         """
         pixels = pixels_of(image)
         checked = checked_box(box, pixels.shape)
@@ -87,7 +87,7 @@ class Tracker(ABC):
             image: As in :meth:`start`, of the same size and kind.
 
         Raises:
-            UsageError: The tracker was not started, or the image has another shape or type than at the start.
+            UsageError: The tracker was not started, or the image's shape or type differs from the first.
         """
         if self._shape is None:
             raise UsageError("the tracker was not started: call start(image, box) before update(image)")
@@ -100,10 +100,10 @@ class Tracker(ABC):
         return self._update(pixels)
 
     def shift(self, right: float, down: float) -> None:  # noqa: B027 - to ignore it is allowed
-        """Say how far the target moved in the image since the last one, as is known when the camera turned [px].
+        """Announce how far the target moved in the image since the last one, as known from the camera's rotation [px].
 
-        It is looked for there in the next image. Trackers that look for it everywhere, or by the image's own motion,
-        ignore it; so it may be left out.
+        The target is searched for there in the next image. Trackers that search everywhere, or measure the image's own
+        motion, ignore this, and calling it is optional.
         """
 
     @abstractmethod
@@ -116,14 +116,14 @@ class Tracker(ABC):
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
-    """Check a box that a tracker is started with.
+    """Check the initial box of a tracker.
 
     Args:
         box: x, y, width, height [px].
-        shape: Of the image: height, width, and more.
+        shape: Shape of the image: height, width, and more.
 
     Raises:
-        UsageError: It is anything else, too small, or less than half of it is in the image.
+        UsageError: The box is malformed or too small, or less than half of it is in the image.
     """
     try:
         x, y, width, height = (float(part) for part in box)
@@ -131,7 +131,7 @@ def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
         raise UsageError(f"the box is {box!r} and must be x, y, width and height in pixels") from None
     given = f"x={x:g}, y={y:g}, width={width:g}, height={height:g}"
     if not all(math.isfinite(part) for part in (x, y, width, height)):
-        raise UsageError(f"the box is {given} and must be of finite numbers")
+        raise UsageError(f"the box is {given} and must consist of finite numbers")
     if width < LEAST_PX or height < LEAST_PX:
         raise UsageError(f"the box is {given} and must be at least {LEAST_PX:g} pixels wide and high")
     rows, columns = shape[:2]
@@ -154,13 +154,13 @@ def overlap_area(one: Box, other: Box) -> float:
 
 
 def overlap(one: Box, other: Box) -> float:
-    """Return how well two boxes agree: the shared area over that of both together, 0 to 1."""
+    """Return the overlap of two boxes: intersection over union, 0 to 1."""
     shared = overlap_area(one, other)
     return shared / max(one[2] * one[3] + other[2] * other[3] - shared, 1e-9)
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box of an image; what is outside of the image repeats its edge.
+    """Sample a box of an image; pixels outside the image repeat its edge.
 
     Args:
         cv: The module ``cv2``.
@@ -174,7 +174,7 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
     right, bottom = min(columns, math.ceil(x + width) + 1), min(rows, math.ceil(y + height) + 1)
     left, top = min(left, columns - 1), min(top, rows - 1)
     part = image[top : max(bottom, top + 1), left : max(right, left + 1)]
-    # Linear sampling looks at the nearest pixels only: a large part is averaged down first.
+    # Linear sampling uses only the nearest pixels, so average a large part down first.
     coarse = [max(1, int(full / wanted)) for full, wanted in zip((width, height), size, strict=True)]
     high, wide = part.shape[:2]
     if max(coarse) > 1:
@@ -190,11 +190,11 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
 
 
 def features(cv: Any, pixels: Image) -> Floats:
-    """Return the features of a patch, (channels, height / CELL, width / CELL): 8 of a grey one, 10 of a colour one.
+    """Return the features of a patch, (channels, height / CELL, width / CELL): 8 channels for grey, 10 for colour.
 
-    The gradient's strength in each cell and the first harmonics of its direction, which say what a histogram of
-    directions says with fewer numbers; each over the strength around, so that light and contrast do not matter. Then
-    brightness and, of a colour image, both parts of the colour, over the whole patch's.
+    The gradient's strength in each cell and the first harmonics of its direction, which carry a direction histogram's
+    information in fewer numbers, each normalised by the local strength, so that light and contrast do not matter. Then
+    brightness and, for a colour image, both colour components, over the whole patch's.
     """
     size = (pixels.shape[1] // CELL, pixels.shape[0] // CELL)
     if pixels.ndim == 3:
@@ -221,7 +221,7 @@ def features(cv: Any, pixels: Image) -> Floats:
         2 * twice_cos * sin2,
     ]
     cells = [cv.resize(one, size, interpolation=cv.INTER_AREA) for one in maps]
-    around = cv.blur(cells[0], (3, 3)) + np.float32(4.0)  # grey levels: the noise of a flat wall is no texture
+    around = cv.blur(cells[0], (3, 3)) + np.float32(4.0)  # grey levels; noise on a flat wall is not texture
     light = [(plain[0] - plain[0].mean()) / np.float32(64.0)]
     colour = [(one - 128) / np.float32(32.0) for one in plain[1:]]
     return np.stack([one / around for one in cells] + light + colour)

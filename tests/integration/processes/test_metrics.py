@@ -55,7 +55,7 @@ def test_a_router(start: Callable[..., Process]) -> None:
 
 def test_an_invalid_address_is_refused_before_anything_starts() -> None:
     said = skyloop_command("proxy", "sim://", "--metrics", "nowhere", code=2)
-    assert "'nowhere' is no place for metrics" in said
+    assert "'nowhere' is not an address for metrics" in said
     assert "ready" not in said
     said = skyloop_command("sim", "--firmware", "tello", "--metrics", "0", code=2)
     assert "--metrics is of proxies" in said

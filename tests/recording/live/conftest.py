@@ -1,4 +1,4 @@
-"""Drones on threads of this process, and what shows them."""
+"""Drones on threads of this process, and their viewers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Fly = Callable[..., Drone]
 
 @pytest.fixture
 def fly() -> Iterator[Fly]:
-    """Makes proxies in this process, with a pilot each."""
+    """Creates proxies in this process, with a pilot each."""
     with ExitStack() as stack:
 
         def one(name: str = "alpha", vehicle: Driver | None = None) -> Drone:

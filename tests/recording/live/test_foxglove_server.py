@@ -1,4 +1,4 @@
-"""Foxglove's server, by a viewer of our own that reads its protocol: topics, what is subscribed to, parameters."""
+"""Foxglove's server, with our own viewer that reads its protocol: topics, subscriptions, parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skyloop.recording import foxglove as schemas
 from skyloop.recording import foxglove_access as module
 from skyloop.recording import layout, taps
 from skyloop.recording.backlog import Item, Rank
-from skyloop.recording.foxglove_access import MAX_HEAD, OriginDoor, ParameterDesk, hidden_host
+from skyloop.recording.foxglove_access import MAX_HEAD, OriginGuard, ParameterAccess, hidden_host
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.translation import Picture
 from tests.recording.live.conftest import WAIT_S, Fly
@@ -45,11 +45,11 @@ VIDEO, IMAGE, FRAMES = (f"/alpha/{name}" for name in ("camera/front/video", "cam
 
 @pytest.fixture
 def show() -> Iterator[Show]:
-    """Serves drones on a free port; what tests show there takes turns with what the view's thread does.
+    """Serves drones on a free port; what tests show there takes turns with the view's thread.
 
-    Two threads at once would hold up the process for ever: the SDK tells Python's logging of a viewer whose messages
-    are dropped, with that viewer's lock held; Python may go on with another thread meanwhile, which waits for that lock
-    and holds the interpreter's.
+    Two threads at once would deadlock the process: the SDK logs to Python, with a lock held, about a viewer whose
+    messages are dropped; Python may switch to another thread meanwhile that waits for that lock while it holds the
+    interpreter's.
     """
     with ExitStack() as stack:
 
@@ -78,7 +78,7 @@ def until(done: Callable[[], object], what: str) -> None:
 
 
 class Encoded(FakeVehicle):
-    """Sends H.264, of which every fifth picture is a key, and nothing else."""
+    """Sends only H.264, with every fifth image a key frame."""
 
     def capabilities(self) -> Capabilities:
         able = super().capabilities()
@@ -97,7 +97,7 @@ class Encoded(FakeVehicle):
 # Topics --------------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_looked_at_is_subscribed_to_and_nothing_else(fly: Fly, show: Show) -> None:
+def test_only_watched_topics_are_subscribed_to(fly: Fly, show: Show) -> None:
     view, server = show(fly())
     with Viewer(server.url) as viewer:
         viewer.until(lambda one: IMAGE in one.topics)
@@ -138,7 +138,7 @@ def test_messages_are_those_of_a_recording(fly: Fly, show: Show) -> None:
         assert abs(times[-1] - time.time_ns()) < 60e9
 
 
-def test_who_subscribes_later_is_sent_what_was_known_before(fly: Fly, show: Show) -> None:
+def test_late_subscribers_get_the_known_state(fly: Fly, show: Show) -> None:
     _, server = show(fly())
     known = "/alpha/parameters"
     with Viewer(server.url) as first, Viewer(server.url) as second:
@@ -160,11 +160,11 @@ def test_two_drones_on_one_server(fly: Fly, show: Show) -> None:
 
 def test_two_drones_of_the_same_name_are_refused(fly: Fly, show: Show) -> None:
     drone = fly()
-    with pytest.raises(UsageError, match="different names, not alpha, alpha"):
+    with pytest.raises(UsageError, match="different names, got alpha, alpha"):
         show(drone, drone)
 
 
-def test_h264_begins_with_a_key_picture_each_time(fly: Fly, show: Show) -> None:
+def test_h264_starts_with_a_key_frame_each_time(fly: Fly, show: Show) -> None:
     _, server = show(fly(vehicle=Encoded()))
     keys = {unit.data for unit in film() if unit.key}
     with Viewer(server.url) as viewer:
@@ -182,7 +182,7 @@ def test_h264_begins_with_a_key_picture_each_time(fly: Fly, show: Show) -> None:
             viewer.unsubscribe(FRAMES)
 
 
-def test_frames_in_another_form_than_expected_get_a_topic(fly: Fly, show: Show) -> None:
+def test_frames_in_an_unexpected_format_get_a_topic(fly: Fly, show: Show) -> None:
     _, server = show(fly(vehicle=Encoded()))
     with Viewer(server.url) as viewer:
         viewer.until(lambda one: VIDEO in one.topics)
@@ -191,7 +191,7 @@ def test_frames_in_another_form_than_expected_get_a_topic(fly: Fly, show: Show) 
         viewer.until(lambda one: IMAGE in one.topics)
 
 
-def test_from_a_network_frames_come_as_h264_and_in_their_own_form_where_that_can_not_be_had(
+def test_over_a_network_frames_arrive_as_h264_or_else_in_their_own_format(
     far: Node, show: Show, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("av", reason="H.264 needs the extra 'video'")
@@ -203,7 +203,7 @@ def test_from_a_network_frames_come_as_h264_and_in_their_own_form_where_that_can
             viewer.until(lambda one: len(one.of(video)) > 5)
             assert image not in viewer.topics
             first = schemas.CompressedVideo.FromString(viewer.of(video)[0]).data
-            assert first.split(b"\x00\x00\x01")[1][0] & 31 == 7  # a key picture, with its parameters
+            assert first.split(b"\x00\x00\x01")[1][0] & 31 == 7  # a key frame with its parameters
             viewer.unsubscribe(video)
             # A proxy that can't encode sends nothing: JPEG is shown instead.
             monkeypatch.setattr(taps, "_STREAM_GONE_NS", 1)
@@ -223,22 +223,22 @@ def frame_item(seq: int, data: bytes) -> Item:
     return Item(0, "video.front", Rank.FRAME, time.monotonic_ns(), Picture(record, data), len(data))
 
 
-def test_a_viewer_that_stands_still_loses_messages_and_nobody_else_does(fly: Fly, show: Show) -> None:
+def test_only_a_hanging_viewer_loses_messages(fly: Fly, show: Show) -> None:
     drone = fly()
     _, server = show(drone)
-    count, size = 2 * WAITING, 50_000  # more than the server keeps and the sockets hold
+    count, size = 2 * WAITING, 50_000  # more than the server and the sockets can hold
     with Viewer(server.url) as stalled, Viewer(server.url) as healthy:
         for viewer in (stalled, healthy):
             viewer.subscribe(FRAMES, IMAGE)
         until(lambda: server.viewers == {FRAMES: 2, IMAGE: 2}, "both have subscribed")
         stalled.until(lambda one: one.of(FRAMES))
         sent = range(10_000, 10_000 + count)
-        for seq in sent:  # what the view's thread does; it must not wait for the viewer
+        for seq in sent:  # as the view's thread does; it must not wait for the viewer
             server.show(frame_item(seq, bytes(size)))
             if seq % 50 == 0 or seq == sent[-1]:
                 healthy.until(lambda one, seq=seq: newest(one) >= seq)  # type: ignore[misc]
         assert set(sent) <= sequences(healthy)
-        drone.takeoff()  # the pilot is unharmed
+        drone.takeoff()  # the pilot is unaffected
         stalled.until(lambda one: newest(one) >= sent[-1], "the newest, once it reads again")
         lost = set(sent) - sequences(stalled)
         assert lost
@@ -246,7 +246,7 @@ def test_a_viewer_that_stands_still_loses_messages_and_nobody_else_does(fly: Fly
 
 
 def test_the_sdk_never_asks_pythons_logging(fly: Fly, show: Show, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It did with a viewer's lock held: a thread that wanted that lock kept the interpreter, and all stood still."""
+    """It did with a viewer's lock held: a thread waiting for that lock held the interpreter, a deadlock."""
     asked: list[str] = []
     plain = logging.Logger.isEnabledFor
 
@@ -290,7 +290,7 @@ def test_parameters_are_read_and_followed(fly: Fly, show: Show) -> None:
         viewer.until(lambda one: one.parameters.get(tilt) == 0.2, "the new value")
 
 
-def test_a_view_that_only_looks_on_writes_nothing_and_says_why(fly: Fly, show: Show) -> None:
+def test_a_read_only_view_refuses_writes_with_the_reason(fly: Fly, show: Show) -> None:
     drone = fly()
     _, server = show(drone)
     before = drone.config["limits.tilt"]
@@ -299,13 +299,13 @@ def test_a_view_that_only_looks_on_writes_nothing_and_says_why(fly: Fly, show: S
         assert answer["value"] == before == drone.config["limits.tilt"]
         viewer.until(lambda one: one.status)
         assert viewer.status == [
-            "alpha/limits.tilt was not written: this view only looks on: start it with --write to write parameters"
+            "alpha/limits.tilt was not written: this view is read-only: start it with --write to write parameters"
         ]
 
 
 @pytest.fixture
 def lent(monkeypatch: pytest.MonkeyPatch, fly: Fly) -> Drone:
-    """A drone whose desk writes through the pilot's own connection: its proxy has no name outside of this process."""
+    """A drone whose writes use the pilot's connection: its proxy has no name outside this process."""
 
     class Lent:
         def __init__(self, drone: Drone) -> None:
@@ -321,7 +321,7 @@ def lent(monkeypatch: pytest.MonkeyPatch, fly: Fly) -> Drone:
     return drone
 
 
-def test_parameters_are_written_where_that_was_asked_for(lent: Drone, show: Show) -> None:
+def test_parameters_are_written_if_allowed(lent: Drone, show: Show) -> None:
     _, server = show(lent, priority=31)
     with Viewer(server.url) as viewer:
         (answer,) = viewer.set_parameter("alpha/limits.tilt", 0.2)
@@ -340,14 +340,14 @@ def test_parameters_are_written_where_that_was_asked_for(lent: Drone, show: Show
         ("alpha/limits.tilt", "much", "limits.tilt"),
     ],
 )
-def test_what_can_not_be_written_is_refused_with_the_reason(lent: Drone, name: str, value: object, why: str) -> None:
-    written = ParameterDesk([lent], 31).write(name, value)
+def test_impossible_writes_are_refused_with_the_reason(lent: Drone, name: str, value: object, why: str) -> None:
+    written = ParameterAccess([lent], 31).write(name, value)
     assert why in written.refused
     assert written.value == (lent.config["limits.tilt"] if name == "alpha/limits.tilt" else None)
 
 
 def test_whole_numbers_are_written_as_the_parameter_s_type(lent: Drone) -> None:
-    desk = ParameterDesk([lent], 31)
+    desk = ParameterAccess([lent], 31)
     whole = [each for each in lent.config.parameters() if each.type.value == "float" and not each.read_only]
     taken = next(each for each in whole if (each.minimum or 0) <= 1 <= (each.maximum or 1))
     assert desk.write(f"alpha/{taken.name}", 1).value == 1.0
@@ -357,14 +357,14 @@ def test_whole_numbers_are_written_as_the_parameter_s_type(lent: Drone) -> None:
 # Refusals ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_port_that_is_taken(fly: Fly) -> None:
+def test_a_taken_port(fly: Fly) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(LinkError, match=rf"can't listen on 127\.0\.0\.1:{port}: .*choose another --port"):
             FoxgloveServer([fly()], port=port)
 
 
-def test_nobody_writes_from_beyond_this_machine(fly: Fly) -> None:
+def test_only_this_machine_can_write(fly: Fly) -> None:
     with pytest.raises(UsageError, match="no passwords"):
         FoxgloveServer([fly()], host="0.0.0.0", port=0, priority=31)
 
@@ -384,7 +384,7 @@ def test_nobody_writes_from_beyond_this_machine(fly: Fly) -> None:
         ("http://127.0.0.1.evil.example", b"403"),
     ],
 )
-def test_no_page_of_another_origin_gives_orders(lent: Drone, show: Show, origin: str | None, answer: bytes) -> None:
+def test_pages_of_other_origins_can_not_write(lent: Drone, show: Show, origin: str | None, answer: bytes) -> None:
     """With ``--write`` any web page in a browser of this machine could write parameters."""
     _, server = show(lent, priority=31)
     head = (
@@ -397,8 +397,8 @@ def test_no_page_of_another_origin_gives_orders(lent: Drone, show: Show, origin:
         assert page.recv(12) == b"HTTP/1.1 " + answer
 
 
-def test_a_door_ends_who_says_too_much_or_nothing() -> None:
-    door = OriginDoor("127.0.0.1", 0)
+def test_the_guard_closes_connections_with_too_long_or_no_requests() -> None:
+    door = OriginGuard("127.0.0.1", 0)
     try:
         with socket.create_connection(("127.0.0.1", door.port), timeout=WAIT_S) as page:
             page.sendall(b"GET / HTTP/1.1\r\nX: " + b"x" * MAX_HEAD)
@@ -417,7 +417,7 @@ def test_without_the_sdk_the_error_says_what_to_install(fly: Fly, monkeypatch: p
         FoxgloveServer([fly()], port=0)
 
 
-def test_a_sample_that_can_not_be_shown_is_counted_and_the_view_goes_on(fly: Fly) -> None:
+def test_a_sample_that_can_not_be_shown_is_counted_and_the_view_continues(fly: Fly) -> None:
     class Broken:
         def wanted(self) -> frozenset[tuple[int, str]]:
             return frozenset({(0, "feedback")})

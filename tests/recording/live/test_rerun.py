@@ -1,6 +1,6 @@
-"""What Rerun is given, by a stand-in for its module; and by its own programs, where they are installed.
+"""Rerun's input, with a stand-in for its module; and with its own programs, where installed.
 
-The latter takes the Python that SKYLOOP_RERUN names, in whose environment are rerun-sdk and Skyloop, or this one.
+The latter use the Python in SKYLOOP_RERUN, whose environment has rerun-sdk and Skyloop, or this one.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from tests.support.commands import Ended
 from tests.support.fake_rerun import Stream
 from tests.support.recorded_flights import CAPABILITIES, MS, UNIX_NS
 
-CAMERA = "cameras/alpha/front"  # nobody knows where it is mounted
+CAMERA = "cameras/alpha/front"  # its mounting is unknown
 RERUN = os.environ.get("SKYLOOP_RERUN") or (sys.executable if find_spec("rerun") else "")
 
 
@@ -67,7 +67,7 @@ def drawn(streams: list[Stream]) -> tuple[RerunLog, Stream]:
 # Recordings ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_recording_with_everything_in_it(flight: Path, tmp_path: Path, streams: list[Stream]) -> None:
+def test_a_recording_with_all_channels(flight: Path, tmp_path: Path, streams: list[Stream]) -> None:
     found = export_rrd(Recording.open(flight), tmp_path / "flight.rrd")
     (stream,) = streams
     assert (found.drones, found.pictures, found.left_out) == (("alpha",), 20, 0)
@@ -88,12 +88,12 @@ def test_a_recording_with_everything_in_it(flight: Path, tmp_path: Path, streams
     assert {"half way", "touched a chair"} <= set(texts)
     warning = next(made for made in stream.of("log/alpha") if made.values[0] == "touched a chair")
     assert warning.named["level"] == "WARN"
-    # Everything stands at the time of its capture.
+    # Everything is at the time of its capture.
     first = next(at_ns for entity, at_ns, made in stream.logged if made.kind == "EncodedImage")
     assert first == UNIX_NS + 5 * MS - 30 * MS
 
 
-def test_h264_stays_as_it_was_and_begins_with_a_key_picture(tmp_path: Path, streams: list[Stream]) -> None:
+def test_h264_is_unchanged_and_starts_with_a_key_frame(tmp_path: Path, streams: list[Stream]) -> None:
     path = write_film(tmp_path / "flight.mcap", film()[2:])
     found = export_rrd(Recording.open(path), tmp_path / "flight.rrd")
     stream = streams[0]
@@ -112,7 +112,7 @@ def test_by_the_command_line(flight: Path, tmp_path: Path, streams: list[Stream]
     assert log("export", flight, "--to", "rrd", "--drone", "beta", "-o", target).code == 2
 
 
-def test_a_drone_that_is_not_in_it_and_a_folder_that_is_not_there(flight: Path, streams: list[Stream]) -> None:
+def test_a_missing_drone_and_a_missing_folder(flight: Path, streams: list[Stream]) -> None:
     with pytest.raises(UnknownNameError, match="beta"):
         export_rrd(Recording.open(flight), Path("x.rrd"), drone="beta")
     with pytest.raises(UsageError, match="no such folder"):
@@ -122,7 +122,7 @@ def test_a_drone_that_is_not_in_it_and_a_folder_that_is_not_there(flight: Path, 
 # Samples -------------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_not_known_is_not_drawn(drawn: tuple[RerunLog, Stream]) -> None:
+def test_unknown_values_are_not_drawn(drawn: tuple[RerunLog, Stream]) -> None:
     log, stream = drawn
     log.add(0, Feedback(captured_ns=1, altitude_m=1.5))
     assert {name for name, at_ns, _ in stream.logged if at_ns is not None} == {"plots/alpha/altitude"}
@@ -139,7 +139,7 @@ def test_set_points(drawn: tuple[RerunLog, Stream]) -> None:
     assert scalars.values[0][:3] == [1.0, 2.0, 3.0]
     assert math.isnan(scalars.values[0][3])
     home = ReturnToStart(land=True)
-    log.add(0, Applied(2, 1, 1, 1, 1, home, home))  # no number is given
+    log.add(0, Applied(2, 1, 1, 1, 1, home, home))  # no values given
     assert not stream.of("plots/alpha/set_points/return_to_start")
 
 
@@ -158,7 +158,7 @@ def test_drawings_of_each_source_replace_its_own(drawn: tuple[RerunLog, Stream])
     assert not [name for name, *_ in stream.logged if "unknown" in name]
 
 
-def test_names_that_applications_choose_are_limited_in_number(drawn: tuple[RerunLog, Stream]) -> None:
+def test_names_chosen_by_applications_are_limited_in_number(drawn: tuple[RerunLog, Stream]) -> None:
     log, stream = drawn
     for number in range(100):
         log.add(0, LogEntry("me", f"series {number}", 1, number=1.0))
@@ -191,7 +191,7 @@ def test_a_flight_live(fly: Fly, tmp_path: Path, streams: list[Stream]) -> None:
     assert stream.closed
 
 
-def test_a_viewer_that_runs_is_taken_and_one_that_does_not_start_is_an_error(
+def test_a_running_viewer_is_used_and_one_that_does_not_start_is_an_error(
     fly: Fly, streams: list[Stream], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drone = fly()
@@ -200,18 +200,18 @@ def test_a_viewer_that_runs_is_taken_and_one_that_does_not_start_is_an_error(
         viewer = RerunViewer([drone], port=port)
         assert viewer.target == streams[0].target == f"rerun+http://127.0.0.1:{port}/proxy"
         streams[0].broken = True
-        viewer.close()  # the viewer is gone: that is no error at the end
+        viewer.close()  # closing without the viewer is not an error
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
     with pytest.raises(LinkError, match="can't be started"):
         RerunViewer([drone], port=0)
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(LinkError, match="needs a display"):
         RerunViewer([drone], port=0)
-    with pytest.raises(UsageError, match="no address"):
+    with pytest.raises(UsageError, match="not an address"):
         RerunViewer([drone], connect="here")
 
 
-def test_a_viewer_that_stands_still_is_given_nothing_until_it_goes_on(
+def test_a_hanging_viewer_gets_nothing_until_it_continues(
     fly: Fly, streams: list[Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rerun_viewer, "_ASK_NS", 0)
@@ -230,7 +230,7 @@ def test_a_viewer_that_stands_still_is_given_nothing_until_it_goes_on(
     assert [show(2), show(3)] == [2, 2]
     assert viewer.left_out == 2
     stream.broken = False
-    assert [show(4), show(5), show(6)] == [2, 3, 4]  # goes on with the next key picture
+    assert [show(4), show(5), show(6)] == [2, 3, 4]  # continues with the next key frame
     viewer.close()
     assert stream.closed
 

@@ -1,4 +1,4 @@
-"""A small viewer of a Foxglove server, for tests: Foxglove's protocol by what its page says.
+"""A small viewer of a Foxglove server, for tests, from the protocol's specification.
 
 https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 """
@@ -21,7 +21,7 @@ _MESSAGE = 1
 
 
 class Viewer:
-    """Connected from the start; reads what the server sends only when it is asked to."""
+    """Connected from the start; reads the server's messages only on request."""
 
     def __init__(self, url: str) -> None:
         self.topics: dict[str, dict[str, Any]] = {}
@@ -30,7 +30,7 @@ class Viewer:
         self.parameters: dict[str, Any] = {}
         self.answers: dict[str, list[dict[str, Any]]] = {}
         self._subscribed: dict[int, str] = {}
-        self._numbers = itertools.count(1)  # of subscriptions: what comes late for an old one is not for the next
+        self._numbers = itertools.count(1)  # of subscriptions: tells late messages of an old one apart
         self._stack = ExitStack()
         dialled = connect(
             url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_queue=1, max_size=None, close_timeout=0.1
@@ -47,7 +47,7 @@ class Viewer:
         self._stack.close()
 
     def until(self, done: Callable[[Self], object], what: str = "") -> None:
-        """Read until something is so."""
+        """Read until a condition holds."""
         end = time.monotonic() + WAIT_S
         while not done(self):
             left = end - time.monotonic()

@@ -1,4 +1,4 @@
-"""A drone and its radio without sockets, threads or time of their own, for tests of the pure session."""
+"""A drone and its radio without sockets, threads or clocks, for tests of the pure session."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class ScriptedDrone:
     def __init__(self, version: int = 2) -> None:
         self.version = version
         self.values: dict[str, Value] = {}
-        self.stubborn: set[str] = set()  # keys that it acknowledges and does not change
-        self.deaf = False  # it takes no command
+        self.stubborn: set[str] = set()  # keys that it acknowledges but does not change
+        self.deaf = False  # it ignores all commands
         self.refuses_takeoff = False
         self.commands: list[AtCommand] = []  # obeyed
         self.toggles = 0  # of its emergency
         self.stale = 0
-        self.telemetry: list[Option] = []  # besides the demo option
-        self.extra = State(0)  # bits that stay
+        self.telemetry: list[Option] = []  # in addition to the demo option
+        self.extra = State(0)  # bits that stay set
         self.restart()
 
     def restart(self) -> None:
-        """Switched off and on."""
+        """Switch it off and on."""
         known = keys_of(self.version)
         self.values = {name: key.default for name, key in known.items()}
         self.values["general:num_version_soft"] = "2.4.8" if self.version == 2 else "1.7.4"
@@ -52,11 +52,11 @@ class ScriptedDrone:
 
     @property
     def names(self) -> list[str]:
-        """Of the commands obeyed, in order."""
+        """Names of the obeyed commands, in order."""
         return [command.name for command in self.commands]
 
     def take(self, datagram: bytes) -> None:
-        """AT commands came."""
+        """Handle a datagram of AT commands."""
         if self.deaf:
             return
         commands, malformed = parse_commands(datagram)
@@ -70,16 +70,16 @@ class ScriptedDrone:
             self._obey(command)
 
     def land(self) -> None:
-        """By itself."""
+        """Land without a command."""
         self.state &= ~State.FLYING
         self.control = ControlState.LANDED
 
     def hear_bit(self) -> None:
-        """Another program's emergency bit stayed set, and is known."""
+        """Simulate another program's emergency bit, which stayed set and is known to the drone."""
         self._ref = Ref.EMERGENCY
 
     def navdata(self) -> bytes:
-        """Its next datagram."""
+        """Return its next datagram."""
         self.sequence += 1
         bits = self.state | self.extra
         if State.BOOTSTRAP in self.state:
@@ -89,7 +89,7 @@ class ScriptedDrone:
         return encode(bits, self.sequence, [demo, *self.telemetry])
 
     def dump(self) -> bytes:
-        """What its control port sends."""
+        """Return the output of its control port."""
         return format_dump(self.values)
 
     def _obey(self, command: AtCommand) -> None:
@@ -135,9 +135,9 @@ class ScriptedDrone:
 
 
 class Rig:
-    """A session, its drone and the time. ``lost`` says of each datagram, either way, whether it gets lost.
+    """A session, its drone and the time. ``lost`` decides for each datagram, in either direction, whether to drop it.
 
-    ``late``: how late it comes [s], given whether it goes up.
+    ``late`` returns the delay of a datagram [s], given whether it goes up.
     """
 
     def __init__(self, options: ArdroneOptions | None = None, drone: ScriptedDrone | None = None) -> None:
@@ -145,32 +145,32 @@ class Rig:
         self.session = ArdroneSession(options or ArdroneOptions("drone"), IDS, self.clock.now_ns)
         self.drone = drone or ScriptedDrone()
         self.sink = RecordingSink()
-        self.on = True  # the drone is there
+        self.on = True  # the drone is switched on
         self.port_open = True  # its control port
         self.lost: Callable[[], bool] = lambda: False
         self.late: Callable[[bool], float] = lambda _up: 0.0
-        self._under_way: list[tuple[int, bool, bytes]] = []  # when it comes, whether it goes up, and what
-        self.started = False  # it was asked for navdata
+        self._under_way: list[tuple[int, bool, bytes]] = []  # time of arrival, whether it goes up, and the datagram
+        self.started = False  # navdata was requested
         self.sent: list[bytes] = []
         self.navdata_steps = NAVDATA_STEPS
         self._steps = 0
         self._dump = 0
 
     def run(self, seconds: float) -> None:
-        """Let the time go by."""
+        """Advance the time."""
         for _ in range(round(seconds / STEP_S)):
             self.step()
 
     def until(self, condition: Callable[[], bool], within_s: float) -> float:
-        """How long it took; fails if it took longer."""
+        """Return the time until the condition holds; fail after the limit."""
         for steps in range(round(within_s / STEP_S)):
             if condition():
                 return steps * STEP_S
             self.step()
-        raise AssertionError(f"not within {within_s} s; links told: {self.sink.links}")
+        raise AssertionError(f"not within {within_s} s; links reported: {self.sink.links}")
 
     def ready(self) -> None:
-        """Until it is set up."""
+        """Run until the drone is set up."""
         self.until(lambda: self.session.ready, 3.0)
 
     def step(self) -> None:
@@ -201,7 +201,7 @@ class Rig:
         come = sorted(
             (each for each in self._under_way if each[0] <= now_ns and each[1] is up), key=lambda each: each[0]
         )
-        for each in come[:1]:  # one at a step, as what was held back comes
+        for each in come[:1]:  # one per step, like delayed datagrams
             self._under_way.remove(each)
             if up:
                 self.drone.take(each[2])
@@ -234,5 +234,5 @@ class Rig:
 
 
 def ns(seconds: float) -> int:
-    """Shorter to read in tables."""
+    """Return nanoseconds; shorter in tables than the full name."""
     return nanoseconds(seconds)

@@ -1,4 +1,4 @@
-"""The handshake of one key, the reading of all, and the line of exchanges."""
+"""The handshake for one key, the reading of all keys, and the queue of exchanges."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SEND_ALL: AtMessage = ("CTRL", (4, 0))
 DUMP = b"control:outdoor = TRUE\ngeneral:num_version_soft = 2.4.8\n\0"
 
 
-class Desk:
-    """A configurator with the time and what became of the exchanges."""
+class Bench:
+    """A configurator with the time and the results of its exchanges."""
 
     def __init__(self) -> None:
         self.configurator = Configurator()
@@ -41,139 +41,139 @@ class Desk:
 
 
 def test_the_handshake() -> None:
-    desk = Desk()
-    desk.submit(Write("control:outdoor", "TRUE"))
-    assert desk.says() == [("CONFIG", ("control:outdoor", "TRUE"))]
-    assert desk.says(0.03) == []
-    assert desk.configurator.on_acknowledge(True)
-    assert desk.says(0.03) == [CLEAR]
-    assert desk.results == []
-    assert desk.configurator.on_acknowledge(False)
-    assert desk.results == [None]
-    assert desk.says(0.03) == []
+    bench = Bench()
+    bench.submit(Write("control:outdoor", "TRUE"))
+    assert bench.says() == [("CONFIG", ("control:outdoor", "TRUE"))]
+    assert bench.says(0.03) == []
+    assert bench.configurator.on_acknowledge(True)
+    assert bench.says(0.03) == [CLEAR]
+    assert bench.results == []
+    assert bench.configurator.on_acknowledge(False)
+    assert bench.results == [None]
+    assert bench.says(0.03) == []
 
 
-def test_an_acknowledgement_of_before_is_cleared_first() -> None:
-    desk = Desk()
-    desk.configurator.on_acknowledge(True)
-    desk.submit(Write("control:outdoor", "TRUE"))
-    assert desk.says() == [CLEAR]
-    assert desk.says(0.03) == [CLEAR]
-    assert desk.configurator.on_acknowledge(False)
-    assert desk.says(0.03) == [("CONFIG", ("control:outdoor", "TRUE"))]
+def test_an_earlier_acknowledgement_is_cleared_first() -> None:
+    bench = Bench()
+    bench.configurator.on_acknowledge(True)
+    bench.submit(Write("control:outdoor", "TRUE"))
+    assert bench.says() == [CLEAR]
+    assert bench.says(0.03) == [CLEAR]
+    assert bench.configurator.on_acknowledge(False)
+    assert bench.says(0.03) == [("CONFIG", ("control:outdoor", "TRUE"))]
 
 
 def test_a_config_without_acknowledgement_is_repeated() -> None:
-    desk = Desk()
-    desk.submit(Write("a:b", "1"))
-    said = [desk.says(0.03) for _ in range(20)]
+    bench = Bench()
+    bench.submit(Write("a:b", "1"))
+    said = [bench.says(0.03) for _ in range(20)]
     assert [bool(messages) for messages in said].count(True) == 4
-    desk.says(0.5)
-    assert desk.results == ["the drone did not acknowledge a:b"]
+    bench.says(0.5)
+    assert bench.results == ["the drone did not acknowledge a:b"]
 
 
-def test_ids_stand_right_before_the_config() -> None:
-    desk = Desk()
-    desk.configurator.ids = Ids("00000001", "00000002", "00000003")
-    desk.submit(Write("a:b", "1"))
-    assert desk.says() == [("CONFIG_IDS", ("00000001", "00000002", "00000003")), ("CONFIG", ("a:b", "1"))]
+def test_ids_are_sent_right_before_the_config() -> None:
+    bench = Bench()
+    bench.configurator.ids = Ids("00000001", "00000002", "00000003")
+    bench.submit(Write("a:b", "1"))
+    assert bench.says() == [("CONFIG_IDS", ("00000001", "00000002", "00000003")), ("CONFIG", ("a:b", "1"))]
 
 
 def test_reading_everything() -> None:
-    desk = Desk()
-    desk.submit(Read())
-    assert desk.says() == []
-    assert desk.configurator.wants_dump == 1
-    desk.configurator.dump_opened()
-    assert desk.says() == [SEND_ALL]
-    assert desk.says(0.1) == []
-    assert desk.says(0.25) == [SEND_ALL], "the command may be lost"
-    assert not desk.configurator.dump_received(DUMP[:9])
-    assert desk.says(0.3) == [], "something came: it is not asked for again"
-    assert desk.configurator.dump_received(DUMP[9:])
-    assert desk.configurator.values == {"control:outdoor": "TRUE", "general:num_version_soft": "2.4.8"}
-    assert desk.results == [None]
-    assert desk.configurator.wants_dump == 0
+    bench = Bench()
+    bench.submit(Read())
+    assert bench.says() == []
+    assert bench.configurator.wants_dump == 1
+    bench.configurator.dump_opened()
+    assert bench.says() == [SEND_ALL]
+    assert bench.says(0.1) == []
+    assert bench.says(0.25) == [SEND_ALL], "the command may be lost"
+    assert not bench.configurator.dump_received(DUMP[:9])
+    assert bench.says(0.3) == [], "data arrived: no further request"
+    assert bench.configurator.dump_received(DUMP[9:])
+    assert bench.configurator.values == {"control:outdoor": "TRUE", "general:num_version_soft": "2.4.8"}
+    assert bench.results == [None]
+    assert bench.configurator.wants_dump == 0
 
 
 def test_a_stray_acknowledgement_is_cleared() -> None:
-    desk = Desk()
-    desk.configurator.on_acknowledge(True)
-    assert desk.says() == [CLEAR]
+    bench = Bench()
+    bench.configurator.on_acknowledge(True)
+    assert bench.says() == [CLEAR]
 
 
 @pytest.mark.parametrize("reason", ["connection refused", "the connection ended early"])
 def test_a_dump_that_fails_is_tried_again_until_the_deadline(reason: str) -> None:
-    desk = Desk()
-    desk.submit(Read())
-    desk.says()
-    desk.configurator.dump_opened()
-    desk.configurator.dump_received(b"control:outd")
-    desk.configurator.dump_failed(reason)
-    assert desk.says(0.03) == [], "not connected"
-    desk.configurator.dump_opened()
-    assert desk.says(0.03) == [SEND_ALL]
-    assert desk.configurator.dump_received(DUMP)
-    assert desk.results == [None]
-    desk.submit(Read())
-    desk.says()
-    desk.configurator.dump_failed(reason)
-    desk.says(1.0)
-    assert desk.results[1] == f"the drone's configuration could not be read: {reason}"
+    bench = Bench()
+    bench.submit(Read())
+    bench.says()
+    bench.configurator.dump_opened()
+    bench.configurator.dump_received(b"control:outd")
+    bench.configurator.dump_failed(reason)
+    assert bench.says(0.03) == [], "not connected"
+    bench.configurator.dump_opened()
+    assert bench.says(0.03) == [SEND_ALL]
+    assert bench.configurator.dump_received(DUMP)
+    assert bench.results == [None]
+    bench.submit(Read())
+    bench.says()
+    bench.configurator.dump_failed(reason)
+    bench.says(1.0)
+    assert bench.results[1] == f"the drone's configuration could not be read: {reason}"
 
 
-def test_an_endless_dump_is_broken_off() -> None:
-    desk = Desk()
-    desk.submit(Read())
-    desk.says()
-    desk.configurator.dump_opened()
-    assert desk.configurator.dump_received(b"x" * (MAX_DUMP + 1))
-    assert "no end" in desk.configurator.trouble
+def test_an_endless_dump_is_aborted() -> None:
+    bench = Bench()
+    bench.submit(Read())
+    bench.says()
+    bench.configurator.dump_opened()
+    assert bench.configurator.dump_received(b"x" * (MAX_DUMP + 1))
+    assert "without an end mark" in bench.configurator.trouble
 
 
 def test_exchanges_wait_for_one_another() -> None:
-    desk = Desk()
-    desk.submit(Write("a:a", "1"))
-    desk.submit(Write("b:b", "2"), within_s=0.2)
-    desk.submit(Write("c:c", "3"))
-    desk.says()
-    desk.says(0.3)
-    assert desk.results == ["the drone was busy with other settings"]
-    desk.configurator.on_acknowledge(True)
-    desk.configurator.on_acknowledge(False)
-    assert desk.says() == [("CONFIG", ("c:c", "3"))]
+    bench = Bench()
+    bench.submit(Write("a:a", "1"))
+    bench.submit(Write("b:b", "2"), within_s=0.2)
+    bench.submit(Write("c:c", "3"))
+    bench.says()
+    bench.says(0.3)
+    assert bench.results == ["the drone was busy with other settings"]
+    bench.configurator.on_acknowledge(True)
+    bench.configurator.on_acknowledge(False)
+    assert bench.says() == [("CONFIG", ("c:c", "3"))]
 
 
-def test_abandoning_fails_everything_and_forgets_what_was_read() -> None:
-    desk = Desk()
-    desk.configurator.values = {"a:a": "1"}
-    desk.submit(Write("a:a", "1"))
-    desk.submit(Read())
-    desk.configurator.abandon("gone")
-    assert desk.results == ["gone", "gone"]
-    assert desk.configurator.values == {}
-    assert not desk.configurator.busy
+def test_abandoning_fails_all_exchanges_and_forgets_the_configuration() -> None:
+    bench = Bench()
+    bench.configurator.values = {"a:a": "1"}
+    bench.submit(Write("a:a", "1"))
+    bench.submit(Read())
+    bench.configurator.abandon("gone")
+    assert bench.results == ["gone", "gone"]
+    assert bench.configurator.values == {}
+    assert not bench.configurator.busy
 
 
-def test_an_exchange_may_follow_from_the_end_of_another() -> None:
-    desk = Desk()
-    desk.configurator.submit(Exchange(iter(()), ns(99), lambda failure: desk.submit(Write("after:it", "1"))))
-    desk.submit(Write("in:line", "1"))
-    assert desk.says() == [("CONFIG", ("after:it", "1"))]
-    desk.configurator.on_acknowledge(True)
-    desk.configurator.on_acknowledge(False)
-    assert desk.says() == [("CONFIG", ("in:line", "1"))]
+def test_an_exchange_may_be_submitted_at_the_end_of_another() -> None:
+    bench = Bench()
+    bench.configurator.submit(Exchange(iter(()), ns(99), lambda failure: bench.submit(Write("after:it", "1"))))
+    bench.submit(Write("in:line", "1"))
+    assert bench.says() == [("CONFIG", ("after:it", "1"))]
+    bench.configurator.on_acknowledge(True)
+    bench.configurator.on_acknowledge(False)
+    assert bench.says() == [("CONFIG", ("in:line", "1"))]
 
 
 @pytest.mark.parametrize(
     ("soft", "board", "version"),
     [("1.7.4", "17", 1), ("2.4.8", "33", 2), ("1.11.5", "17", 1), ("3.0", "", 2), ("", "17", 1), ("x", "33", 2)],
 )
-def test_the_version_by_what_the_drone_says(soft: str, board: str, version: int) -> None:
+def test_the_version_from_the_configuration(soft: str, board: str, version: int) -> None:
     assert version_of({"general:num_version_soft": soft, "general:num_version_mb": board}) == version
 
 
-def test_a_drone_that_says_nothing_of_its_version() -> None:
+def test_a_drone_without_a_version() -> None:
     assert version_of({}) is None
     assert version_of({"general:num_version_soft": "0.9"}) is None
 

@@ -1,4 +1,4 @@
-"""The control port as the driver meets it: refusing, slow, broken off, and as it should be."""
+"""The control port from the driver's side: refusing, slow, interrupted, and working."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from skyloop.vehicles.ardrone.link import RETRY_NS, DumpClient
 DUMP = b"control:outdoor = TRUE\n\0"
 
 
-class Desk:
-    """A client, who serves it, and the drone's end of the connection."""
+class Bench:
+    """A client with its server loop, and the drone's end of the connection."""
 
     def __init__(self, *, listening: bool = True) -> None:
         self.server = socket.create_server(("127.0.0.1", 0))
@@ -39,7 +39,7 @@ class Desk:
         self.client.follow(self.configurator, self.now_ns)
 
     def serve(self) -> None:
-        """Wait until the connection wants to be served, and do it."""
+        """Wait until the connection is ready, and serve it."""
         assert self.selector.select(5.0)
         self.client.serve(self.configurator)
 
@@ -57,77 +57,77 @@ class Desk:
 
 
 @pytest.fixture
-def desk() -> Iterator[Desk]:
-    made = Desk()
+def bench() -> Iterator[Bench]:
+    made = Bench()
     yield made
     made.close()
 
 
-def test_a_dump_in_pieces(desk: Desk) -> None:
-    with desk.connected() as drone:
+def test_a_dump_in_pieces(bench: Bench) -> None:
+    with bench.connected() as drone:
         drone.sendall(DUMP[:10])
-        desk.serve()
-        assert desk.results == []
+        bench.serve()
+        assert bench.results == []
         drone.sendall(DUMP[10:])
-        desk.serve()
-        assert desk.results == [None]
-        assert desk.configurator.values == {"control:outdoor": "TRUE"}
-        assert drone.recv(1) == b"", "the connection is let go"
+        bench.serve()
+        assert bench.results == [None]
+        assert bench.configurator.values == {"control:outdoor": "TRUE"}
+        assert drone.recv(1) == b"", "the connection is closed"
 
 
-def test_a_connection_that_ends_early_is_made_again(desk: Desk) -> None:
-    desk.connected().close()
-    desk.serve()
-    assert "the connection ended early" in desk.configurator.trouble
-    desk.follow()
-    assert not desk.selector.get_map(), "not at once"
-    desk.now_ns += RETRY_NS
-    with desk.connected() as drone:
+def test_a_connection_that_ends_early_is_retried(bench: Bench) -> None:
+    bench.connected().close()
+    bench.serve()
+    assert "the connection ended early" in bench.configurator.trouble
+    bench.follow()
+    assert not bench.selector.get_map(), "not immediately"
+    bench.now_ns += RETRY_NS
+    with bench.connected() as drone:
         drone.sendall(DUMP)
-        desk.serve()
-    assert desk.results == [None]
-    assert desk.configurator.trouble == ""
+        bench.serve()
+    assert bench.results == [None]
+    assert bench.configurator.trouble == ""
 
 
 def test_a_port_that_refuses() -> None:
-    desk = Desk(listening=False)
-    desk.follow()
-    if not desk.configurator.trouble:  # it may be known at once, or a moment later
-        desk.serve()
-    assert "Connection refused" in desk.configurator.trouble
-    assert f"TCP port {desk.client._port}" in desk.configurator.trouble
-    desk.close()
+    bench = Bench(listening=False)
+    bench.follow()
+    if not bench.configurator.trouble:  # the refusal may show at once or a moment later
+        bench.serve()
+    assert "Connection refused" in bench.configurator.trouble
+    assert f"TCP port {bench.client._port}" in bench.configurator.trouble
+    bench.close()
 
 
-def test_a_drone_without_an_address_yet(desk: Desk) -> None:
-    desk.client.address = "no address at all"
-    desk.follow()
-    assert desk.configurator.trouble
-    assert not desk.selector.get_map()
+def test_a_drone_without_an_address_yet(bench: Bench) -> None:
+    bench.client.address = "no address at all"
+    bench.follow()
+    assert bench.configurator.trouble
+    assert not bench.selector.get_map()
 
 
-def test_a_connection_that_is_not_wanted_any_more_is_let_go(desk: Desk) -> None:
-    with desk.connected() as drone:
-        desk.configurator.abandon("gone")
-        desk.follow()
+def test_a_connection_is_closed_when_no_longer_needed(bench: Bench) -> None:
+    with bench.connected() as drone:
+        bench.configurator.abandon("gone")
+        bench.follow()
         assert drone.recv(1) == b""
-    desk.client.serve(desk.configurator)  # a late event does nothing
+    bench.client.serve(bench.configurator)  # a late event has no effect
 
 
-def test_a_later_dump_gets_a_connection_of_its_own(desk: Desk) -> None:
-    with desk.connected() as old:
-        desk.configurator.abandon("gone")
-        desk.read()
-        with desk.connected() as new:
+def test_a_later_dump_gets_a_new_connection(bench: Bench) -> None:
+    with bench.connected() as old:
+        bench.configurator.abandon("gone")
+        bench.read()
+        with bench.connected() as new:
             assert old.recv(1) == b""
             new.sendall(DUMP)
-            desk.serve()
-    assert desk.results == ["gone", None]
+            bench.serve()
+    assert bench.results == ["gone", None]
 
 
-def test_a_connection_that_is_reset(desk: Desk) -> None:
-    drone = desk.connected()
+def test_a_connection_that_is_reset(bench: Bench) -> None:
+    drone = bench.connected()
     drone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
     drone.close()
-    desk.serve()
-    assert "reset" in desk.configurator.trouble
+    bench.serve()
+    assert "reset" in bench.configurator.trouble

@@ -54,7 +54,7 @@ def test_the_recorded_datagram() -> None:
     assert feedback.acceleration_m_s2 == pytest.approx((0.7874, 0.3267, 9.2430), abs=1e-3)
     assert feedback.angular_velocity_rad_s == pytest.approx((-0.00196, -0.0012, -0.00108), abs=1e-5)
     assert not implausible(feedback)
-    # The accelerometers agree with the drone's own attitude from them, so their axes and signs are understood.
+    # The accelerometers agree with the drone's own attitude estimate, which confirms their axes and signs.
     assert feedback.acceleration_m_s2 is not None
     forward, left, up = feedback.acceleration_m_s2
     assert math.degrees(math.atan2(forward, up)) == pytest.approx(4.866, abs=0.1)
@@ -84,7 +84,7 @@ def test_native_telemetry_of_the_demo_mode_is_short() -> None:
     assert native_of(seen, everything=False)["vision_detect.xc"] == (500, 0, 0, 0)
 
 
-def test_numbers_that_are_not_finite_are_left_out() -> None:
+def test_numbers_that_are_not_finite_are_omitted() -> None:
     navdata = decode(encode(0, 9, [Demo(vx=math.nan), Gps(trajectory=(math.inf,) * 10), Wifi(3)]))
     native = native_of(navdata, everything=True)
     assert "demo.vx" not in native
@@ -119,7 +119,7 @@ def test_every_option_has_a_name() -> None:
         (Demo(vx=math.nan), "velocity_m_s", None),
     ],
 )
-def test_units_signs_and_what_cannot_be(demo: Demo, field: str, value: object) -> None:
+def test_units_signs_and_impossible_values(demo: Demo, field: str, value: object) -> None:
     assert getattr(told(demo), field) == (value if value is None else pytest.approx(value))
 
 
@@ -129,10 +129,10 @@ def test_body_axes_of_the_full_mode() -> None:
     assert feedback.acceleration_m_s2 == pytest.approx((0.980665, -1.96133, 9.80665))
     assert feedback.angular_velocity_rad_s == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
     assert feedback.battery_v == 11.0
-    assert told(Demo(), RawMeasures()).battery_v is None, "zero volts are no measurement"
+    assert told(Demo(), RawMeasures()).battery_v is None, "zero volts is not a measurement"
 
 
-def test_what_is_not_told_is_none() -> None:
+def test_missing_values_are_none() -> None:
     feedback = told(Demo(), climb=None)
     assert feedback.velocity_m_s is None
     assert feedback.acceleration_m_s2 is None
@@ -162,7 +162,7 @@ def test_flight_states(state: State, control: ControlState | None, flight: Fligh
     assert flight_state(state, control) is flight
 
 
-def test_a_control_state_that_nobody_knows() -> None:
+def test_an_unknown_control_state() -> None:
     assert control_state(Demo(ctrl_state=99 << 16)) is None
     assert control_state(Demo(ctrl_state=(4 << 16) | 7)) is ControlState.HOVERING
 
@@ -175,13 +175,13 @@ def stamped(stamp_s: float, sequence: int = 1) -> Navdata:
     return decode(encode(0, sequence, [Time(whole % 2048 << 21 | round((stamp_s - whole) * 1e6))]))
 
 
-def test_without_the_drones_time_the_arrival_counts() -> None:
+def test_without_the_drones_time_the_arrival_is_used() -> None:
     clock = DroneClock()
     assert clock.captured_ns(decode(encode(0, 1)), 500) == 500
     assert clock.captured_ns(decode(encode(0, 2)), 400) == 500, "never backwards"
 
 
-def test_the_drones_time_tells_delays() -> None:
+def test_the_drones_time_reveals_delays() -> None:
     clock = DroneClock()
     base = 1000.0
     for at, delay in enumerate((0.0, 0.004, 0.05, 0.0, 0.02)):
@@ -215,8 +215,8 @@ def test_climb_is_the_slope_of_the_altitude() -> None:
     for step in range(20, 40):
         climb = meter.climb(0.5 * 19 * 0.067, ns(step * 0.067))
     assert climb == 0.0
-    assert meter.climb(3.0, ns(60.0)) is None, "after a gap nothing is known"
-    assert meter.climb(3.0, ns(60.0)) is None, "nor from two samples of one time"
+    assert meter.climb(3.0, ns(60.0)) is None, "unknown after a gap"
+    assert meter.climb(3.0, ns(60.0)) is None, "nor from two samples with the same time"
 
 
 # Order and damage ------------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def receive(reception: Reception, sequence: int, at_s: float) -> bool:
     return reception.receive(encode(0, sequence), ns(at_s)) is not None
 
 
-def test_gaps_are_counted_and_late_ones_left_out() -> None:
+def test_gaps_are_counted_and_late_datagrams_dropped() -> None:
     reception = Reception()
     taken = [receive(reception, sequence, 10 + at * 0.005) for at, sequence in enumerate((1, 2, 5, 3, 4, 5, 6))]
     assert taken == [True, True, True, False, False, False, True]
@@ -243,7 +243,7 @@ def test_a_new_count_after_silence_is_a_restart() -> None:
     assert receive(reception, 3, 10.31)
 
 
-def test_a_new_count_is_taken_even_without_silence() -> None:
+def test_a_new_count_is_accepted_even_without_silence() -> None:
     reception = Reception()
     assert receive(reception, 5000, 10.0)
     assert [receive(reception, sequence, 10.0 + sequence * 0.005) for sequence in range(1, 7)] == [False] * 4 + [
@@ -261,7 +261,7 @@ def test_damage_and_unknown_options_are_counted() -> None:
     assert reception.telemetry()["navdata.unknown"] == 1
 
 
-def test_a_datagram_is_not_changed_by_looking_at_it() -> None:
+def test_decoding_does_not_modify_a_datagram() -> None:
     demo = navdata().get(Demo)
     assert demo is not None
     before = replace(navdata())

@@ -1,4 +1,4 @@
-"""Events of the state bits: once per change, with the reasons."""
+"""Events for the state bits: one per change, with the reasons."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVERY = State(0xFFFFFFFF)
         (State(0), "unknown"),
     ],
 )
-def test_an_emergency_and_why(bits: State, reason: str) -> None:
+def test_an_emergency_and_its_reason(bits: State, reason: str) -> None:
     health = Health()
     health.changes(State.FLYING)
     first = health.changes(State.EMERGENCY | bits)[0]
@@ -63,14 +63,14 @@ def test_a_condition_begins_and_ends(bit: State, reason: str) -> None:
     assert (ended.severity, ended.data) == (Severity.INFO, {"reason": reason, "active": False})
 
 
-def test_a_healthy_flight_is_no_news() -> None:
+def test_a_healthy_flight_emits_no_events() -> None:
     health = Health()
     for state in (State.BOOTSTRAP, State.DEMO, State.DEMO | State.FLYING, State.COMMUNICATION_WATCHDOG, State(0)):
         assert health.changes(state) == []
 
 
 @given(st.lists(BITS, max_size=10))
-def test_each_change_is_told_once(states: list[State]) -> None:
+def test_each_change_is_reported_once(states: list[State]) -> None:
     health = Health()
     active: set[object] = set()
     for state in states:

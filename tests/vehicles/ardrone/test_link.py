@@ -1,4 +1,4 @@
-"""The driver on real sockets: an emulated drone with a bad radio, one that goes away, and nobody at all."""
+"""The driver on real sockets: an emulated drone with a bad radio, one that disappears, and none at all."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_a_flight_with_a_tenth_of_the_datagrams_lost() -> None:
         assert late > 0
 
 
-def test_an_ardrone_1_is_found_out() -> None:
+def test_an_ardrone_1_is_detected() -> None:
     with firmware(version=1) as drone, opened(drone.ports) as (driver, sink):
         wait_up(sink)
         assert sink.wait(lambda: sink.frame_counts["front"] > 0, PATIENCE_S)
@@ -116,12 +116,12 @@ def test_a_drone_that_is_switched_off_and_on_in_flight() -> None:
         drone.start()
         wait_up(sink)
         limits = {parameter.name: parameter.value for parameter in driver.parameters()}
-        assert limits["limits.tilt"] == pytest.approx(0.15), "what the drone forgot was written again"
+        assert limits["limits.tilt"] == pytest.approx(0.15), "forgotten values were written again"
         driver.failsafe(Land())
         wait_state(sink, FlightState.LANDED)
 
 
-def test_emergency_is_told_and_reset_only_when_asked() -> None:
+def test_an_emergency_is_reported_and_reset_only_on_request() -> None:
     with firmware() as drone, opened(drone.ports, "&video=0&navdata=full") as (driver, sink):
         wait_up(sink)
         driver.apply(Takeoff())
@@ -168,18 +168,18 @@ def test_the_bottom_camera() -> None:
 
 
 def test_garbage_on_the_navdata_port() -> None:
-    """A stranger with the drone's address and port: nothing he sends ends the thread."""
+    """Datagrams from a stranger at the drone's address and port do not end the thread."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger, opened(_ports_of(stranger)) as (_, sink):
         stranger.settimeout(PATIENCE_S)
         _, address = stranger.recvfrom(64)
         for datagram in (b"", b"\x88\x77\x66\x55", bytes(60_000), b"\xff" * 4096, b"\x88\x77\x66\x55" * 1000):
             stranger.sendto(datagram, address)
         for _ in range(3):
-            assert stranger.recvfrom(64)[0] == b"\x01\x00\x00\x00", "it goes on asking"
+            assert stranger.recvfrom(64)[0] == b"\x01\x00\x00\x00", "it keeps requesting navdata"
         assert not [event for event in sink.events if event.kind is EventKind.DRIVER_ERROR]
 
 
-def test_an_error_of_our_own_is_told_and_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_internal_error_is_reported_and_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(range(1000))
     poll = ArdroneSession.poll
 
@@ -195,14 +195,14 @@ def test_an_error_of_our_own_is_told_and_does_not_end_the_flight(monkeypatch: py
         assert [event.text for event in failures] == ["the link to the vehicle failed: RuntimeError('a fault')"]
 
 
-def test_nobody_there() -> None:
+def test_no_drone() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         ports = _ports_of(taken)
     with opened(ports) as (driver, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
         assert "no navdata from 127.0.0.1" in sink.links[-1][1]
-        assert driver.failsafe(Land()), "it may hear us"
-        with pytest.raises(ParameterError, match="not read yet"):
+        assert driver.failsafe(Land()), "the drone may receive it"
+        with pytest.raises(ParameterError, match="not been read yet"):
             driver.set_parameter("limits.tilt", 0.1)
 
 
@@ -238,6 +238,6 @@ def test_closing_while_a_parameter_is_written() -> None:
 
 
 def _ports_of(navdata: socket.socket) -> Ports:
-    """This socket's as the navdata port, and others at which nobody is."""
+    """Return this socket as the navdata port, and other ports without a listener."""
     navdata.bind(("127.0.0.1", 0))
     return Ports(navdata=navdata.getsockname()[1], video=9, at=9, control=9)

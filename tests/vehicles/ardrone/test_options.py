@@ -63,7 +63,7 @@ def test_options_of_navdata(text: str, mask: int) -> None:
         ("ardrone://d?fx=500&distortion=1,2", "distortion"),
     ],
 )
-def test_what_makes_no_sense(address: str, says: str) -> None:
+def test_invalid_addresses(address: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         options_of(parse_uri(address))
 
@@ -88,7 +88,7 @@ def test_capabilities_of_an_ardrone_1_and_without_video() -> None:
     assert make_driver("ardrone://192.168.1.1?version=2&video=0").capabilities().cameras == ()
 
 
-def test_a_driver_that_is_not_open() -> None:
+def test_an_unopened_driver() -> None:
     driver = ArdroneDriver(parse_uri("ardrone://192.168.1.1"))
     assert driver.parameters() == []
     with pytest.raises(ParameterError, match="not open"):

@@ -1,4 +1,4 @@
-"""The driver's page says what the code does."""
+"""The driver's page matches the code."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_reasons() -> None:
     assert all(f"`{name}`" in DRIVER for _, name in _REASONS)
 
 
-def test_the_emulated_cameras_are_those_that_are_announced() -> None:
+def test_the_emulated_cameras_match_the_drivers() -> None:
     front, bottom = cameras_of(parse_uri("ardrone://d"), 2)
     for info, model in ((front, FRONT_2), (bottom, BOTTOM_2_SENT)):
         assert info.intrinsics is not None

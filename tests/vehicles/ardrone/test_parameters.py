@@ -35,7 +35,7 @@ def test_every_parameter_fits_its_own_description(version: int) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_every_parameter_comes_back_as_it_is(version: int) -> None:
+def test_every_parameter_survives_a_round_trip(version: int) -> None:
     for name, entry in entries_of(DRONES[version], version).items():
         if not entry.parameter.read_only:
             same, text = written(entries_of(DRONES[version], version), name, entry.parameter.value)
@@ -66,7 +66,7 @@ def test_names_and_units(name: str, value: Value, key: str, text: str) -> None:
 
 
 @given(st.floats(0.2, 2.0))
-def test_a_limit_in_si_is_taken_as_it_was_written(value: float) -> None:
+def test_a_limit_in_si_counts_as_written(value: float) -> None:
     entry, text = written(entries_of(DRONES[2], 2), "limits.climb", value)
     told = entry.from_text(text)
     assert isinstance(told, float)
@@ -84,13 +84,13 @@ def test_a_limit_in_si_is_taken_as_it_was_written(value: float) -> None:
         "ardrone.leds.leds_anim",
     ],
 )
-def test_what_can_only_be_read(name: str) -> None:
+def test_read_only_parameters(name: str) -> None:
     with pytest.raises(ParameterError, match="only be read") as caught:
         written(entries_of(DRONES[2], 2), name, "x")
     assert caught.value.code == Refusal.READ_ONLY
 
 
-def test_a_name_that_nobody_has() -> None:
+def test_an_unknown_name() -> None:
     with pytest.raises(UnknownNameError, match=r"limits\.tilt"):
         written(entries_of(DRONES[2], 2), "limits.tild", 0.1)
 
@@ -107,7 +107,7 @@ def test_a_name_that_nobody_has() -> None:
         ("ardrone.general.ardrone_name", 3),
     ],
 )
-def test_values_of_another_type(name: str, value: Value) -> None:
+def test_values_of_the_wrong_type(name: str, value: Value) -> None:
     with pytest.raises(ParameterError) as caught:
         written(entries_of(DRONES[2], 2), name, value)
     assert caught.value.code == Refusal.WRONG_TYPE
@@ -124,12 +124,12 @@ def test_cameras_of_both_versions() -> None:
 @pytest.mark.parametrize(
     ("channel", "camera"), [("0", "front"), ("1", "bottom"), ("2", "front"), ("3", "bottom"), ("x", "front")]
 )
-def test_the_camera_that_is_on(channel: str, camera: str) -> None:
+def test_the_active_camera(channel: str, camera: str) -> None:
     assert active_camera({"video:video_channel": channel}) == camera
     assert active_camera({}) == "front"
 
 
-def test_what_a_drone_may_say_besides() -> None:
+def test_unknown_keys_and_unusual_values() -> None:
     strange = {
         **DRONES[2],
         "general:something_new": "42",
@@ -152,9 +152,9 @@ def test_what_a_drone_may_say_besides() -> None:
         assert not mismatch(entry.parameter, entry.parameter.value)
 
 
-def test_texts_that_a_parameter_cannot_be() -> None:
+def test_texts_without_a_value() -> None:
     entry = entries_of(DRONES[2], 2)["camera.active"]
-    with pytest.raises(DecodeError, match="no number of"):
+    with pytest.raises(DecodeError, match="not the number of one of"):
         entry.from_text("7")
     assert not taken(entry, "1", "bottom")
 
@@ -162,8 +162,8 @@ def test_texts_that_a_parameter_cannot_be() -> None:
 # Commands --------------------------------------------------------------------------------------------------------
 
 
-class Desk:
-    """Commands with a controller, and what they said."""
+class Bench:
+    """Commands with a controller, and their messages."""
 
     def __init__(self, condition: Condition | None, version: int | None = 2) -> None:
         self.setpoints = SetpointController()
@@ -183,22 +183,22 @@ class Desk:
 
 @pytest.mark.parametrize("version", [None, 1, 2])
 def test_commands_fit_their_own_description(version: int | None) -> None:
-    for parameter in Desk(GROUND, version).commands.parameters(version):
+    for parameter in Bench(GROUND, version).commands.parameters(version):
         assert not mismatch(parameter, parameter.value)
 
 
 def test_flat_trim_on_the_ground() -> None:
-    desk = Desk(GROUND)
-    assert desk.write("ardrone.flat_trim", True) is True
-    assert desk.parameter("ardrone.flat_trim").value is True
-    assert desk.write("ardrone.flat_trim", False) is False
-    assert desk.said == [(("FTRIM", ()), 3)]
+    bench = Bench(GROUND)
+    assert bench.write("ardrone.flat_trim", True) is True
+    assert bench.parameter("ardrone.flat_trim").value is True
+    assert bench.write("ardrone.flat_trim", False) is False
+    assert bench.said == [(("FTRIM", ()), 3)]
 
 
 def test_calibration_in_the_air() -> None:
-    desk = Desk(AIR)
-    desk.write("ardrone.calibrate_magnetometer", True)
-    assert desk.said == [(("CALIB", (0,)), 3)]
+    bench = Bench(AIR)
+    bench.write("ardrone.calibrate_magnetometer", True)
+    assert bench.said == [(("CALIB", (0,)), 3)]
 
 
 @pytest.mark.parametrize(
@@ -212,31 +212,31 @@ def test_calibration_in_the_air() -> None:
         ("leds.animation", "fire", None, "no data from"),
     ],
 )
-def test_what_the_state_forbids(name: str, value: Value, condition: Condition | None, says: str) -> None:
-    desk = Desk(condition)
-    before = desk.parameter(name).value
+def test_commands_forbidden_in_a_state(name: str, value: Value, condition: Condition | None, says: str) -> None:
+    bench = Bench(condition)
+    before = bench.parameter(name).value
     with pytest.raises(ParameterError, match=says) as caught:
-        desk.write(name, value)
+        bench.write(name, value)
     assert caught.value.code == Refusal.WRONG_STATE
-    assert desk.said == []
-    assert desk.parameter(name).value == before
+    assert bench.said == []
+    assert bench.parameter(name).value == before
 
 
 def test_lights() -> None:
-    desk = Desk(GROUND)
-    desk.write("leds.frequency", 4.0)
-    desk.write("leds.duration", 5.0)
-    assert desk.write("leds.animation", "snake_green_red") == "snake_green_red"
-    assert desk.write("leds.animation", "none") == "none"
-    assert desk.said == [(("LED", (4, 4.0, 5)), 3)]
+    bench = Bench(GROUND)
+    bench.write("leds.frequency", 4.0)
+    bench.write("leds.duration", 5.0)
+    assert bench.write("leds.animation", "snake_green_red") == "snake_green_red"
+    assert bench.write("leds.animation", "none") == "none"
+    assert bench.said == [(("LED", (4, 4.0, 5)), 3)]
 
 
-def test_flight_animations_are_said_once() -> None:
-    desk = Desk(AIR)
-    desk.write("ardrone.flight_animation", "flip_left")
-    desk.write("ardrone.flight_animation", "yaw_shake")
-    desk.write("ardrone.flight_animation", "none")
-    assert desk.said == [(("ANIM", (18, 15)), 1), (("ANIM", (8, 2000)), 1)]
+def test_flight_animations_are_sent_once() -> None:
+    bench = Bench(AIR)
+    bench.write("ardrone.flight_animation", "flip_left")
+    bench.write("ardrone.flight_animation", "yaw_shake")
+    bench.write("ardrone.flight_animation", "none")
+    assert bench.said == [(("ANIM", (18, 15)), 1), (("ANIM", (8, 2000)), 1)]
 
 
 def test_numbers_of_animations() -> None:
@@ -246,22 +246,22 @@ def test_numbers_of_animations() -> None:
     assert [duration for _, duration in FLIGHT_ANIMATIONS] == [1000] * 6 + [5000] * 2 + [2000] + [5000] * 7 + [15] * 4
 
 
-def test_what_an_ardrone_1_has_not() -> None:
-    names = {parameter.name for parameter in Desk(GROUND, 1).commands.parameters(1)}
+def test_commands_missing_on_an_ardrone_1() -> None:
+    names = {parameter.name for parameter in Bench(GROUND, 1).commands.parameters(1)}
     assert "ardrone.calibrate_magnetometer" not in names
     assert "ardrone.absolute_control" not in names
-    assert "flip_left" not in Desk(GROUND, 1).parameter("ardrone.flight_animation").choices
+    assert "flip_left" not in Bench(GROUND, 1).parameter("ardrone.flight_animation").choices
 
 
 def test_absolute_control() -> None:
-    desk = Desk(AIR)
-    assert desk.setpoints.reference_rad is None
-    desk.write("ardrone.absolute_heading", math.pi)
-    assert desk.setpoints.reference_rad is None
-    desk.write("ardrone.absolute_control", True)
-    assert desk.setpoints.reference_rad == math.pi
-    desk.write("ardrone.absolute_control", False)
-    assert desk.setpoints.reference_rad is None
+    bench = Bench(AIR)
+    assert bench.setpoints.reference_rad is None
+    bench.write("ardrone.absolute_heading", math.pi)
+    assert bench.setpoints.reference_rad is None
+    bench.write("ardrone.absolute_control", True)
+    assert bench.setpoints.reference_rad == math.pi
+    bench.write("ardrone.absolute_control", False)
+    assert bench.setpoints.reference_rad is None
 
 
 @pytest.mark.parametrize(
@@ -275,8 +275,8 @@ def test_absolute_control() -> None:
         ("ardrone.flat_trim", 1, Refusal.WRONG_TYPE),
     ],
 )
-def test_commands_check_for_themselves(name: str, value: Value, code: Refusal) -> None:
-    desk = Desk(GROUND)
+def test_commands_check_their_own_values(name: str, value: Value, code: Refusal) -> None:
+    bench = Bench(GROUND)
     with pytest.raises(ParameterError) as caught:
-        desk.commands.write(desk.parameter(name), value)
+        bench.commands.write(bench.parameter(name), value)
     assert caught.value.code == code

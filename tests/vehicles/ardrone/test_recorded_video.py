@@ -1,4 +1,4 @@
-"""The recorded video of real drones through the whole driver, beside navdata of which most was recorded too."""
+"""The recorded video of real drones through the whole driver, together with mostly recorded navdata."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Radio:
 
     @property
     def options(self) -> str:
-        """Of the address by which a driver finds it."""
+        """Query of an address for a driver to reach it."""
         ports = {"navdata_port": self._navdata, "at_port": self._at, "control_port": self._control}
         return "&".join(f"{name}={one.getsockname()[1]}" for name, one in ports.items())
 
@@ -92,17 +92,17 @@ class Radio:
             self._drone.dump_asked = False
             self._asked.sendall(self._drone.dump())
         if self._listener is not None:
-            with suppress(OSError):  # it has gone
+            with suppress(OSError):  # it has left
                 self._navdata.sendto(self._drone.navdata(), self._listener)
 
 
 def counters(driver: ArdroneDriver) -> VideoCounters:
-    """At once: those in the telemetry come with the next feedback."""
+    """Return the counters directly: those in the telemetry arrive with the next feedback."""
     return VideoCounters() if driver._video is None else driver._video.counters
 
 
 def in_step(name: str, driver: list[ArdroneDriver], sink: RecordingSink) -> Callable[[socket.socket], None]:
-    """Sends a recording, each frame once what became of all before it is known, so that none is too late."""
+    """Send a recording frame by frame, each once all earlier ones were processed, so that none is late."""
 
     def dealt_with(number: int) -> bool:
         known = counters(driver[0])
@@ -110,7 +110,7 @@ def in_step(name: str, driver: list[ArdroneDriver], sink: RecordingSink) -> Call
 
     def play(connection: socket.socket) -> None:
         for number, piece in enumerate(pieces(name)):
-            if number > 1:  # the first one is held back until the second came
+            if number > 1:  # the first one is held back until the second arrives
                 assert sink.wait(lambda number=number: dealt_with(number), PATIENCE_S)  # type: ignore[misc]
             connection.sendall(piece)
         connection.recv(1)
@@ -120,7 +120,7 @@ def in_step(name: str, driver: list[ArdroneDriver], sink: RecordingSink) -> Call
 
 @contextmanager
 def flown(name: str) -> Iterator[tuple[ArdroneDriver, RecordingSink]]:
-    """A driver whose drone sends this recording."""
+    """Return a driver whose drone sends this recording."""
     drone = ScriptedDrone()
     drone.telemetry = [option for kind, option in navdata().options.items() if kind not in (Demo, Time)]
     sink = RecordingSink()
@@ -151,7 +151,7 @@ def test_a_recording_from_the_drones_socket_to_the_sink(name: str, pictures: int
         assert sink.link_state is LinkState.UP
         assert driver.capabilities().cameras[0].name == "front"
     assert set(sink.frame_counts) == {"front"}
-    assert ended.skipped <= 1, "at most the first of the two that came at once"
+    assert ended.skipped <= 1, "at most the first of the two that arrive together"
     assert (ended.waited, ended.damaged, ended.refused, ended.reconnects) == (waited, damaged, 0, 0)
     assert {(frame.width, frame.height) for frame in sink.frames} == {(640, 360)}
     true = [content for _, content in sorted(true_pictures(name).items())]
@@ -159,7 +159,7 @@ def test_a_recording_from_the_drones_socket_to_the_sink(name: str, pictures: int
     seen = [digest(frame.pixels.tobytes()) for frame in sink.frames]  # the newest 64, or all
     assert seen == true[-len(seen) :]
     assert len(frames(name)) == pictures + waited + damaged
-    # The telemetry beside it: of the drone's recording what is not scripted.
+    # The telemetry beside it: values from the drone's recording, except the scripted ones.
     assert native["video.received"] == len(frames(name)) - damaged
     assert native["navdata.damaged"] == native["navdata.unknown"] == 0
     assert "magneto.heading" in native

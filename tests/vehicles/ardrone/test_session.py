@@ -1,4 +1,4 @@
-"""From the first datagram on: setting up, losing, finding, telling. Without sockets, and with the time in hand."""
+"""A session from the first datagram on: set-up, link loss, recovery, reports. Without sockets, on a manual clock."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_an_ardrone_2_is_set_up_within_a_second() -> None:
     assert tuple(rig.drone.values[key] for key in ids) == (IDS.session, IDS.profile, IDS.application)
     assert rig.session.setpoints.limits is not None
     assert rig.session.setpoints.limits.tilt_rad == pytest.approx(0.2094395, rel=1e-6)
-    assert not rig.drone.state & State.COMMAND_ACK, "the acknowledge bit is cleared behind the last answer"
+    assert not rig.drone.state & State.COMMAND_ACK, "the acknowledge bit is cleared after the last answer"
 
 
 def test_every_config_is_preceded_by_the_ids_in_force() -> None:
@@ -60,13 +60,13 @@ def test_every_config_is_preceded_by_the_ids_in_force() -> None:
     rig.ready()
     commands = rig.drone.commands
     before = [commands[at - 1] for at, command in enumerate(commands) if command.name == "CONFIG"][1:]
-    assert before, "the first one is the mode, when nothing is known of ids"
+    assert before, "the first one sets the mode, before ids are known"
     assert {command.name for command in before} == {"CONFIG_IDS"}
     assert before[0].arguments == ("00000000",) * 3
     assert before[-1].arguments == (IDS.session, IDS.profile, "00000000")
 
 
-def test_an_ardrone_1_is_known_by_its_firmware_and_gets_no_ids() -> None:
+def test_an_ardrone_1_is_recognised_by_its_firmware_and_gets_no_ids() -> None:
     rig = Rig(drone=ScriptedDrone(version=1))
     rig.ready()
     assert rig.session.version == 1
@@ -79,7 +79,7 @@ def test_ids_can_be_declined() -> None:
     assert "CONFIG_IDS" not in rig.drone.names
 
 
-def test_ids_that_the_drone_does_not_keep_are_told() -> None:
+def test_ids_that_the_drone_does_not_keep_are_reported() -> None:
     rig = Rig()
     rig.drone.stubborn = {"custom:session_id"}
     rig.ready()
@@ -96,7 +96,7 @@ def test_the_full_mode_and_its_options() -> None:
     assert rig.drone.values["general:navdata_options"] == 0x4000401
 
 
-def test_a_drone_that_is_in_its_mode_already_is_not_asked_for_it() -> None:
+def test_a_drone_already_in_its_mode_is_not_switched() -> None:
     rig = Rig()
     rig.drone.state = State.DEMO
     rig.ready()
@@ -114,7 +114,7 @@ def test_set_up_with_a_third_of_the_datagrams_lost(seed: int) -> None:
 # The pace and the watchdog ---------------------------------------------------------------------------------------
 
 
-def test_commands_go_on_at_their_pace_whatever_the_application_does() -> None:
+def test_commands_keep_their_pace_whatever_the_application_does() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.2)
@@ -135,7 +135,7 @@ def test_the_watchdog_is_cleared_while_its_bit_is_set() -> None:
     assert "COMWDG" not in rig.drone.names
 
 
-def test_a_new_decision_is_said_at_once() -> None:
+def test_a_new_decision_is_sent_at_once() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.1)
@@ -146,10 +146,10 @@ def test_a_new_decision_is_said_at_once() -> None:
     assert rig.session.due_ns == now_ns
     rig.session.poll(now_ns)
     rig.session.command(Land(), rig.clock.advance(0.002))
-    assert rig.session.due_ns == now_ns + ns(0.01), "but not sooner than the drone can take it"
+    assert rig.session.due_ns == now_ns + ns(0.01), "but not sooner than the drone accepts it"
 
 
-def test_the_same_decision_hurries_nothing() -> None:
+def test_a_repeated_decision_is_not_sent_early() -> None:
     rig = Rig()
     rig.ready()
     rig.session.poll(rig.clock.now_ns)
@@ -158,7 +158,7 @@ def test_the_same_decision_hurries_nothing() -> None:
     assert rig.session.due_ns == due_ns
 
 
-def test_the_sequence_begins_anew_when_the_drone_lost_us() -> None:
+def test_the_sequence_restarts_when_the_drone_lost_us() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.5)
@@ -173,20 +173,20 @@ def test_the_sequence_begins_anew_when_the_drone_lost_us() -> None:
     assert rig.sink.link_state is LinkState.UP
 
 
-def test_the_sequence_begins_anew_when_our_commands_are_not_taken() -> None:
+def test_the_sequence_restarts_when_our_commands_are_ignored() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.5)
-    rig.drone.heard_sequence = 1_000_000  # somebody else counted far
+    rig.drone.heard_sequence = 1_000_000  # another program counted far
     rig.drone.state |= State.COMMUNICATION_WATCHDOG
     rig.until(lambda: not rig.drone.state & State.COMMUNICATION_WATCHDOG, 2.0)
     assert rig.drone.stale > 0
 
 
-# Losing and finding ----------------------------------------------------------------------------------------------
+# Link loss and recovery ------------------------------------------------------------------------------------------
 
 
-def test_silence_is_told_by_degrees() -> None:
+def test_silence_degrades_and_then_loses_the_link() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.1)
@@ -203,7 +203,7 @@ def test_silence_is_told_by_degrees() -> None:
     assert "drone, UDP port 5554" in reason
 
 
-def test_a_short_silence_heals_without_ado() -> None:
+def test_a_short_silence_needs_no_set_up() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.1)
@@ -215,7 +215,7 @@ def test_a_short_silence_heals_without_ado() -> None:
     assert rig.session.ready
 
 
-def test_a_drone_that_was_away_is_set_up_anew() -> None:
+def test_a_drone_is_set_up_again_after_an_absence() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.1)
@@ -225,13 +225,13 @@ def test_a_drone_that_was_away_is_set_up_anew() -> None:
     rig.drone.commands.clear()
     rig.switch_on()
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
-    assert rig.drone.heard_sequence < 200, "the sequence began anew"
+    assert rig.drone.heard_sequence < 200, "the sequence restarted"
     assert rig.drone.values["custom:session_id"] == IDS.session
     assert rig.session.setpoints.limits is not None
     assert rig.session.reception.counts["restarts"] == 1
 
 
-def test_a_drone_that_was_away_too_briefly_to_be_missed_is_set_up_anew() -> None:
+def test_a_drone_is_set_up_again_after_an_unnoticed_absence() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.2)
@@ -240,8 +240,8 @@ def test_a_drone_that_was_away_too_briefly_to_be_missed_is_set_up_anew() -> None
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 2.0)
 
 
-def test_one_datagram_that_says_so_is_no_reboot_and_no_lost_link() -> None:
-    """Two in a row have to."""
+def test_a_single_datagram_shows_neither_a_reboot_nor_a_lost_link() -> None:
+    """It takes two in a row."""
     rig = Rig()
     rig.ready()
     rig.run(0.5)
@@ -253,7 +253,7 @@ def test_one_datagram_that_says_so_is_no_reboot_and_no_lost_link() -> None:
     assert LinkState.LOST not in [state for state, _ in rig.sink.links]
 
 
-def test_what_was_written_is_written_again_where_the_drone_forgot_it() -> None:
+def test_keys_that_the_drone_forgot_are_written_again() -> None:
     rig = Rig()
     rig.ready()
     rig.session.remembered["control:euler_angle_max"] = "3.000000e-01"
@@ -264,7 +264,7 @@ def test_what_was_written_is_written_again_where_the_drone_forgot_it() -> None:
     assert rig.session.setpoints.limits.tilt_rad == pytest.approx(0.3)
 
 
-def test_nobody_there_is_told_and_tried_for_ever() -> None:
+def test_an_absent_drone_is_reported_and_retried_forever() -> None:
     rig = Rig()
     rig.on = False
     rig.session.unreachable("No route to host")
@@ -285,7 +285,7 @@ def test_a_configuration_that_cannot_be_read_leaves_landing_possible() -> None:
     assert "connection refused" in reason
     assert rig.session.command(Takeoff(), rig.clock.now_ns) == Takeoff()
     rig.run(0.2)
-    assert rig.session.command(Attitude(pitch=0.1), rig.clock.now_ns) == Hover(), "no set-point is claimed"
+    assert rig.session.command(Attitude(pitch=0.1), rig.clock.now_ns) == Hover(), "no set-point counts as applied"
     rig.run(0.1)
     assert any("limits are not known" in text for text in rig.texts)
     rig.session.command(Land(), rig.clock.now_ns)
@@ -295,7 +295,7 @@ def test_a_configuration_that_cannot_be_read_leaves_landing_possible() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 8.0)
 
 
-def test_a_drone_that_acknowledges_nothing_is_told() -> None:
+def test_a_drone_that_acknowledges_nothing_is_reported() -> None:
     rig = Rig()
     rig.drone.deaf = True
     rig.run(4.0)
@@ -304,7 +304,7 @@ def test_a_drone_that_acknowledges_nothing_is_told() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 8.0)
 
 
-def test_a_configuration_without_limits_takes_no_set_points() -> None:
+def test_without_limits_set_points_are_refused() -> None:
     rig = Rig()
     del rig.drone.values["control:control_yaw"]
     rig.ready()
@@ -313,7 +313,7 @@ def test_a_configuration_without_limits_takes_no_set_points() -> None:
     assert rig.session.command(Attitude(pitch=0.1), rig.clock.now_ns) == Hover()
 
 
-def test_a_drone_that_is_lost_while_it_is_set_up() -> None:
+def test_a_link_loss_during_the_set_up() -> None:
     rig = Rig()
     rig.run(0.1)
     assert not rig.session.ready
@@ -323,10 +323,10 @@ def test_a_drone_that_is_lost_while_it_is_set_up() -> None:
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
 
 
-# What it tells ---------------------------------------------------------------------------------------------------
+# Reports ---------------------------------------------------------------------------------------------------------
 
 
-def test_feedback_comes_with_the_counts() -> None:
+def test_feedback_includes_the_counts() -> None:
     rig = Rig()
     rig.ready()
     rig.session.on_navdata(b"garbage", rig.clock.now_ns)
@@ -339,7 +339,7 @@ def test_feedback_comes_with_the_counts() -> None:
     assert not rig.sink.problems
 
 
-def test_full_navdata_is_told_at_the_rate_asked_for() -> None:
+def test_full_navdata_is_published_at_the_requested_rate() -> None:
     rig = Rig(ArdroneOptions("drone", full=True, rate_hz=10.0))
     rig.ready()
     rig.run(0.1)
@@ -348,7 +348,7 @@ def test_full_navdata_is_told_at_the_rate_asked_for() -> None:
     assert rig.sink.feedback_count - before == pytest.approx(20, abs=3)
 
 
-def test_each_change_of_health_is_told_once() -> None:
+def test_each_change_of_health_is_reported_once() -> None:
     rig = Rig()
     rig.ready()
     rig.drone.extra = State.BATTERY_LOW
@@ -362,7 +362,7 @@ def test_each_change_of_health_is_told_once() -> None:
     ]
 
 
-def test_a_takeoff_that_is_refused_is_told_and_not_tried_for_ever() -> None:
+def test_a_refused_takeoff_is_reported_and_not_retried_forever() -> None:
     rig = Rig()
     rig.ready()
     rig.drone.refuses_takeoff = True
@@ -374,7 +374,7 @@ def test_a_takeoff_that_is_refused_is_told_and_not_tried_for_ever() -> None:
     assert not rig.drone.state & State.FLYING
 
 
-def test_a_flight_that_is_lost_is_not_taken_off_again_on_the_ground() -> None:
+def test_a_lost_flight_does_not_take_off_again_after_landing() -> None:
     rig = Rig()
     rig.ready()
     rig.session.command(Takeoff(), rig.clock.now_ns)
@@ -391,7 +391,7 @@ def test_a_flight_that_is_lost_is_not_taken_off_again_on_the_ground() -> None:
     assert not with_takeoff
 
 
-def test_a_drone_that_flies_already_is_left_flying() -> None:
+def test_a_flying_drone_is_left_flying() -> None:
     rig = Rig()
     rig.drone.state = State.FLYING | State.DEMO
     rig.ready()
@@ -405,7 +405,7 @@ def test_no_takeoff_without_navdata() -> None:
         rig.session.command(Takeoff(), rig.clock.now_ns)
 
 
-def test_commands_without_acknowledgement_are_repeated_as_often_as_wanted() -> None:
+def test_commands_without_acknowledgement_are_repeated_as_requested() -> None:
     rig = Rig()
     rig.ready()
     rig.session.send(("FTRIM", ()))
@@ -431,7 +431,7 @@ def test_closing_ends_exchanges() -> None:
 @needs_recordings
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=64) | st.integers(0, 8 * len(RECORDED) - 1) | st.just(RECORDED), max_size=30))
-def test_whatever_comes_is_counted_and_never_raises(pieces: list[bytes | int]) -> None:
+def test_any_input_is_counted_and_never_raises(pieces: list[bytes | int]) -> None:
     rig = Rig()
     damaged = 0
     for piece in pieces:
@@ -481,10 +481,10 @@ def test_the_recorded_datagram_goes_through() -> None:
     feedback = rig.sink.newest
     assert feedback is not None
     assert (feedback.state, feedback.battery) == (FlightState.LANDED, 0.5)
-    assert not rig.sink.events, "it is in good health"
+    assert not rig.sink.events, "it is healthy"
 
 
-def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
+def test_a_landing_of_a_lost_drone_expires() -> None:
     rig = Rig()
     rig.ready()
     rig.session.command(Land(), rig.clock.now_ns)
@@ -504,7 +504,7 @@ def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
 def flying() -> Rig:
     rig = Rig()
     rig.ready()
-    rig.navdata_steps = 7  # about 15 Hz, as a real one
+    rig.navdata_steps = 7  # about 15 Hz, like a real drone
     rig.session.command(Takeoff(), rig.clock.now_ns)
     rig.until(lambda: State.FLYING in rig.drone.state, 1.0)
     rig.run(0.3)
@@ -512,8 +512,8 @@ def flying() -> Rig:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_an_emergency_is_toggled_once_however_bad_the_link_is(seed: int) -> None:
-    """Late, lost and out of order: a second toggle would have released the motors, or stopped them after a reset."""
+def test_an_emergency_is_toggled_once_over_any_link(seed: int) -> None:
+    """Packets are late, lost and reordered; a second toggle would release the motors, or stop them after a reset."""
     rig, chance = flying(), random.Random(seed)
     drone, setpoints = rig.drone, rig.session.setpoints
     rig.lost = lambda: chance.random() < 0.3
@@ -533,8 +533,8 @@ def test_an_emergency_is_toggled_once_however_bad_the_link_is(seed: int) -> None
 
 @pytest.mark.parametrize("stall_s", [0.5, 0.7, 0.9])
 @pytest.mark.parametrize("before_s", [0.0, 0.1, 0.3])
-def test_navdata_that_waited_are_no_news(stall_s: float, before_s: float) -> None:
-    """The driver's process stood still, or the network held them back: then they come in a row, the oldest first."""
+def test_delayed_navdata_is_not_new(stall_s: float, before_s: float) -> None:
+    """After a stall of the driver or the network, navdata arrives in a burst, the oldest first."""
     rig = flying()
     until_s = 0.0
     rig.late = lambda up: 0.0 if up else max(0.0, until_s - rig.clock.now_ns / 1e9)
@@ -548,7 +548,7 @@ def test_navdata_that_waited_are_no_news(stall_s: float, before_s: float) -> Non
     assert State.EMERGENCY not in rig.drone.state
 
 
-def test_one_old_datagram_after_a_gap_does_not_release_what_is_stopped() -> None:
+def test_one_old_datagram_after_a_gap_does_not_release_stopped_motors() -> None:
     rig = flying()
     old = rig.drone.navdata()
     rig.session.command(EmergencyStop(), rig.clock.now_ns)
@@ -564,8 +564,8 @@ def test_one_old_datagram_after_a_gap_does_not_release_what_is_stopped() -> None
     assert rig.drone.toggles == 1
 
 
-def test_a_stop_whose_toggle_the_drone_did_not_see_gets_another() -> None:
-    """It had heard the bit set last, from another program."""
+def test_a_stop_with_an_unseen_toggle_gets_another() -> None:
+    """The drone had last seen the bit set, by another program."""
     rig = flying()
     rig.drone.hear_bit()
     rig.session.command(EmergencyStop(), rig.clock.now_ns)
@@ -575,8 +575,8 @@ def test_a_stop_whose_toggle_the_drone_did_not_see_gets_another() -> None:
 
 
 @pytest.mark.parametrize("port_open", [False, True])
-def test_such_a_stop_is_as_soon_where_no_navdata_are_configured(port_open: bool) -> None:
-    """Few come then, and were taken for many: the next toggle came after 7.5 s, or never while it was set up anew."""
+def test_such_a_stop_takes_no_longer_with_unconfigured_navdata(port_open: bool) -> None:
+    """Navdata is sparse then, and was taken for dense: the next toggle took 7.5 s, or never came during the set-up."""
     rig = Rig()
     rig.navdata_steps = 7
     rig.drone.stubborn = {"general:navdata_demo"}
@@ -588,7 +588,7 @@ def test_such_a_stop_is_as_soon_where_no_navdata_are_configured(port_open: bool)
     assert 0.4 < rig.until(lambda: State.EMERGENCY in rig.drone.state, 8.0) < 0.8
 
 
-def test_motors_that_another_program_releases_soon_are_stopped_again() -> None:
+def test_motors_soon_released_by_another_program_are_stopped_again() -> None:
     rig = flying()
     rig.session.command(EmergencyStop(), rig.clock.now_ns)
     rig.run(2.0)
@@ -596,12 +596,12 @@ def test_motors_that_another_program_releases_soon_are_stopped_again() -> None:
     assert rig.until(lambda: State.EMERGENCY in rig.drone.state, 2.0) < 0.8
 
 
-# What stands does not take off by what it was ------------------------------------------------------------------------
+# A landed drone does not take off by its old state -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stall_s", [0.5, 0.9, 4.0])
-def test_a_drone_that_landed_while_the_driver_stood_still_stays_there(stall_s: float) -> None:
-    """It hears nothing for 2 s and lands. Navdata of its flight wait for whoever wakes up, and told it to take off."""
+def test_a_drone_that_landed_during_a_stall_of_the_driver_stays_landed(stall_s: float) -> None:
+    """After 2 s of silence it lands. Old navdata of its flight then made the driver command a take-off."""
     rig = flying()
     rig.session.command(Hover(), rig.clock.now_ns)
     rig.run(0.2)
@@ -623,7 +623,7 @@ def test_a_drone_that_landed_while_the_driver_stood_still_stays_there(stall_s: f
     assert State.FLYING not in rig.drone.state
 
 
-def test_a_drone_that_is_not_heard_for_a_moment_is_not_told_to_take_off() -> None:
+def test_a_short_silence_causes_no_takeoff() -> None:
     rig = flying()
     rig.lost = lambda: True
     rig.run(0.5)
@@ -637,7 +637,7 @@ def test_a_drone_that_is_not_heard_for_a_moment_is_not_told_to_take_off() -> Non
     assert State.FLYING not in rig.drone.state
 
 
-def test_a_drone_that_flies_is_told_to_again_after_a_gap() -> None:
+def test_a_flying_drone_gets_the_takeoff_bit_again_after_a_gap() -> None:
     rig = flying()
     rig.lost = lambda: True
     rig.run(0.5)

@@ -1,4 +1,4 @@
-"""What is said of take-off, landing and emergency, tick by tick."""
+"""The bits for take-off, landing and emergency, tick by tick."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PERIOD_S = 0.03
 
 @dataclass
 class Cockpit:
-    """A pilot with the time."""
+    """A pilot with a clock."""
 
     setpoints: SetpointController = field(default_factory=SetpointController)
     now_s: float = 1000.0
@@ -48,7 +48,7 @@ class Cockpit:
         self.setpoints.on_condition(condition, ns(self.now_s))
 
     def ref(self) -> Ref | None:
-        """At the next tick; without the fixed bits."""
+        """Return the bits of the next tick, without the fixed ones."""
         self.now_s += PERIOD_S
         return next((self._bits(args) for name, args in self.setpoints.messages(ns(self.now_s)) if name == "REF"), None)
 
@@ -75,11 +75,11 @@ def at(condition: Condition | None) -> Cockpit:
     ("condition", "ref"),
     [(None, None), (GROUND, Ref(0)), (AIR, None), (LANDING, None), (EMERGENCY, Ref(0))],
 )
-def test_before_anything_is_decided_the_drone_goes_on(condition: Condition | None, ref: Ref | None) -> None:
+def test_before_any_decision_the_drone_continues(condition: Condition | None, ref: Ref | None) -> None:
     assert at(condition).ref() == ref
 
 
-def test_a_drone_that_another_program_flies_is_told_nothing_but_that_we_are_there() -> None:
+def test_a_drone_flown_by_another_program_gets_only_the_watchdogs_answer() -> None:
     cockpit = at(AIR)
     assert cockpit.setpoints.messages(0) == [("COMWDG", ())], "neither REF nor PCMD, which would stop its sticks"
     cockpit.setpoints.apply(Hover(), 0)
@@ -90,16 +90,16 @@ def test_a_drone_that_another_program_flies_is_told_nothing_but_that_we_are_ther
 
 
 @pytest.mark.parametrize("before", [None, GROUND, AIR, EMERGENCY])
-def test_a_drone_that_is_not_heard_and_that_nobody_flies_from_here_is_told_nothing(before: Condition | None) -> None:
-    """A hover stops another program's sticks, and after an emergency a landing; it also kept up a lost drone."""
+def test_a_silent_drone_that_we_do_not_fly_gets_no_commands(before: Condition | None) -> None:
+    """A hover would stop another program's sticks, and after an emergency a landing; it also kept a lost drone up."""
     cockpit = at(before)
     cockpit.setpoints.lost()
     assert cockpit.setpoints.messages(0) == []
     cockpit.take(Hover())
-    assert [name for name, _ in cockpit.setpoints.messages(0)] != [], "somebody flies it by now"
+    assert [name for name, _ in cockpit.setpoints.messages(0)] != [], "now we fly it"
 
 
-def test_a_landing_that_was_given_up_leaves_what_is_not_heard_to_land_by_itself() -> None:
+def test_a_silent_drone_lands_without_commands_after_an_abandoned_landing() -> None:
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.setpoints.lost()
@@ -108,7 +108,7 @@ def test_a_landing_that_was_given_up_leaves_what_is_not_heard_to_land_by_itself(
     assert cockpit.setpoints.messages(0) == []
 
 
-def test_takeoff_is_said_until_the_drone_flies_and_as_long_as_it_does() -> None:
+def test_the_takeoff_bit_is_sent_before_and_during_the_flight() -> None:
     cockpit = at(GROUND)
     assert cockpit.take(Takeoff()) == Takeoff()
     assert [cockpit.ref() for _ in range(5)] == [Ref.TAKEOFF] * 5
@@ -117,12 +117,12 @@ def test_takeoff_is_said_until_the_drone_flies_and_as_long_as_it_does() -> None:
     cockpit.hears(AIR)
     assert cockpit.ref() == Ref.TAKEOFF
     cockpit.hears(LANDING)
-    assert cockpit.ref() == Ref(0), "it lands by itself, and is not talked out of it"
+    assert cockpit.ref() == Ref(0), "its own landing is not aborted"
     cockpit.hears(GROUND)
-    assert cockpit.ref() == Ref(0), "nor made to take off again"
+    assert cockpit.ref() == Ref(0), "nor followed by a take-off"
 
 
-def test_hover_and_set_points_do_not_break_a_takeoff_off() -> None:
+def test_hover_and_set_points_do_not_abort_a_takeoff() -> None:
     cockpit = at(GROUND)
     cockpit.take(Takeoff())
     cockpit.take(Hover())
@@ -131,7 +131,7 @@ def test_hover_and_set_points_do_not_break_a_takeoff_off() -> None:
     assert cockpit.ref() == Ref.TAKEOFF
 
 
-def test_a_takeoff_has_its_time() -> None:
+def test_a_takeoff_has_a_time_limit() -> None:
     cockpit = at(GROUND)
     cockpit.take(Takeoff())
     cockpit.now_s += 4.9
@@ -142,14 +142,14 @@ def test_a_takeoff_has_its_time() -> None:
 
 
 @pytest.mark.parametrize("condition", [AIR, GROUND, None])
-def test_landing_is_said_until_something_else_is_decided(condition: Condition | None) -> None:
+def test_a_landing_is_sent_until_the_next_decision(condition: Condition | None) -> None:
     cockpit = at(condition)
     assert cockpit.take(Land()) == Land()
     assert [cockpit.ref() for _ in range(5)] == [Ref(0)] * 5
 
 
-def test_a_landing_that_withdraws_a_takeoff_is_said_when_the_drone_rises_all_the_same() -> None:
-    """What it had heard last of us was the take-off: it was taken for another program's flight, and left to hover."""
+def test_a_landing_that_withdraws_a_takeoff_is_sent_if_the_drone_still_rises() -> None:
+    """Its last command was the take-off. The rise once counted as another program's flight and was left hovering."""
     cockpit = at(GROUND)
     cockpit.take(Takeoff())
     assert cockpit.ref() == Ref.TAKEOFF
@@ -167,7 +167,7 @@ def test_a_landing_that_withdraws_a_takeoff_is_said_when_the_drone_rises_all_the
     assert cockpit.ref() is None, "another program flies it"
 
 
-def test_a_landing_of_ours_can_be_broken_off() -> None:
+def test_our_own_landing_can_be_aborted() -> None:
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.hears(LANDING)
@@ -179,8 +179,8 @@ def test_a_landing_of_ours_can_be_broken_off() -> None:
 
 @pytest.mark.parametrize("action", [Hover(), Attitude(pitch=0.1)])
 @pytest.mark.parametrize("low", [TOUCHING_DOWN, Condition(State.FLYING, ControlState.LANDING)])
-def test_a_landing_is_not_broken_off_where_the_drone_touches_down(low: Condition, action: AnyAction) -> None:
-    """Navdata are a moment old: the bit reached a drone that stood by then, and it took off again."""
+def test_a_landing_is_not_aborted_at_touchdown(low: Condition, action: AnyAction) -> None:
+    """Navdata is slightly old: the bit once reached a landed drone, which took off again."""
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.hears(low)
@@ -193,8 +193,8 @@ def test_a_landing_is_not_broken_off_where_the_drone_touches_down(low: Condition
         assert cockpit.ref() == Ref(0)
 
 
-def test_a_drone_that_lands_by_itself_after_a_landing_that_was_broken_off_is_left_to_land() -> None:
-    """It was told to take off again, on and on, with an empty battery."""
+def test_a_drones_own_landing_after_an_aborted_one_is_not_aborted() -> None:
+    """It was once repeatedly commanded to take off again, with an empty battery."""
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.hears(LANDING)
@@ -207,8 +207,8 @@ def test_a_drone_that_lands_by_itself_after_a_landing_that_was_broken_off_is_lef
     assert cockpit.ref() == Ref(0)
 
 
-def test_a_landing_that_is_broken_off_too_late_for_the_drone_to_hear_it_is_completed() -> None:
-    """The bit was sent on until navdata no longer showed it flying, which is later than it stands."""
+def test_a_landing_aborted_too_late_is_completed() -> None:
+    """The bit was sent until navdata no longer showed a flight, which is after the touchdown."""
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.hears(LANDING)
@@ -219,8 +219,8 @@ def test_a_landing_that_is_broken_off_too_late_for_the_drone_to_hear_it_is_compl
         assert cockpit.ref() == Ref(0)
 
 
-def test_a_landing_that_was_given_up_and_shows_all_the_same_is_not_broken_off() -> None:
-    """The drone was told to take off again as soon as it was heard."""
+def test_an_abandoned_landing_that_still_happens_is_not_aborted() -> None:
+    """The drone was once commanded to take off again with its first navdata."""
     cockpit = at(AIR)
     cockpit.take(Land())
     cockpit.hears(LANDING)
@@ -230,13 +230,13 @@ def test_a_landing_that_was_given_up_and_shows_all_the_same_is_not_broken_off() 
     for condition in (None, LANDING, AIR):
         if condition is not None:
             cockpit.hears(condition)
-        assert cockpit.ref() is None, "it may be somebody else's flight by now"
+        assert cockpit.ref() is None, "another program may fly it by now"
     cockpit.hears(LANDING)
     cockpit.take(Hover())
-    assert cockpit.ref() == Ref.TAKEOFF, "a pilot breaks it off"
+    assert cockpit.ref() == Ref.TAKEOFF, "a pilot aborts it"
 
 
-def test_set_points_are_said_until_the_next_decision() -> None:
+def test_set_points_are_sent_until_the_next_decision() -> None:
     cockpit = at(AIR)
     assert cockpit.take(Attitude(pitch=0.1, climb=9.0)) == Attitude(pitch=0.1, climb=0.7)
     assert cockpit.pcmd() == cockpit.pcmd() == (1, 0.0, -0.5, 1.0, 0.0)
@@ -247,7 +247,7 @@ def test_set_points_are_said_until_the_next_decision() -> None:
 
 
 @pytest.mark.parametrize("action", [Land(), Takeoff(), EmergencyStop()])
-def test_what_ends_a_set_point(action: AnyAction) -> None:
+def test_actions_that_end_a_set_point(action: AnyAction) -> None:
     cockpit = at(AIR)
     cockpit.take(Attitude(pitch=0.1))
     cockpit.take(action)
@@ -262,14 +262,14 @@ def test_a_set_point_does_not_outlive_the_flight() -> None:
 
 
 def test_a_set_point_does_not_outlive_the_link() -> None:
-    """It was sent on for as long as nothing was heard, unless somebody thought of a hover."""
+    """It was once sent for as long as the drone was silent, unless an application sent a hover."""
     cockpit = at(AIR)
     cockpit.take(Attitude(pitch=0.1))
     cockpit.setpoints.lost()
     assert cockpit.pcmd()[0] == 0
 
 
-def test_without_limits_it_hovers_and_says_so_once() -> None:
+def test_without_limits_it_hovers_with_one_warning() -> None:
     cockpit = at(AIR)
     cockpit.setpoints.limits = None
     for _ in range(3):
@@ -290,7 +290,7 @@ def test_absolute_control() -> None:
 # Emergency -------------------------------------------------------------------------------------------------------
 
 
-def test_the_emergency_bit_is_let_go_when_the_motors_are_cut() -> None:
+def test_the_emergency_bit_is_cleared_when_the_motors_are_cut() -> None:
     cockpit = at(AIR)
     cockpit.take(EmergencyStop())
     assert [cockpit.ref() for _ in range(4)] == [Ref.EMERGENCY] * 4
@@ -298,13 +298,13 @@ def test_the_emergency_bit_is_let_go_when_the_motors_are_cut() -> None:
     assert [cockpit.ref() for _ in range(4)] == [Ref(0)] * 4
 
 
-def test_an_emergency_stop_of_what_is_stopped_resets_nothing() -> None:
+def test_an_emergency_stop_of_stopped_motors_resets_nothing() -> None:
     cockpit = at(EMERGENCY)
     cockpit.take(EmergencyStop())
     assert cockpit.ref() == Ref(0)
 
 
-def test_an_emergency_stop_is_said_to_a_drone_that_is_not_heard() -> None:
+def test_an_emergency_stop_is_sent_to_a_silent_drone() -> None:
     cockpit = at(AIR)
     cockpit.setpoints.lost()
     cockpit.take(EmergencyStop())
@@ -322,13 +322,13 @@ def test_an_emergency_stop_without_effect_gets_a_new_edge() -> None:
     assert said[0] == said[-1] == Ref.EMERGENCY
 
 
-def test_no_second_edge_while_nothing_new_is_heard() -> None:
+def test_no_second_edge_without_new_navdata() -> None:
     cockpit = at(AIR)
     cockpit.take(EmergencyStop())
     assert {cockpit.ref() for _ in range(40)} == {Ref.EMERGENCY}
 
 
-def test_a_stop_pressed_while_the_drone_is_lost_is_not_sent_when_it_is_back_minutes_later() -> None:
+def test_a_stop_of_a_lost_drone_is_not_sent_minutes_later() -> None:
     cockpit = at(AIR)
     cockpit.take(Hover())
     cockpit.setpoints.lost()
@@ -349,7 +349,7 @@ def test_a_stop_pressed_while_the_drone_is_lost_is_not_sent_when_it_is_back_minu
     assert cockpit.ref() == Ref(0)
 
 
-def test_a_stop_that_has_no_effect_is_given_up_and_the_drone_can_be_landed() -> None:
+def test_a_stop_without_effect_is_abandoned_and_the_drone_can_land() -> None:
     cockpit = at(AIR)
     cockpit.take(Hover())
     cockpit.take(EmergencyStop())
@@ -363,7 +363,7 @@ def test_a_stop_that_has_no_effect_is_given_up_and_the_drone_can_be_landed() -> 
     assert cockpit.ref() == Ref(0)
 
 
-def test_a_stop_of_a_drone_that_another_program_flies_since_is_still_sent() -> None:
+def test_a_stop_is_sent_even_if_another_program_now_flies_the_drone() -> None:
     cockpit = at(AIR)
     cockpit.setpoints.lost()
     cockpit.take(EmergencyStop())
@@ -372,7 +372,7 @@ def test_a_stop_of_a_drone_that_another_program_flies_since_is_still_sent() -> N
     assert cockpit.ref() == Ref.EMERGENCY
 
 
-def test_a_further_stop_while_a_stopped_drone_is_lost_makes_no_edge_that_would_release_it() -> None:
+def test_another_stop_of_a_lost_stopped_drone_makes_no_releasing_edge() -> None:
     cockpit = at(AIR)
     cockpit.take(EmergencyStop())
     cockpit.hears(EMERGENCY)
@@ -383,7 +383,7 @@ def test_a_further_stop_while_a_stopped_drone_is_lost_makes_no_edge_that_would_r
 
 
 @pytest.mark.parametrize("action", [Hover(), Land(), Attitude(pitch=0.1)])
-def test_nothing_but_a_reset_takes_an_emergency_stop_back(action: AnyAction) -> None:
+def test_only_a_reset_ends_an_emergency_stop(action: AnyAction) -> None:
     cockpit = at(AIR)
     cockpit.take(EmergencyStop())
     cockpit.take(action)
@@ -404,7 +404,7 @@ def test_reset_without_an_emergency_cuts_no_motors() -> None:
     assert cockpit.ref() == Ref(0)
 
 
-def test_a_reset_is_not_waited_for_after_the_link_was_lost() -> None:
+def test_a_link_loss_cancels_a_reset() -> None:
     cockpit = at(EMERGENCY)
     cockpit.take(ResetEmergency())
     cockpit.setpoints.lost()
@@ -412,7 +412,7 @@ def test_a_reset_is_not_waited_for_after_the_link_was_lost() -> None:
     assert cockpit.ref() == Ref(0)
 
 
-def test_nobody_resets_by_himself() -> None:
+def test_no_reset_without_a_request() -> None:
     cockpit = at(AIR)
     cockpit.take(Attitude(pitch=0.1))
     for _ in range(50):
@@ -429,7 +429,7 @@ def test_nobody_resets_by_himself() -> None:
         (AIR, Velocity(), "does not support velocity"),
     ],
 )
-def test_what_cannot_be_done(condition: Condition | None, action: AnyAction, says: str) -> None:
+def test_impossible_actions(condition: Condition | None, action: AnyAction, says: str) -> None:
     cockpit = at(condition)
     with pytest.raises(DriverError, match=says):
         cockpit.take(action)

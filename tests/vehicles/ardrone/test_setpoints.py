@@ -1,4 +1,4 @@
-"""Set-points in SI become shares of the drone's own limits, with its signs."""
+"""Set-points in SI as shares of the drone's own limits, with its signs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_signs_and_scale(asked: Attitude, stick: Stick) -> None:
 
 
 @given(ANGLES, ANGLES, ANGLES, ANGLES)
-def test_what_is_applied_is_what_the_stick_says(roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
+def test_the_applied_action_matches_the_stick(roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
     asked = Attitude(roll, pitch, climb, yaw_rate)
     stick, applied = stick_of(asked, LIMITS)
     assert applied.roll == pytest.approx(stick.roll * LIMITS.tilt_rad)
@@ -55,7 +55,7 @@ def test_a_motion_can_be_sent(stick: Stick | None) -> None:
 
 
 def test_motion_along_a_heading() -> None:
-    name, arguments = motion(Stick(0.5, -0.5, 0.0, 0.0), math.pi / 2)  # ours is counter-clockwise, the drone's not
+    name, arguments = motion(Stick(0.5, -0.5, 0.0, 0.0), math.pi / 2)  # ours is counter-clockwise
     assert name == "PCMD_MAG"
     assert arguments == (int(Pcmd.PROGRESSIVE | Pcmd.ABSOLUTE), 0.5, -0.5, 0.0, 0.0, -0.5, HEADING_ACCURACY)
 

@@ -1,4 +1,4 @@
-"""The driver keeps the drivers' contract, against the emulated firmware of an AR.Drone 2."""
+"""The driver passes the driver suite against the emulated firmware of an AR.Drone 2."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
 
 
 class TestArdrone2(DriverSuite):
-    """One drone for each test. In the full mode, in which parameters are acknowledged at once."""
+    """One drone for each test, in the full mode, which acknowledges parameters at once."""
 
     firmware: ArdroneFirmware
     uri = "ardrone://127.0.0.1"
-    #: Those that the drone's state on the ground refuses.
+    #: Parameters that the drone refuses on the ground.
     untouched_parameters = frozenset({"ardrone.calibrate_magnetometer", "ardrone.flight_animation"})
 
     @pytest.fixture(autouse=True)

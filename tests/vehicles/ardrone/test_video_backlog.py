@@ -1,4 +1,4 @@
-"""Which frames are decoded and shown, and what time a picture was taken at: pure decisions."""
+"""Which frames are decoded and shown, and capture times: pure decisions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_in_time_every_frame_is_decoded_and_shown() -> None:
     assert backlog.skipped == 0
 
 
-def test_when_late_it_goes_on_at_the_newest_key_frame_and_shows_only_the_newest() -> None:
+def test_when_late_it_skips_to_the_newest_key_frame_and_shows_only_the_newest() -> None:
     backlog = FrameBacklog()
     for n in range(9):
         backlog.put(coded(n, key=n in (0, 3, 6)), wanted=True)
@@ -51,7 +51,7 @@ def test_late_without_a_key_frame_all_are_decoded_and_the_newest_is_shown() -> N
     assert backlog.skipped == 3
 
 
-def test_while_nobody_looks_the_frames_since_the_newest_key_frame_are_kept_and_none_is_counted_as_skipped() -> None:
+def test_without_viewers_the_frames_since_the_newest_key_frame_are_kept_and_none_counts_as_skipped() -> None:
     backlog = FrameBacklog()
     for n in range(1000):
         backlog.put(coded(n, key=n % 15 == 0), wanted=False)
@@ -60,7 +60,7 @@ def test_while_nobody_looks_the_frames_since_the_newest_key_frame_are_kept_and_n
     assert backlog.skipped == 0
 
 
-def test_more_than_it_holds_pushes_the_oldest_out() -> None:
+def test_an_overflow_drops_the_oldest() -> None:
     backlog = FrameBacklog()
     for n in range(MAX_FRAMES + 5):
         backlog.put(coded(n), wanted=True)
@@ -94,9 +94,9 @@ def test_a_stamp_is_mapped_by_the_smallest_delay_seen() -> None:
     assert taken == [40 * MS, *((33 * n + 12) * MS for n in range(1, 6))]
 
 
-def test_the_stale_greeting_of_a_real_drone_does_not_shift_what_follows() -> None:
+def test_the_stale_first_frame_of_a_real_drone_does_not_shift_later_times() -> None:
     stamps = DroneStamps()
-    assert stamps.captured_ns(1792570814, 0) == 0  # 6.3 s older than the next, and came 1 ms before it
+    assert stamps.captured_ns(1792570814, 0) == 0  # 6.3 s older than the next one, and 1 ms ahead of it
     assert stamps.captured_ns(1792577172, 1 * MS) == 1 * MS
     assert stamps.captured_ns(1792577204, 60 * MS) == 33 * MS
 
@@ -110,7 +110,7 @@ def test_stamps_wrap() -> None:
     assert taken == [(33 * n + 5) * MS for n in range(4)]
 
 
-def test_a_drone_that_was_started_again_is_learned_anew() -> None:
+def test_a_restarted_drones_clock_is_learned_again() -> None:
     stamps = DroneStamps()
     for n in range(100):
         stamps.captured_ns(500_000 + 33 * n, (33 * n + 5) * MS)
@@ -121,7 +121,7 @@ def test_a_drone_that_was_started_again_is_learned_anew() -> None:
 
 
 def test_a_drifting_clock_is_followed() -> None:
-    """100 ppm slow or fast, with 0 to 40 ms of jitter: never later than it came, and within 3 ms of the truth."""
+    """100 ppm slow or fast, with 0 to 40 ms of jitter: never later than the arrival, and within 3 ms of the truth."""
     for drift in (-1e-4, 1e-4):
         rng = random.Random(5)
         stamps = DroneStamps()

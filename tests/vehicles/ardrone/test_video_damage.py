@@ -1,4 +1,4 @@
-"""Recorded streams, damaged: nothing raises, no picture is shown that was not sent, and what is missing is counted."""
+"""Recorded streams, damaged: nothing raises, only sent pictures are shown, and missing ones are counted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skyloop.vehicles.emulation.video import Encoder
 from tests.vehicles.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 
 NAMES = st.sampled_from((LONG, SHORT))
-FRAMES = 20  # of the long recording are taken: an interval between key frames, and a little more
+FRAMES = 20  # of the long recording: an interval between key frames, and a little more
 KEY_INTERVAL = 15
 HEADER = 64
 FEW = settings(max_examples=60, deadline=None)
@@ -29,7 +29,7 @@ FEW = settings(max_examples=60, deadline=None)
 
 @dataclass
 class Outcome:
-    """What became of a stream."""
+    """The result for a stream."""
 
     seen: list[tuple[int, Digest]] = field(default_factory=list)
     received: int = 0
@@ -45,17 +45,17 @@ class Outcome:
 
     @property
     def false(self) -> list[int]:
-        """Numbers of the pictures that were not sent."""
+        """Numbers of shown pictures that were not sent."""
         true = set(true_pictures(LONG).values()) | set(true_pictures(SHORT).values())
         return [number for number, content in self.seen if content not in true]
 
     def check_counts(self) -> None:
-        """Every frame that came whole was shown or counted."""
+        """Check that every whole frame was shown or counted."""
         assert len(self.seen) + self.refused + self.waited + self.damaged == self.received
 
 
 def play(data: bytes, piece: int = 4000) -> Outcome:
-    """Through all that stands between the socket and the screen, each frame at once."""
+    """Decode everything between socket and screen, frame by frame."""
     assembly, decoder, outcome = PaveAssembly(0), PaveVideo(), Outcome()
     for start in range(0, len(data), piece):
         for coded in assembly.feed(data[start : start + piece], start):
@@ -79,7 +79,7 @@ def stream(name: str) -> list[bytes]:
 
 @FEW
 @given(NAMES, st.data())
-def test_bytes_that_are_missing(name: str, draw: st.DataObject) -> None:
+def test_missing_bytes(name: str, draw: st.DataObject) -> None:
     whole = b"".join(stream(name))
     start = draw.draw(st.integers(0, len(whole)), label="start")
     count = draw.draw(st.integers(0, len(whole) - start) | st.integers(0, min(2000, len(whole) - start)), label="count")
@@ -121,7 +121,7 @@ def test_flipped_bits_of_headers(name: str, draw: st.DataObject) -> None:
 
 @FEW
 @given(NAMES, st.data())
-def test_a_flipped_bit_of_a_payload_reaches_no_further_than_the_next_key_frame(name: str, draw: st.DataObject) -> None:
+def test_a_flipped_payload_bit_has_no_effect_beyond_the_next_key_frame(name: str, draw: st.DataObject) -> None:
     sent = stream(name)
     n = draw.draw(st.integers(0, len(sent) - 1), label="frame")
     sent[n] = flipped(sent[n], draw.draw(st.integers(8 * HEADER, 8 * len(sent[n]) - 1), label="bit"))
@@ -130,7 +130,7 @@ def test_a_flipped_bit_of_a_payload_reaches_no_further_than_the_next_key_frame(n
 
 @FEW
 @given(NAMES, st.integers(500, 20_000), st.data())
-def test_blocks_in_the_wrong_order_reach_no_further_either(name: str, size: int, draw: st.DataObject) -> None:
+def test_blocks_in_the_wrong_order_have_no_effect_beyond_it_either(name: str, size: int, draw: st.DataObject) -> None:
     sent = stream(name)
     whole = b"".join(sent)
     at = draw.draw(st.integers(0, len(whole) - 2), label="where")
@@ -142,10 +142,10 @@ def test_blocks_in_the_wrong_order_reach_no_further_either(name: str, size: int,
 
 
 def check_reach(name: str, data: bytes, first: int, last: int) -> None:
-    """Frames from ``first`` to ``last`` were touched: those before, and those from the next key frame on, are shown.
+    """Check that frames before ``first``, and from the next key frame after ``last`` on, are shown.
 
-    H.264 has no checksum: touched bytes may make another valid stream, which no decoder can tell from what was sent. So
-    what is promised is less than for all other damage; what bytes do over TCP they don't do unnoticed.
+    H.264 has no checksum: damaged bytes may make another valid stream, which no decoder can detect. The promise is
+    therefore weaker than for other damage; over TCP such damage does not go unnoticed.
     """
     outcome = play(data)
     sent = frames(name)[:FRAMES]
@@ -165,7 +165,7 @@ def flipped(data: bytes, bit: int) -> bytes:
 
 @FEW
 @given(st.binary(max_size=3000), st.integers(0, 40_000))
-def test_anything_in_between_costs_no_more_than_the_pictures_up_to_the_next_key_frame(noise: bytes, at: int) -> None:
+def test_inserted_bytes_cost_only_the_pictures_up_to_the_next_key_frame(noise: bytes, at: int) -> None:
     whole = b"".join(stream(LONG))
     outcome = play(whole[:at] + noise + whole[at:])
     assert not outcome.false
@@ -181,7 +181,7 @@ def test_noise_shows_nothing(noise: bytes, piece: int) -> None:
 
 
 @pytest.mark.parametrize("name", [LONG, SHORT])
-def test_undamaged_all_is_shown(name: str) -> None:
+def test_an_undamaged_stream_is_shown_completely(name: str) -> None:
     outcome = play(recording(name))
     assert dict(outcome.seen) == true_pictures(name)
     assert (outcome.refused, outcome.damaged, outcome.lost_bytes) == (0, 0, 0)
@@ -189,7 +189,7 @@ def test_undamaged_all_is_shown(name: str) -> None:
 
 
 def test_mpeg4_as_the_emulated_drone_encodes_it() -> None:
-    """Moving slopes with grain, so that frames end in every number of padding bits: FFmpeg refuses some as they are."""
+    """Moving slopes with grain, so that frames end in every number of padding bits, some of which FFmpeg refuses."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0:360, 0:640]
     encoder = Encoder(MP4_360P, 30, 4000)

@@ -20,7 +20,7 @@ from tests.vehicles.ardrone.video_ports import HOST, Viewer
     ("version", "header_size", "size", "fps"),
     [(1, 68, (320, 240), 15), (2, 64, (640, 360), 30), (2, 68, (640, 360), 30)],
 )
-def test_pictures_come_in_time_and_again_after_a_restart(
+def test_pictures_arrive_in_time_also_after_a_restart(
     version: int, header_size: int, size: tuple[int, int], fps: int
 ) -> None:
     host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
@@ -40,12 +40,12 @@ def test_pictures_come_in_time_and_again_after_a_restart(
         firmware.start()
         viewer.wait(lambda: len(viewer.seen) >= before + 15, "pictures after the restart")
 
-        def period_s() -> float:  # of the last 15; a machine that is busy draws fewer
+        def period_s() -> float:  # of the last 15; a busy machine draws fewer
             return float(np.median(np.diff([taken_ns for _, taken_ns, _ in viewer.seen[before:][-15:]]) / 1e9))
 
         viewer.wait(lambda: period_s() < 6 / fps, "at their rate")
         receiver.stop()
     assert viewer.sizes == {size}
-    assert receiver.counters.damaged <= 2  # what was under way when the drone was switched off, and a stale greeting
+    assert receiver.counters.damaged <= 2  # the one in flight at the switch-off, and a stale first frame
     periods_s = np.diff([taken_ns for _, taken_ns, _ in viewer.seen[before:]]) / 1e9
     assert 0.7 / fps < np.median(periods_s)

@@ -1,4 +1,4 @@
-"""An AR.Drone 2's H.264 handed on as it comes: which pictures, and when."""
+"""An AR.Drone 2's H.264 relayed without decoding: which pictures, and when."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INTRINSICS = Intrinsics(1.0, 2.0, 3.0, 4.0)
 
 
 class Bench:
-    """Frames as the reading thread would see them."""
+    """Frames as seen by the reading thread."""
 
     def __init__(self) -> None:
         self.sink = RecordingSink(record=True)
@@ -28,7 +28,7 @@ class Bench:
         self.stream = EncodedStream(self.sink, lambda: self.camera, lambda *_: INTRINSICS)
 
     def take(self, *numbers: int, **changes: int) -> list[int]:
-        """Frames of the recording by their place; those that are handed on."""
+        """Take frames of the recording by their index; return those that were relayed."""
         handed_on = []
         for n in numbers:
             before = self.sink.calls
@@ -44,7 +44,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_it_begins_with_a_key_and_goes_on_with_what_follows(bench: Bench) -> None:
+def test_it_begins_with_a_key_and_continues_with_the_next_frames(bench: Bench) -> None:
     assert bench.take(13, 14, 15, 16, 17) == [15, 16, 17]
     first, second, _ = bench.sink.pictures
     assert (first.camera, first.data, first.captured_ns) == ("front", frames(LONG)[15].payload, 15)
@@ -53,7 +53,7 @@ def test_it_begins_with_a_key_and_goes_on_with_what_follows(bench: Bench) -> Non
     assert not bench.sink.problems
 
 
-def test_after_a_gap_damage_another_connection_or_camera_the_next_key_is_waited_for(bench: Bench) -> None:
+def test_a_gap_damage_or_another_connection_or_camera_needs_a_new_key(bench: Bench) -> None:
     assert bench.take(0, 1, 3, 4, 15, 16) == [0, 1, 15, 16]
     assert bench.take(17, after_damage=True) == []
     assert bench.take(18, 30, 31) == [30, 31]
@@ -64,7 +64,7 @@ def test_after_a_gap_damage_another_connection_or_camera_the_next_key_is_waited_
     assert {seen.camera for seen in bench.sink.pictures} == {"front", "bottom"}
 
 
-def test_only_h264_pictures_while_somebody_wants_them(bench: Bench) -> None:
+def test_only_h264_pictures_with_a_subscriber(bench: Bench) -> None:
     bench.sink.record = False
     assert bench.take(0, 1) == []
     bench.sink.record = True
@@ -83,7 +83,7 @@ def test_only_h264_pictures_while_somebody_wants_them(bench: Bench) -> None:
 
 @pytest.mark.parametrize(("name", "first"), [(LONG, 0), (SHORT, 3)])
 @pytest.mark.parametrize("looks", [True, False])
-def test_recordings_of_real_drones_are_handed_on_byte_by_byte(name: str, first: int, looks: bool) -> None:
+def test_recordings_of_real_drones_are_relayed_byte_by_byte(name: str, first: int, looks: bool) -> None:
     sink, viewer = RecordingSink(record=True), Viewer()
     viewer.looks = looks
     stream = EncodedStream(sink, lambda: "front", lambda *_: None)
@@ -107,7 +107,7 @@ def test_recordings_of_real_drones_are_handed_on_byte_by_byte(name: str, first: 
         receiver.start()
         assert sink.wait(lambda: len(sink.pictures) == len(expected), PATIENCE_S), len(sink.pictures)
         last = frames(name)[-1].number
-        if looks:  # decoding may leave out some that came too fast, which makes no difference here
+        if looks:  # decoding may drop some that arrive too fast, which does not matter here
             viewer.wait(lambda: viewer.numbers[-1:] == [last], "the last picture")
         receiver.stop()
     assert [seen.data for seen in sink.pictures] == expected

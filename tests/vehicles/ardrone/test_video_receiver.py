@@ -52,7 +52,7 @@ Step = Callable[[int], None]
 
 
 def in_step(name: str, receiver: list[VideoReceiver], before: Step = lambda n: None) -> Callable[[socket.socket], None]:
-    """Sends a recording, each frame once all before it were dealt with; then keeps the connection."""
+    """Send a recording frame by frame, each after all earlier ones were processed; then keep the connection."""
 
     def play(connection: socket.socket) -> None:
         until = threading.Event()
@@ -87,7 +87,7 @@ def test_the_recordings_of_real_drones(name: str, shown: int, waited: int, damag
     assert viewer.numbers == sorted(viewer.numbers)
     assert viewer.sizes == {(640, 360)}
     assert viewer.notices[0] == (VideoEvent.STREAMING, f"{HOST}:{port.port}")
-    # Each frame came at the time of its stamp, but for the very first.
+    # Each frame's capture time is that of its stamp, except for the very first one.
     came_ns = [(stamp - stamps[1]) * MS for stamp in stamps[-shown:]]
     assert [taken_ns for _, taken_ns, _ in viewer.seen][1:] == came_ns[1:]
 
@@ -109,7 +109,7 @@ def test_one_stream_in_small_pieces() -> None:
 
 
 def test_a_slow_viewer_gets_the_newest() -> None:
-    """The first picture is looked at for long: then the newest of those that came meanwhile follows."""
+    """The first picture is displayed for long; the newest one that arrived meanwhile follows."""
     viewer = Viewer()
     viewer.gate.clear()
     clock = ManualClock()
@@ -135,7 +135,7 @@ def test_a_slow_viewer_gets_the_newest() -> None:
     assert (counters.frames, counters.skipped, counters.waited, counters.damaged) == (2, 48, 0, 0)
 
 
-def test_nothing_is_decoded_for_nobody_and_a_picture_is_there_with_the_next_frame_once_somebody_looks() -> None:
+def test_nothing_is_decoded_without_viewers_and_the_next_frame_shows_a_picture_to_a_new_one() -> None:
     viewer = Viewer()
     viewer.looks = False
     clock = ManualClock()
@@ -161,7 +161,7 @@ def test_nothing_is_decoded_for_nobody_and_a_picture_is_there_with_the_next_fram
     assert content == true_pictures(LONG)[number]
 
 
-def test_a_lost_connection_is_made_anew_and_told_once() -> None:
+def test_a_lost_connection_is_restored_and_reported_once() -> None:
     viewer = Viewer()
     lost = list(pieces(LONG)[:10])
     lost[9] = lost[9][:1000]
@@ -170,7 +170,7 @@ def test_a_lost_connection_is_made_anew_and_told_once() -> None:
         connection.sendall(b"".join(lost))
         viewer.wait(lambda: len(viewer.seen) == 9, "nine pictures")
 
-    def again(connection: socket.socket) -> None:  # the numbers go on where they were torn: it must not matter
+    def again(connection: socket.socket) -> None:  # the numbers continue where they were torn, which must not matter
         connection.sendall(b"".join(pieces(LONG)[9:20]))
         connection.recv(1)
 
@@ -185,12 +185,12 @@ def test_a_lost_connection_is_made_anew_and_told_once() -> None:
     assert counters.lost_bytes == 1000
 
 
-def test_a_drone_that_is_not_there_is_told_once_and_waited_for() -> None:
+def test_an_absent_drone_is_reported_once_and_retried() -> None:
     viewer = Viewer()
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
     with receiving(viewer, port):
-        viewer.wait(lambda: viewer.notices, "that it is not there")
+        viewer.wait(lambda: viewer.notices, "the report of its absence")
 
         def play(connection: socket.socket) -> None:
             connection.sendall(b"".join(pieces(LONG)[:3]))
@@ -202,7 +202,7 @@ def test_a_drone_that_is_not_there_is_told_once_and_waited_for() -> None:
     assert viewer.notices[:2] == [(VideoEvent.LOST, refused), (VideoEvent.STREAMING, f"{HOST}:{port}")]
 
 
-def test_a_drone_that_falls_silent_is_given_up_and_tried_again() -> None:
+def test_the_connection_to_a_silent_drone_is_retried() -> None:
     viewer = Viewer()
     clock = ManualClock()
 
@@ -219,7 +219,7 @@ def test_a_drone_that_falls_silent_is_given_up_and_tried_again() -> None:
     assert viewer.texts(VideoEvent.LOST)[0].endswith("no frame came for 3 s")
 
 
-def test_a_codec_that_is_not_decoded_is_told_once() -> None:
+def test_an_unsupported_codec_is_reported_once() -> None:
     viewer = Viewer()
     data = b"".join(piece[:5] + b"\x02" + piece[6:] for piece in pieces(LONG)[:10])
 
@@ -236,7 +236,7 @@ def test_a_codec_that_is_not_decoded_is_told_once() -> None:
     assert not viewer.seen
 
 
-def test_a_viewer_that_fails_is_told_of_and_goes_on() -> None:
+def test_a_failing_viewer_is_reported_and_continues() -> None:
     viewer = Viewer()
     tries = []
 
@@ -257,7 +257,7 @@ def test_a_viewer_that_fails_is_told_of_and_goes_on() -> None:
     assert viewer.texts(VideoEvent.FAULT) == ["RuntimeError('no screen')"]
 
 
-def test_stopping_is_quick_whether_the_drone_is_there_or_not_and_can_be_repeated() -> None:
+def test_stopping_is_quick_with_or_without_a_drone_and_repeatable() -> None:
     for play in (lambda connection: connection.recv(1), lambda connection: None):
         viewer = Viewer()
         with TcpPort(play) as port:
@@ -268,7 +268,7 @@ def test_stopping_is_quick_whether_the_drone_is_there_or_not_and_can_be_repeated
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("ardrone-")]
 
 
-def test_what_cannot_work_is_said() -> None:
+def test_misuse_is_refused() -> None:
     viewer = Viewer()
     with pytest.raises(UsageError, match=r"there is .* not 3"):
         receiver_of(viewer, 1, version=3)
@@ -276,7 +276,7 @@ def test_what_cannot_work_is_said() -> None:
         receiver.start()
 
 
-def test_without_pyav_it_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyav_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [
         name
         for name in sys.modules

@@ -1,4 +1,4 @@
-"""The video of an AR.Drone 1, which comes as datagrams: pictures from the encoder of the emulated drone."""
+"""The video of an AR.Drone 1, which arrives as datagrams: pictures from the emulated drone's encoder."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def packets() -> list[bytes]:
 
 
 class UdpPort:
-    """Waits for somebody to ask, as the drone does."""
+    """Waits for a request, as the drone does."""
 
     def __init__(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -58,7 +58,7 @@ def port() -> Iterator[UdpPort]:
     port.socket.close()
 
 
-def test_it_is_woken_and_its_pictures_are_shown(port: UdpPort, packets: list[bytes]) -> None:
+def test_it_is_woken_up_and_its_pictures_are_shown(port: UdpPort, packets: list[bytes]) -> None:
     viewer, clock = Viewer(), ManualClock()
     receiver = receiver_of(viewer, port.port, version=1, clock=clock)
     receiver.start()
@@ -79,7 +79,7 @@ def test_it_is_woken_and_its_pictures_are_shown(port: UdpPort, packets: list[byt
     assert (counters.received, counters.frames, counters.damaged) == (8, 8, 0)
 
 
-def test_it_is_asked_again_and_again(port: UdpPort) -> None:
+def test_the_request_is_repeated(port: UdpPort) -> None:
     viewer, clock = Viewer(), ManualClock()
     receiver = receiver_of(viewer, port.port, version=1, clock=clock)
     receiver.start()
@@ -88,14 +88,14 @@ def test_it_is_asked_again_and_again(port: UdpPort) -> None:
             assert port.wait() == WAKE
             clock.advance(0.6)
         clock.advance(5.0)
-        viewer.wait(lambda: viewer.texts(VideoEvent.LOST), "that nothing came")
+        viewer.wait(lambda: viewer.texts(VideoEvent.LOST), "the report of silence")
         assert port.wait() == WAKE
     finally:
         receiver.stop()
     assert viewer.texts(VideoEvent.LOST) == [f"{HOST}:{port.port}: no frame came for 3 s"]
 
 
-def test_what_others_send_is_not_taken(port: UdpPort, packets: list[bytes]) -> None:
+def test_datagrams_of_others_are_ignored(port: UdpPort, packets: list[bytes]) -> None:
     viewer = Viewer()
     receiver = receiver_of(viewer, port.port, version=1)
     receiver.start()
@@ -138,19 +138,19 @@ def through(packets: list[bytes]) -> tuple[list[int], UvlcVideo]:
     return shown, decoder
 
 
-def test_late_and_repeated_pictures_are_left_out(packets: list[bytes]) -> None:
+def test_late_and_repeated_pictures_are_dropped(packets: list[bytes]) -> None:
     shown, decoder = through([packets[n - 1] for n in (1, 3, 2, 3, 4, 4, 6, 5)])
     assert shown == [1, 3, 4, 6]
     assert (decoder.waited, decoder.damaged) == (4, 0)
 
 
-def test_a_drone_that_was_started_again_counts_anew() -> None:
+def test_a_restarted_drone_starts_a_new_count() -> None:
     far = encode(picture(1), 5000)
     shown, _ = through([far, encode(picture(2), 1), far])
     assert shown == [5000, 1, 5000]
 
 
-def test_a_drone_that_was_started_again_soon_counts_anew_after_a_few_pictures(packets: list[bytes]) -> None:
+def test_a_quickly_restarted_drone_starts_a_new_count_after_a_few_pictures(packets: list[bytes]) -> None:
     shown, decoder = through([encode(picture(1), 40), *packets])
     assert shown == [40, 4, 5, 6, 7, 8]
     assert decoder.waited == 3
@@ -168,6 +168,6 @@ def test_truncated_datagrams_show_nothing_and_are_counted(draw: st.DataObject) -
 @given(st.binary(min_size=1, max_size=500))
 @example(b"\0\0\1")
 def test_noise_shows_nothing_and_is_counted(noise: bytes) -> None:
-    assume(not is_p264(noise))  # which is refused with words
+    assume(not is_p264(noise))  # which is refused with a message
     shown, decoder = through([noise])
     assert (shown, decoder.damaged) == ([], 1)

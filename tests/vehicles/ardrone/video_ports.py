@@ -1,4 +1,4 @@
-"""Stand-ins for the drone's video port, and somebody who looks at what is shown."""
+"""Stand-ins for the drone's video port, and a viewer of the pictures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def recording(name: str) -> bytes:
 
 @functools.cache
 def pieces(name: str) -> tuple[bytes, ...]:
-    """The recording's frames with their headers."""
+    """Return the recording's frames with their headers."""
     data = recording(name)
     starts = [0]
     while (start := data.find(b"PaVE", starts[-1] + 1)) > 0:
@@ -46,7 +46,7 @@ def frames(name: str) -> tuple[PaveFrame, ...]:
 
 @functools.cache
 def true_pictures(name: str) -> dict[int, Digest]:
-    """By number, what a plain decoder makes of the undamaged recording from its first key frame on."""
+    """Return a plain decoder's pictures of the undamaged recording from its first key frame on, by number."""
     context = av.CodecContext.create("h264", "r")
     context.flags |= av.codec.context.Flags.low_delay
     context.thread_count = 1
@@ -64,7 +64,7 @@ def digest(data: bytes) -> Digest:
 
 
 class Viewer:
-    """Looks, unless told otherwise, and notes what it sees."""
+    """Displays pictures, unless told otherwise, and records what it sees."""
 
     def __init__(self) -> None:
         self.looks = True
@@ -101,7 +101,7 @@ class Viewer:
 
 
 def receiver_of(viewer: Viewer, port: int, version: int = 2, clock: ManualClock | None = None) -> VideoReceiver:
-    """With a clock that stands still, so that nothing is ever late, unless another is given."""
+    """Return a receiver, by default with a stopped clock, so that no frame is ever late."""
     return VideoReceiver(
         HOST,
         port,
@@ -114,7 +114,7 @@ def receiver_of(viewer: Viewer, port: int, version: int = 2, clock: ManualClock 
 
 
 class TcpPort:
-    """Listens, and plays one script for each connection, in turn; the last one again for all further ones."""
+    """Listens, and plays one script per connection, in turn; the last one for all further connections."""
 
     def __init__(self, *scripts: Callable[[socket.socket], None], port: int = 0) -> None:
         self._scripts = scripts

@@ -1,4 +1,4 @@
-"""A person followed behind emulated firmware: video that was encoded and is late, and a proxy of its own."""
+"""Following a person with emulated firmware: encoded, delayed video and a separate proxy."""
 
 from __future__ import annotations
 

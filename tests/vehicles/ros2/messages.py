@@ -1,4 +1,4 @@
-"""What a robot publishes."""
+"""Messages of a robot."""
 
 from __future__ import annotations
 

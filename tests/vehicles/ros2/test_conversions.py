@@ -68,14 +68,14 @@ def test_quaternions_are_the_rotation_of_the_angles(roll: float, pitch: float, y
 @pytest.mark.parametrize(
     "rows", [(1, 0, 0, 0, -1, 0, 0, 0, -1), (-1, 0, 0, 0, 1, 0, 0, 0, -1), (-1, 0, 0, 0, -1, 0, 0, 0, 1)]
 )
-def test_half_turns_are_rotations_too(rows: tuple[float, ...]) -> None:
+def test_half_turns_are_also_rotations(rows: tuple[float, ...]) -> None:
     rotation = rotation_of(quaternion_of(rows))
     assert rotation is not None
     assert rotation.ravel() == pytest.approx(rows)
 
 
 @pytest.mark.parametrize("quaternion", [(0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (math.inf, 0.0, 0.0, 1.0)])
-def test_what_is_no_quaternion_gives_no_angles(quaternion: tuple[float, float, float, float]) -> None:
+def test_an_invalid_quaternion_gives_no_angles(quaternion: tuple[float, float, float, float]) -> None:
     assert euler_of(quaternion) is None
 
 
@@ -92,7 +92,7 @@ def test_a_body_with_its_nose_down_flies_up_in_its_own_axes_when_it_flies_level(
     assert up == pytest.approx(math.sin(math.radians(30.0)))
 
 
-def test_what_is_not_known_is_a_covariance_of_minus_one() -> None:
+def test_unknown_values_have_a_covariance_of_minus_one() -> None:
     assert covariance(3, known=False) == [NOT_KNOWN, *[0.0] * 8]
     assert covariance(2, variance=4.0) == [4.0, 0.0, 0.0, 4.0]
 
@@ -101,9 +101,9 @@ def test_stamps_keep_their_distance_while_the_clocks_do() -> None:
     clocks = ClockMap()
     assert clocks.to_ros(5, 10, 0) is None  # ROS time is not known yet
     assert clocks.to_ros(1000 * MS, 1010 * MS, 5010 * MS) == 5000 * MS
-    assert clocks.to_ros(1030 * MS, 1040 * MS, 5040 * MS + 300_000) == 5030 * MS  # 0.3 ms off: the same difference
+    assert clocks.to_ros(1030 * MS, 1040 * MS, 5040 * MS + 300_000) == 5030 * MS  # 0.3 ms off: the same offset
     assert clocks.to_ros(1060 * MS, 1070 * MS, 9070 * MS) == 9060 * MS  # the system's clock was set
-    assert clocks.to_ros(0, 9000 * MS, 1 * MS) is None  # before the beginning of a simulation
+    assert clocks.to_ros(0, 9000 * MS, 1 * MS) is None  # before the start of a simulation
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_intrinsics_go_both_ways(intrinsics: Intrinsics, model: str, many: int) 
     assert back.distortion[: len(intrinsics.distortion)] == intrinsics.distortion
 
 
-def test_a_camera_without_intrinsics_is_told_as_uncalibrated() -> None:
+def test_a_camera_without_intrinsics_is_reported_as_uncalibrated() -> None:
     told = camera_model(None)
     assert (told.model, told.d, told.k[0]) == ("", [], 0.0)
     assert intrinsics_of(SimpleNamespace(distortion_model="", d=[], k=told.k)) is None
@@ -157,7 +157,7 @@ def test_pixels_with_transparency_become_blue_green_red() -> None:
 
 
 def test_other_pixels_are_refused() -> None:
-    with pytest.raises(DecodeError, match="encoding '32FC1' are not read, only bgr8"):
+    with pytest.raises(DecodeError, match="encoding '32FC1' are not supported, only bgr8"):
         pixels_of(image("32FC1", 4))
     short = image("bgr8", 3)
     short.height = 3
@@ -166,7 +166,7 @@ def test_other_pixels_are_refused() -> None:
 
 
 def packed(encoding: str, rows: np.ndarray[Any, Any], width: int, height: int, padding: int = 4) -> SimpleNamespace:
-    """An image of these bytes, with padding at the end of each row."""
+    """Return an image of these bytes, with padding at the end of each row."""
     padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=255)
     return SimpleNamespace(
         encoding=encoding, height=height, width=width, step=padded.shape[1], data=padded.tobytes(), is_bigendian=0
@@ -174,7 +174,7 @@ def packed(encoding: str, rows: np.ndarray[Any, Any], width: int, height: int, p
 
 
 def as_camera(encoding: str, picture: np.ndarray[Any, Any]) -> SimpleNamespace:
-    """A BGR picture as a camera would send it."""
+    """Return a BGR picture in a camera's encoding."""
     height, width = picture.shape[:2]
     blue, green, red = (picture[..., n].astype(np.uint8) for n in range(3))
     if encoding.startswith("bayer_"):
@@ -203,8 +203,8 @@ PLAIN = {"bgr8", "8UC3", "rgb8", "mono8", "8UC1", "bgra8", "8UC4", "rgba8", "mon
 
 
 @pytest.mark.parametrize("encoding", sorted({*ENCODINGS} - PLAIN))
-def test_what_cameras_send_by_default_becomes_blue_green_red(encoding: str) -> None:
-    """``yuv422_yuy2`` is what usb_cam sends if nobody says otherwise."""
+def test_usual_camera_encodings_become_blue_green_red(encoding: str) -> None:
+    """``yuv422_yuy2`` is the default of usb_cam."""
     picture = np.zeros((24, 32, 3), np.uint8)
     picture[:12, :16], picture[:12, 16:], picture[12:, :16] = (200, 60, 40), (40, 200, 60), (60, 40, 200)
     pixels, read_as = pixels_of(as_camera(encoding, picture))
@@ -226,7 +226,7 @@ def test_sixteen_bits_of_grey_become_eight() -> None:
     assert pixels_of(big)[0].tolist() == pixels.tolist()
 
 
-def test_an_image_that_can_not_be_halved_is_refused() -> None:
+def test_an_image_that_cannot_be_halved_is_refused() -> None:
     with pytest.raises(DecodeError, match="can't be converted"):
         pixels_of(packed("nv12", np.zeros((5, 3), np.uint8), 3, 3))
 
@@ -243,8 +243,8 @@ def test_an_image_that_can_not_be_halved_is_refused() -> None:
         ("", [], ()),
     ],
 )
-def test_coefficients_are_as_many_as_opencv_takes(model: str, given: list[float], kept: tuple[float, ...]) -> None:
-    """With 2, 6 or 7 of them the first use raised in the application's own callback."""
+def test_the_number_of_coefficients_suits_opencv(model: str, given: list[float], kept: tuple[float, ...]) -> None:
+    """With 2, 6 or 7 of them, the first use once raised in the application's own callback."""
     k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
     found = intrinsics_of(SimpleNamespace(distortion_model=model, d=given, k=k))
     assert found is not None
@@ -253,14 +253,14 @@ def test_coefficients_are_as_many_as_opencv_takes(model: str, given: list[float]
 
 
 @pytest.mark.parametrize(("model", "given"), [("equidistant", [0.1] * 5), ("omni", [0.1]), ("plumb_bob", [0.1] * 15)])
-def test_a_lens_that_is_not_known_is_refused_when_it_is_told(model: str, given: list[float]) -> None:
+def test_an_unknown_lens_is_refused_on_arrival(model: str, given: list[float]) -> None:
     k = [300.0, 0.0, 159.5, 0.0, 300.0, 119.5, 0.0, 0.0, 1.0]
     with pytest.raises(DecodeError, match=model):
         intrinsics_of(SimpleNamespace(distortion_model=model, d=given, k=k))
 
 
 def test_transforms_as_the_bytes_of_their_type() -> None:
-    """As rclpy 9.1.2 wrote and read them; what rosbags reads is tested in ``third_party/test_ros2.py``."""
+    """As written and read by rclpy 9.1.2; ``third_party/test_ros2.py`` reads them with rosbags."""
     packed = encode_transforms([Transform(5 * 10**9 + 6, "odom", "base_link", (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))])
     head = b"\x00\x01\x00\x00" + struct.pack("<IiI", 1, 5, 6)
     texts = struct.pack("<I", 5) + b"odom\0\0\0\0" + struct.pack("<I", 10) + b"base_link\0" + b"\0\0" * 1

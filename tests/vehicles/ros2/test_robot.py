@@ -42,9 +42,9 @@ def test_names_are_below_the_namespace_unless_they_begin_with_a_slash() -> None:
 @pytest.mark.parametrize(
     ("address", "reason"),
     [
-        ("ros2://1robot", "is no namespace"),
+        ("ros2://1robot", "is not a namespace"),
         ("ros2://robot?image=front-image", "option image is 'front-image'"),
-        ("ros2://robot?image=&odom=", "give one of them"),
+        ("ros2://robot?image=&odom=", "name at least one"),
         ("ros2://robot?takeoff=takeoff&ground=1", "does not leave the ground"),
         ("ros2://robot?takeoff=takeoff&cmd_vel=", "it needs cmd_vel"),
         ("ros2://robot?camera=a/b", "option camera"),
@@ -53,12 +53,12 @@ def test_names_are_below_the_namespace_unless_they_begin_with_a_slash() -> None:
         ("ros2://robot?takof=x", "did you mean 'takeoff'"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_the_reason(address: str, reason: str) -> None:
+def test_invalid_addresses_are_refused_with_the_reason(address: str, reason: str) -> None:
     with pytest.raises((UsageError, UnknownNameError), match=reason):
         Ros2Driver(parse_uri(address))
 
 
-def test_capabilities_are_what_the_address_names() -> None:
+def test_capabilities_follow_from_the_address() -> None:
     plain = Ros2Driver(parse_uri("ros2://robot")).capabilities()
     assert plain.actions == {"idle", "velocity"}
     assert plain.cameras[0].rotation is not None
@@ -71,7 +71,7 @@ def test_capabilities_are_what_the_address_names() -> None:
     assert options("ros2://robot?image=").capabilities().cameras == ()
 
 
-def test_a_driver_that_is_not_open_commands_nothing() -> None:
+def test_an_unopened_driver_refuses_commands() -> None:
     driver = Ros2Driver(parse_uri(SERVED))
     with pytest.raises(DriverError, match="is not open"):
         driver.apply(Land())
@@ -81,7 +81,7 @@ def test_a_driver_that_is_not_open_commands_nothing() -> None:
     driver.close()
 
 
-def test_without_rclpy_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_rclpy_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rclpy", None)
     with pytest.raises(MissingExtraError, match=r"skyloop install ros"):
         Ros2Driver(parse_uri(SERVED)).open(RecordingSink())
@@ -100,7 +100,7 @@ def test_odometry_becomes_state_in_levelled_axes() -> None:
     assert "altitude_m" not in state_of(odometry(0), ground=True)
 
 
-def test_what_is_not_finite_is_not_known() -> None:
+def test_values_that_are_not_finite_are_unknown() -> None:
     bad = odometry(0)
     bad.pose.pose.position.x = math.nan
     bad.twist.twist.linear.y = math.inf
@@ -122,7 +122,7 @@ def test_stamps_of_the_systems_clock_and_of_another() -> None:
     now_ns = 10 * 10**9
     assert clock.captured_ns(EPOCH_NS - 30_000_000, now_ns, EPOCH_NS) == now_ns - 30_000_000
     assert clock.captured_ns(EPOCH_NS - 60_000_000, now_ns + 1, EPOCH_NS) == now_ns - 30_000_000  # never backwards
-    assert clock.captured_ns(0, now_ns + 2, EPOCH_NS) == now_ns + 2  # no stamp: when it came
+    assert clock.captured_ns(0, now_ns + 2, EPOCH_NS) == now_ns + 2  # no stamp: its arrival
     simulated = CaptureClock()
     assert simulated.captured_ns(5 * 10**9, now_ns, EPOCH_NS) == now_ns
     late_ns = now_ns + 30_000_000 + 8_000_000  # 30 ms later by its stamp, 38 ms by its arrival
@@ -133,7 +133,7 @@ def test_stamps_of_the_systems_clock_and_of_another() -> None:
 
 
 class FakeRobot:
-    """Notes what it is sent; services answer when the test wants."""
+    """Records sent velocities; services answer when the test wants."""
 
     def __init__(self) -> None:
         self.sent: list[Velocity] = []
@@ -149,7 +149,7 @@ class FakeRobot:
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
         if not self.offers:
-            raise DriverError(f"nobody offers the service {service}")
+            raise DriverError(f"no node offers the service {service}")
         self.called.append(service)
         self.answer = answered
 
@@ -180,27 +180,27 @@ def test_a_flight_by_services_and_velocities() -> None:
     rig = Rig()
     assert rig.tell() is FlightState.LANDED
     rig.session.command(Takeoff())
-    rig.session.command(Takeoff(), new=False)  # under way: not called once more
+    rig.session.command(Takeoff(), new=False)  # under way: not called again
     assert rig.robot.called == ["/robot/takeoff"]
     assert rig.tell(z=0.05) is FlightState.TAKING_OFF
     rig.answer(True)
     assert rig.tell(z=1.0) is FlightState.HOVERING
-    rig.session.command(Takeoff(), new=False)  # it is up
+    rig.session.command(Takeoff(), new=False)  # it is in the air
     rig.session.command(Velocity(forward=0.5))
     assert rig.tell(z=1.0) is FlightState.FLYING
     rig.session.tick()
     assert rig.robot.sent == [Velocity(forward=0.5)] * 2
     rig.session.command(Land())
     rig.session.tick()
-    assert len(rig.robot.sent) == 2  # a landing robot is left to itself
+    assert len(rig.robot.sent) == 2  # a landing robot gets no velocities
     assert rig.tell(z=0.5) is FlightState.LANDING
     rig.answer(True)
     assert rig.tell() is FlightState.LANDED
     rig.session.command(Land())
-    assert rig.robot.called == ["/robot/takeoff", "/robot/land"]  # it stands already
+    assert rig.robot.called == ["/robot/takeoff", "/robot/land"]  # it is already on the ground
 
 
-def test_a_refused_take_off_is_told_and_over() -> None:
+def test_a_refused_take_off_is_reported_and_over() -> None:
     rig = Rig()
     rig.tell()
     rig.session.command(Takeoff())
@@ -208,14 +208,14 @@ def test_a_refused_take_off_is_told_and_over() -> None:
     assert rig.tell() is FlightState.LANDED
     assert "refused /robot/takeoff: propellers blocked" in rig.sink.events[-1].text
     rig.robot.offers = False
-    with pytest.raises(DriverError, match="nobody offers"):
+    with pytest.raises(DriverError, match="no node offers"):
         rig.session.command(Takeoff())
     assert rig.tell() is FlightState.LANDED
 
 
 @pytest.mark.parametrize("answer", ["no service", "refused", "none"])
-def test_a_robot_that_is_not_landed_stops(answer: str) -> None:
-    """One without a watchdog of its own went on with the velocity that it was sent last, and got no other."""
+def test_a_robot_whose_landing_fails_stops(answer: str) -> None:
+    """A robot without a watchdog once kept its last velocity, as it got no other."""
     rig = Rig()
     rig.tell(z=1.0)
     rig.session.command(Velocity(forward=0.5))
@@ -223,7 +223,7 @@ def test_a_robot_that_is_not_landed_stops(answer: str) -> None:
     if rig.robot.offers:
         rig.session.command(Land())
     else:
-        with pytest.raises(DriverError, match="nobody offers"):
+        with pytest.raises(DriverError, match="no node offers"):
             rig.session.command(Land())
     if answer == "refused":
         rig.answer(False, "not now")
@@ -234,8 +234,8 @@ def test_a_robot_that_is_not_landed_stops(answer: str) -> None:
     assert rig.robot.sent[-1] == Velocity()
 
 
-def test_a_refused_take_off_is_not_asked_for_again_by_its_repeats() -> None:
-    """Whoever frees the propellers meanwhile must not be under a robot that takes off."""
+def test_repeats_of_a_refused_take_off_do_not_call_the_service() -> None:
+    """A person who frees the propellers meanwhile must not be below a robot that takes off."""
     rig = Rig()
     rig.tell()
     rig.session.command(Takeoff())
@@ -249,8 +249,8 @@ def test_a_refused_take_off_is_not_asked_for_again_by_its_repeats() -> None:
     assert rig.robot.called == ["/robot/takeoff"] * 2
 
 
-def test_a_take_off_that_succeeded_and_does_not_show_yet_can_be_withdrawn() -> None:
-    """A service that answers before the robot rises: it stands by its odometry, and is landed all the same."""
+def test_a_successful_take_off_can_be_withdrawn_before_it_shows() -> None:
+    """The service answers before the robot rises: by its odometry it is on the ground, and still has to be landed."""
     rig = Rig()
     for _ in range(2):
         rig.tell()
@@ -270,7 +270,7 @@ def test_a_take_off_that_succeeded_and_does_not_show_yet_can_be_withdrawn() -> N
     assert rig.robot.called == ["/robot/takeoff", "/robot/land"]
 
 
-def test_a_service_that_never_answers_is_waited_for_no_longer() -> None:
+def test_the_wait_for_a_services_answer_is_limited() -> None:
     rig = Rig()
     rig.tell()
     rig.session.command(Takeoff())
@@ -279,8 +279,8 @@ def test_a_service_that_never_answers_is_waited_for_no_longer() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
-def test_no_take_off_waits_for_a_robot_that_is_not_heard() -> None:
-    """ROS delivers a call of a service when the robot runs again: it took off then, by itself."""
+def test_a_take_off_does_not_wait_for_a_silent_robot() -> None:
+    """ROS delivers the call when the robot runs again, and it would take off then."""
     rig = Rig()
     rig.tell()
     rig.clock.advance(rig.session._options.timeout_s + 0.1)
@@ -292,7 +292,7 @@ def test_no_take_off_waits_for_a_robot_that_is_not_heard() -> None:
     assert rig.robot.called == ["/robot/takeoff"]
 
 
-def test_a_take_off_without_an_answer_is_not_called_again_by_its_repeats() -> None:
+def test_repeats_of_an_unanswered_take_off_do_not_call_the_service() -> None:
     rig = Rig()
     rig.tell()
     rig.session.command(Takeoff())
@@ -303,7 +303,7 @@ def test_a_take_off_without_an_answer_is_not_called_again_by_its_repeats() -> No
     assert rig.robot.called == ["/robot/takeoff"]
 
 
-def test_a_robot_of_which_no_images_come_any_more_is_stopped() -> None:
+def test_a_robot_without_images_is_stopped() -> None:
     rig = Rig(f"{SERVED}&odom=")
     rig.session.on_image(image(rig.system()))
     rig.session.command(Velocity(forward=0.5))
@@ -314,7 +314,7 @@ def test_a_robot_of_which_no_images_come_any_more_is_stopped() -> None:
     assert rig.robot.sent[-1] == Velocity()
 
 
-def test_without_odometry_the_services_tell_whether_it_flies() -> None:
+def test_without_odometry_the_services_show_whether_it_flies() -> None:
     rig = Rig(f"{SERVED}&odom=")
     rig.session.on_image(image(rig.system()))
     rig.clock.advance(0.2)
@@ -335,12 +335,12 @@ def test_late_odometry_after_images_alone_does_not_run_backwards() -> None:
     rig.session.tick()
     rig.session.on_odometry(odometry(rig.system() - 300_000_000))  # captured before the image
     rig.clock.advance(0.2)
-    rig.session.tick()  # odometry that is late is not made up
+    rig.session.tick()  # missing odometry is not invented
     assert rig.sink.feedback_count == 2
     assert not rig.sink.problems
 
 
-def test_a_robot_on_the_ground_is_driven_between_take_off_and_landing() -> None:
+def test_a_ground_robot_drives_between_take_off_and_landing() -> None:
     rig = Rig("ros2://robot?ground=1")
     assert rig.tell() is FlightState.LANDED
     rig.session.command(Takeoff())
@@ -354,7 +354,7 @@ def test_a_robot_on_the_ground_is_driven_between_take_off_and_landing() -> None:
     assert rig.robot.called == []
 
 
-def test_closing_stops_what_moves() -> None:
+def test_closing_stops_the_robot() -> None:
     rig = Rig()
     rig.session.command(Velocity(left=0.3))
     rig.session.close()
@@ -373,29 +373,29 @@ def test_the_link_is_lost_with_a_reason_and_found_again() -> None:
     rig.session.tick()
     rig.session.tick()
     assert [state for state, _ in rig.sink.links] == [LinkState.LOST]
-    assert "nothing came on /robot/odom and /robot/image_raw for 1.5 s" in rig.sink.links[0][1]
+    assert "no messages on /robot/odom and /robot/image_raw for 1.5 s" in rig.sink.links[0][1]
     assert "ROS_DOMAIN_ID" in rig.sink.remedy
     rig.tell()
     assert rig.sink.link_state is LinkState.UP
     assert not rig.sink.problems
 
 
-def test_a_robot_whose_services_nobody_offers_is_degraded() -> None:
+def test_a_robot_without_its_services_is_degraded() -> None:
     rig = Rig()
     rig.robot.offers = False
     rig.tell()
-    assert rig.sink.links == []  # they may be found a little later than its topics
+    assert rig.sink.links == []  # they may be discovered a little later than its topics
     rig.clock.advance(6.0)
     rig.tell()
     rig.tell()
-    assert rig.sink.links == [(LinkState.DEGRADED, "nobody offers the service /robot/takeoff")]
+    assert rig.sink.links == [(LinkState.DEGRADED, "no node offers the service /robot/takeoff")]
     assert "correct its name" in rig.sink.remedy
     rig.robot.offers = True
     rig.tell()
     assert rig.sink.link_state is LinkState.UP
 
 
-def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> None:
+def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_reported_once() -> None:
     rig = Rig()
     info = Message(k=[9.0, 0.0, 2.0, 0.0, 9.0, 1.0, 0.0, 0.0, 1.0], d=[0.0] * 5, distortion_model="plumb_bob")
     rig.session.on_info(info)
@@ -409,11 +409,11 @@ def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> 
     for _ in range(2):
         rig.session.on_info(info)
     assert [event.text for event in rig.sink.events] == [
-        "the camera's pixels have a skew of 0.4 px, which is left out: calibrate without it"
+        "the camera's pixels have a skew of 0.4 px, which is ignored: calibrate without it"
     ]
     info.distortion_model, info.d = "equidistant", [0.1] * 8
     rig.session.on_info(info)
-    assert "intrinsics can't be used: a lens of the model 'equidistant' has 4" in rig.sink.events[-1].text
+    assert "intrinsics can't be used: lens model 'equidistant' has at most 4" in rig.sink.events[-1].text
     rig.session.on_image(image(rig.system()))
     assert rig.sink.frames[-1].intrinsics is None, "and no exception in the application"
     rig.sink.events.clear()
@@ -435,7 +435,7 @@ def test_frames_have_the_cameras_intrinsics_and_other_sizes_are_named_once() -> 
     assert rig.sink.newest.battery == 0.7
 
 
-def test_jpeg_is_handed_on_as_it_came() -> None:
+def test_jpeg_is_passed_on_unchanged() -> None:
     cv2 = pytest.importorskip("cv2")
     rig = Rig(f"{SERVED}&compressed=1")
     _, encoded = cv2.imencode(".jpg", np.zeros((2, 4, 3), np.uint8))
@@ -444,11 +444,11 @@ def test_jpeg_is_handed_on_as_it_came() -> None:
     assert frame.encoding is Encoding.JPEG
     rig.session.on_image(Message(header=stamp(rig.system()), format="png", data=b"\x89PNG"))
     rig.session.on_image(Message(header=stamp(rig.system()), format="jpeg", data=b"\xff\xd8\x00"))
-    assert ["'png'" in rig.sink.events[0].text, "how large" in rig.sink.events[1].text] == [True, True]
+    assert ["'png'" in rig.sink.events[0].text, "its size" in rig.sink.events[1].text] == [True, True]
     assert not rig.sink.problems
 
 
-def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -> None:
+def test_the_end_of_odometry_is_reported_and_ends_the_velocity() -> None:
     rig = Rig()
     rig.tell(z=1.0)
     rig.session.command(Velocity(forward=0.5))
@@ -457,7 +457,7 @@ def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -
         rig.session.on_image(image(rig.system()))
         rig.session.tick()
     assert rig.sink.links[-1][0] is LinkState.DEGRADED
-    assert "nothing came on /robot/odom for 1." in rig.sink.links[-1][1]
+    assert "no messages on /robot/odom for 1." in rig.sink.links[-1][1]
     assert len(rig.sink.links) == 2, "told once"
     assert rig.robot.sent[-1] == Velocity()
     assert sum(each != Velocity() for each in rig.robot.sent) < 25
@@ -467,7 +467,7 @@ def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -
     rig.session.command(Velocity(up=-0.3))
     for _ in range(3):
         rig.session.tick()
-    assert rig.robot.sent[-1] == Velocity(up=-0.3), "who still commands is obeyed, as it may be the way down"
+    assert rig.robot.sent[-1] == Velocity(up=-0.3), "further commands are obeyed, as they may land it"
     rig.session.command(Land())
     assert rig.robot.called == ["/robot/land"]
     rig.answer(True)
@@ -476,7 +476,7 @@ def test_odometry_that_ends_while_images_go_on_is_told_and_ends_the_velocity() -
 
 
 def test_a_robot_with_planar_odometry_is_landed() -> None:
-    """Its z is always 0: only its services tell whether it flies."""
+    """Its z is always 0: only its services show whether it flies."""
     rig = Rig()
     rig.tell()
     rig.session.command(Takeoff())
@@ -489,8 +489,8 @@ def test_a_robot_with_planar_odometry_is_landed() -> None:
     assert rig.tell() is FlightState.LANDED
 
 
-def test_a_robot_of_which_nothing_shows_whether_it_flies_is_landed() -> None:
-    """It may have been up before the proxy was started; its odometry was never seen above the ground."""
+def test_a_robot_in_an_unknown_state_is_landed() -> None:
+    """It may have been in the air before the proxy started; its odometry was never above the ground."""
     rig = Rig()
     rig.tell()
     rig.session.command(Land(), new=False)

@@ -1,4 +1,4 @@
-"""The driver's node: topics, services and their answers, with an rclpy that a test delivers to."""
+"""The driver's node: topics, services and their answers, with an rclpy that tests deliver messages to."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.vehicles.ros2.messages import image, odometry
 
 @pytest.fixture(autouse=True)
 def alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")  # nothing is written for this process
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")  # no profile is written for this process
 
 
 def opened(fake: Fake, sink: RecordingSink, options: str = "takeoff=takeoff&land=land") -> tuple[Ros2Driver, Node]:
@@ -27,7 +27,7 @@ def opened(fake: Fake, sink: RecordingSink, options: str = "takeoff=takeoff&land
     return driver, fake.nodes["skyloop_driver"]
 
 
-def test_images_are_subscribed_to_while_they_are_wanted(rclpy: Fake) -> None:
+def test_images_are_subscribed_to_while_needed(rclpy: Fake) -> None:
     sink = RecordingSink(watch=set())
     driver, node = opened(rclpy, sink)
     assert set(node.subscriptions) == {"/robot/odom", "/robot/battery_state", "/robot/camera_info"}
@@ -44,7 +44,7 @@ def test_images_are_subscribed_to_while_they_are_wanted(rclpy: Fake) -> None:
     assert node.destroyed
 
 
-def test_without_odometry_images_show_that_it_is_there(rclpy: Fake) -> None:
+def test_without_odometry_images_show_that_the_robot_is_there(rclpy: Fake) -> None:
     sink = RecordingSink(watch=set())
     driver, node = opened(rclpy, sink, "odom=&compressed=1")
     node.subscriptions["/robot/image_raw"](image(0))
@@ -72,7 +72,7 @@ def test_services_and_their_answers(rclpy: Fake) -> None:
     driver, node = opened(rclpy, sink)
     takeoff = node.clients["/robot/takeoff"]
     takeoff.ready = False
-    with pytest.raises(DriverError, match="nobody offers the service /robot/takeoff"):
+    with pytest.raises(DriverError, match="no node offers the service /robot/takeoff"):
         driver.apply(Takeoff())
     takeoff.ready = True
     driver.apply(Takeoff())

@@ -1,4 +1,4 @@
-"""``sim://?autopilot=…``: real firmware flies the simulated drone. Stand-ins for its programs are enough here."""
+"""``sim://?autopilot=…``: real firmware flies the simulated drone. Stand-ins for its programs suffice here."""
 
 from __future__ import annotations
 
@@ -76,18 +76,18 @@ def happened(sink: RecordingSink, reason: str, times: int = 1) -> bool:
     [
         ("sim://?autopilot=ardupilo", "no autopilot of sim:// named 'ardupilo'; did you mean 'ardupilot'"),
         ("sim://?autopilot=px4&vehicle=ardrone", "firmware needs a vehicle with rotors"),
-        ("sim://?autopilot=betaflight&speed=2", "Betaflight's clock is the computer's: speed is 1 with it, not 2"),
+        ("sim://?autopilot=betaflight&speed=2", "Betaflight uses the computer's clock: speed must be 1, not 2"),
         ("sim://?autopilot=px4&native=attitude", "native is an option of the built-in autopilot, and px4 flies"),
         ("sim://?autopilot_folder=/tmp", "give autopilot=… as well"),
         ("sim://?autopilot=ardupilot&takeof_altitude=2", "no option of mavlink:// named 'takeof_altitude'"),
     ],
 )
-def test_an_address_that_makes_no_sense_is_refused(uri: str, message: str) -> None:
+def test_invalid_addresses_are_refused(uri: str, message: str) -> None:
     with pytest.raises((UsageError, UnknownNameError), match=message):
         make_driver(uri)
 
 
-def test_the_vehicle_is_one_that_the_firmware_is_for() -> None:
+def test_the_vehicle_suits_the_firmware() -> None:
     for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER)):
         options = options_of(parse_uri(f"sim://?autopilot={autopilot}"))
         assert options.parameters == vehicle
@@ -95,20 +95,20 @@ def test_the_vehicle_is_one_that_the_firmware_is_for() -> None:
     assert options_of(parse_uri("sim://?autopilot=px4&vehicle=crazyflie")).parameters == CRAZYFLIE
 
 
-def test_what_it_can_do_is_what_the_firmware_s_driver_can_do() -> None:
+def test_its_capabilities_are_those_of_the_firmwares_driver() -> None:
     driver = made(ARDUPILOT)
     capabilities = driver.capabilities()
     assert capabilities.vehicle == "sim"
     assert capabilities.actions == make_driver("mavlink://udpin:127.0.0.1:14550").capabilities().actions
     assert [camera.name for camera in capabilities.cameras] == ["bottom"]
     assert "ArduCopter in the world 'empty'" in capabilities.description
-    assert driver.apply(Takeoff()) == Takeoff()  # to nobody
+    assert driver.apply(Takeoff()) == Takeoff()  # without a recipient
     assert driver.left_to() == ""
 
 
-def test_without_its_program_opening_says_where_it_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_without_the_program_names_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "/nowhere")
-    with pytest.raises(UsageError, match="SKYLOOP_ARDUCOPTER is '/nowhere', which is no program"):
+    with pytest.raises(UsageError, match="SKYLOOP_ARDUCOPTER is '/nowhere', which is not a program"):
         made(ARDUPILOT).open(RecordingSink())
 
 
@@ -117,7 +117,7 @@ def test_without_its_program_opening_says_where_it_comes_from(monkeypatch: pytes
 
 @pytest.mark.process
 @pytest.mark.daily
-def test_firmware_flies_dies_and_comes_back_while_pictures_go_on() -> None:
+def test_firmware_flies_dies_and_returns_while_pictures_continue() -> None:
     driver = made(ARDUPILOT)
     with opened(driver) as sink:
         assert sink.wait(lambda: happened(sink, "firmware_answers"), LONG_S)
@@ -126,8 +126,8 @@ def test_firmware_flies_dies_and_comes_back_while_pictures_go_on() -> None:
         feedback = sink.newest
         assert feedback is not None
         assert feedback.native is not None
-        assert feedback.roll_rad == pytest.approx(0.1)  # what the firmware says
-        assert feedback.native["truth.roll"] == pytest.approx(0.0, abs=1e-3)  # and what is so
+        assert feedback.roll_rad == pytest.approx(0.1)  # the firmware's estimate
+        assert feedback.native["truth.roll"] == pytest.approx(0.0, abs=1e-3)  # and the truth
         assert {"truth.x", "truth.vx", "truth.yaw", "sim.time_s"} <= set(feedback.native)
         os.kill(pid_of(driver), signal.SIGKILL)
         assert sink.wait(lambda: happened(sink, "firmware_died"), LONG_S)
@@ -140,7 +140,7 @@ def test_firmware_flies_dies_and_comes_back_while_pictures_go_on() -> None:
 
 
 @pytest.mark.process
-def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
+def test_the_simulated_radio_disconnects_the_firmwares_driver() -> None:
     driver = made(ARDUPILOT)
     names = {parameter.name for parameter in driver.parameters()}
     assert {"sim.wind", "sim.link", "camera.bottom.fps", "limits.altitude"} <= names
@@ -158,7 +158,7 @@ def test_the_simulated_radio_cuts_the_firmware_s_driver_off() -> None:
         assert sink.wait(lambda: sink.links[-1] == (LinkState.UP, ""), LONG_S)
         assert sink.wait(lambda: sink.feedback_count > count, LONG_S)
         driver.external_pose(replace(POSE, captured_ns=monotonic_ns()))
-        assert driver.failsafe(Land()) in (True, False)  # as the firmware's driver says
+        assert driver.failsafe(Land()) in (True, False)  # as the firmware's driver decides
         assert driver.checkup()
         with pytest.raises(ParameterError):
             driver.set_parameter("sim.battery", 7.0)
@@ -177,30 +177,30 @@ def test_several_fly_in_one_world(tmp_path: Path) -> None:
         assert pid_of(drivers[0]) != pid_of(drivers[1])
         assert first.wait(lambda: first.feedback_count > 0, LONG_S)
         assert second.wait(lambda: second.feedback_count > 0, LONG_S)
-    for name in ("drone1", "drone2"):  # settings of one would be those of the other
+    for name in ("drone1", "drone2"):  # each has its own settings
         assert (tmp_path / "kept" / name / "skyloop.parm").is_file()
 
 
 @pytest.mark.process
-def test_each_in_a_world_is_flown_by_what_its_own_address_says() -> None:
+def test_each_drone_in_a_world_has_the_autopilot_of_its_own_address() -> None:
     flown = parse_uri(ARDUPILOT)
     host = SimHost(options_of(flown), 2)
     built_in = SimDriver(parse_uri("sim://?world=elsewhere&cameras=none"), host=host, drone=1)
     assert built_in.firmware is None
-    assert built_in.options.world == "empty", "the rest is the world's"
+    assert built_in.options.world == "empty", "the world determines the rest"
     with opened(SimDriver(flown, host=host)) as first, opened(built_in) as second:
         assert first.wait(lambda: happened(first, "firmware_answers"), LONG_S)
         built_in.apply(Takeoff())
         assert second.wait(lambda: second.newest is not None and second.newest.state.airborne, LONG_S)
 
 
-def test_the_built_in_autopilot_takes_no_poses() -> None:
+def test_the_built_in_autopilot_accepts_no_poses() -> None:
     with pytest.raises(UnsupportedError):
         made("sim://").external_pose(POSE)
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_betaflight_is_told_its_position_as_by_motion_capture(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_betaflight_receives_its_position_as_from_motion_capture(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     uri = f"sim://?autopilot=betaflight&world=empty&cameras=none&position={int(known)}&rate=60"
     options = options_of(parse_uri(uri))
     flight = FirmwareFlight(options, "")
@@ -213,7 +213,7 @@ def test_betaflight_is_told_its_position_as_by_motion_capture(known: bool, monke
     assert all(abs(monotonic_ns() - pose.captured_ns) < 60 * NS_PER_S for pose in told)
 
 
-def test_what_the_firmware_s_driver_reports_has_the_truth_beside_it_once_that_is_known() -> None:
+def test_the_firmwares_feedback_includes_the_truth_once_known() -> None:
     flight = FirmwareFlight(options_of(parse_uri(ARDUPILOT)), "")
     sink = RecordingSink()
     inner = _InnerSink(flight, sink)
@@ -233,8 +233,8 @@ def test_what_the_firmware_s_driver_reports_has_the_truth_beside_it_once_that_is
         inner.stream("front", b"", 1, width=2, height=2, key=True)
 
 
-def test_what_is_said_of_the_link_names_what_is_inside() -> None:
-    """Its driver told people to start what this drone starts by itself, at a port that they had never seen."""
+def test_link_reasons_name_the_firmware_inside() -> None:
+    """Its driver once told people to start the firmware, which this drone starts, at a port they had never seen."""
     flight = FirmwareFlight(options_of(parse_uri("sim://?autopilot=betaflight")), "")
     sink = RecordingSink()
     inner = _InnerSink(flight, sink)
@@ -249,10 +249,10 @@ def test_what_is_said_of_the_link_names_what_is_inside() -> None:
     assert flight.link(LinkState.LOST, "")[2].startswith("Betaflight runs within this drone")
 
 
-# The truth beside it ---------------------------------------------------------------------------------------------
+# The truth in feedback -------------------------------------------------------------------------------------------
 
 
-def test_the_truth_is_that_of_the_time_of_the_feedback() -> None:
+def test_the_truth_belongs_to_the_time_of_the_feedback() -> None:
     simulation = SimHost(SimOptions(world="empty", cameras=())).simulation
     believed, truth = simulation.feedback(0), simulation.truth(0)
     first = Report(believed, replace(truth, position_m=(0, 0, 0), velocity_m_s=(0, 0, 0), yaw_rad=3.0), (), 1000)

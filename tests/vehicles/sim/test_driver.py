@@ -1,4 +1,4 @@
-"""``sim://``: what its address can ask for, its cameras, its parameters, and several drones in one world."""
+"""``sim://``: its options, its cameras, its parameters, and several drones in one world."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
         ("sim://?wrld=room", "did you mean 'world'"),
         ("sim://room", "did you mean sim://[?]world=room"),
         ("sim://?cameras=front,botom", "no simulated camera named 'botom'; did you mean 'bottom'"),
-        ("sim://?cameras=front,front", "names one twice"),
+        ("sim://?cameras=front,front", "names a camera twice"),
         ("sim://?speed=0", "option speed"),
         ("sim://?native=atitude", "no action named 'atitude'; did you mean 'attitude'"),
         ("sim://?native=hover", "leaves no set-point"),
@@ -94,7 +94,7 @@ def test_bad_options_are_refused(uri: str, message: str) -> None:
         ("/nowhere/at/all.toml", FileFormatError, "nowhere"),
     ],
 )
-def test_a_world_that_is_not_there_is_told_when_opened(world: str, error: type[Exception], message: str) -> None:
+def test_a_missing_world_is_reported_when_opened(world: str, error: type[Exception], message: str) -> None:
     driver = make_driver(f"sim://?world={world}")
     assert driver.capabilities().actions
     assert driver.parameters()
@@ -102,7 +102,7 @@ def test_a_world_that_is_not_there_is_told_when_opened(world: str, error: type[E
         driver.open(RecordingSink())
 
 
-def test_cameras_are_made_to_measure() -> None:
+def test_cameras_have_the_requested_size() -> None:
     uri = "sim://?cameras=front&width=640&height=360&fps=15&latency=0.1&noise=2"
     front = make_driver(uri).capabilities().cameras[0]
     assert (front.name, front.width, front.height, front.fps) == ("front", 640, 360, 15)
@@ -131,7 +131,7 @@ def test_it_keeps_time(speed: int) -> None:
     assert simulated_s == pytest.approx(speed * (last.captured_ns - first.captured_ns) / 1e9, rel=1e-6)
 
 
-def test_pictures_come_after_their_delay_and_at_their_rate() -> None:
+def test_pictures_arrive_after_their_delay_and_at_their_rate() -> None:
     with opened("sim://?width=160&fps=20&latency=0.06&seed=2") as (_, sink):
         assert sink.wait(lambda: min(sink.frame_counts[name] for name in ("front", "bottom")) >= 12, 10.0)
         frames = [frame for frame in sink.frames if frame.camera == "front"][2:]
@@ -144,16 +144,16 @@ def test_pictures_come_after_their_delay_and_at_their_rate() -> None:
     assert frames[0].intrinsics == make_driver("sim://?width=160").capabilities().cameras[0].intrinsics
 
 
-def test_nothing_is_drawn_for_nobody() -> None:
+def test_nothing_is_rendered_without_viewers() -> None:
     with opened("sim://", watch={"bottom"}) as (_, sink):
         assert sink.wait(lambda: sink.frame_counts["bottom"] >= 3, 10.0)
     assert set(sink.frame_counts) == {"bottom"}
 
 
-# What happens ----------------------------------------------------------------------------------------------------
+# Reports ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_truth_comes_with_the_feedback() -> None:
+def test_feedback_includes_the_truth() -> None:
     with opened(f"sim://?cameras=none&speed=4&{CALM}") as (driver, sink):
         in_the_air(driver, sink)
         newest = sink.newest
@@ -167,7 +167,7 @@ def test_the_truth_comes_with_the_feedback() -> None:
     assert number(newest, f"truth.{board.name}.x") == number(newest, "truth.target.x")
 
 
-def test_without_truth_feedback_holds_what_a_drone_knows() -> None:
+def test_without_truth_feedback_contains_only_the_drones_estimates() -> None:
     with opened("sim://?cameras=none&truth=0&position=none") as (_, sink):
         newest = sink.newest
     assert newest is not None
@@ -178,7 +178,7 @@ def test_without_truth_feedback_holds_what_a_drone_knows() -> None:
 
 
 @pytest.mark.parametrize("value", ["none", "0"])
-def test_a_vehicle_that_reports_no_velocity_still_flies_by_it(value: str) -> None:
+def test_a_vehicle_without_reported_velocity_still_flies_by_it(value: str) -> None:
     with opened(f"sim://?world=empty&cameras=none&speed=10&velocity={value}&{CALM}") as (driver, sink):
         in_the_air(driver, sink)
         driver.apply(Velocity(forward=1.0))
@@ -188,7 +188,7 @@ def test_a_vehicle_that_reports_no_velocity_still_flies_by_it(value: str) -> Non
     assert newest.velocity_m_s is None
 
 
-def test_a_bump_is_told_and_a_crash_is_an_emergency() -> None:
+def test_a_bump_is_reported_and_a_crash_is_an_emergency() -> None:
     with opened(f"sim://?world=empty&cameras=none&speed=10&{CALM}") as (driver, sink):
         driver.set_parameter("limits.speed", 10.0)
         driver.set_parameter("limits.tilt", 0.6)
@@ -218,7 +218,7 @@ def test_a_flat_battery_does_not_take_off() -> None:
 # Parameters ------------------------------------------------------------------------------------------------------
 
 
-def test_without_its_radio_it_hears_and_tells_nothing() -> None:
+def test_without_its_radio_it_neither_receives_nor_sends() -> None:
     with opened(f"sim://?cameras=none&speed=4&{CALM}") as (driver, sink):
         in_the_air(driver, sink)
         driver.apply(Velocity(forward=0.5))
@@ -227,7 +227,7 @@ def test_without_its_radio_it_hears_and_tells_nothing() -> None:
         heard = sink.feedback_count
         driver.apply(Velocity(forward=1.0))
         assert driver.host is not None
-        assert driver.host.simulation.state(0) is FlightState.HOVERING  # it holds its place by itself
+        assert driver.host.simulation.state(0) is FlightState.HOVERING  # it holds its position without commands
         assert sink.feedback_count <= heard + 1
         driver.set_parameter("sim.link", True)
         assert str(sink.link_state) == LinkState.UP
@@ -235,7 +235,7 @@ def test_without_its_radio_it_hears_and_tells_nothing() -> None:
         driver.apply(Hover())
 
 
-def test_one_that_takes_attitudes_only_holds_its_place_without_its_radio_too() -> None:
+def test_an_attitude_only_drone_also_holds_its_position_without_its_radio() -> None:
     with opened(f"sim://?world=empty&cameras=none&native=attitude&speed=4&{CALM}") as (driver, sink):
         with pytest.raises(UsageError, match="sim does not support hover"):
             driver.apply(Hover())
@@ -244,7 +244,7 @@ def test_one_that_takes_attitudes_only_holds_its_place_without_its_radio_too() -
         driver.set_parameter("sim.link", False)
         driver.set_parameter("sim.link", True)
         told = sink.feedback_count
-        assert sink.wait(lambda: sink.feedback_count > told + 5, 5.0)  # the old set-point is not taken up again
+        assert sink.wait(lambda: sink.feedback_count > told + 5, 5.0)  # the old set-point is not resumed
         assert driver.host is not None
         assert driver.host.simulation.state(0) is FlightState.HOVERING
 
@@ -255,7 +255,7 @@ def test_the_battery_can_be_set() -> None:
         assert sink.wait(lambda: sink.newest is not None and (sink.newest.battery or 1.0) < 0.51, 5.0)
 
 
-def test_what_is_written_before_it_is_opened_holds() -> None:
+def test_values_written_before_opening_apply() -> None:
     driver = make_driver("sim://?cameras=front")
     driver.set_parameter("limits.climb", 0.3)
     driver.set_parameter("sim.wind", (0.0, 1.0, 0.0))
@@ -292,7 +292,7 @@ def riding(host: SimHost, drone: int) -> SimDriver:
     return SimDriver(VehicleUri("sim"), host=host, drone=drone)
 
 
-def test_a_computer_that_is_too_slow_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_computer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "SLOW_NS", 200_000_000)
     host = SimHost(SimOptions(world="empty", cameras=(), speed=4.0, most_lag_s=0.02))
     monkeypatch.setattr(host.simulation, "step", lambda _: time.sleep(0.1))
@@ -319,7 +319,7 @@ def test_several_drones_fly_in_one_world() -> None:
         calls, told = heard_one.calls, heard_three.feedback_count
         assert heard_three.wait(lambda: heard_three.feedback_count > told + 5, 5.0)
         assert heard_one.calls == calls
-        with opened(riding(host, 0)) as (_, heard_again):  # and it can come back
+        with opened(riding(host, 0)) as (_, heard_again):  # and it can return
             assert heard_again.newest is not None
 
 

@@ -1,4 +1,4 @@
-"""The simulated drone keeps the drivers' contract, with all actions of its own and with fewer."""
+"""The simulated drone passes the driver suite, with all native actions and with fewer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from skyloop.drivers.uri import VehicleUri
 
 
 class SimSuite(DriverSuite):
-    untouched_parameters = frozenset({"sim.link", "sim.battery"})  # one cuts the suite off, the other drains
+    untouched_parameters = frozenset({"sim.link", "sim.battery"})  # one disconnects the suite, the other drains
 
     def make(self, uri: VehicleUri) -> Driver:
         self.driver = super().make(uri)

@@ -1,4 +1,4 @@
-"""A session and an emulated Tello in one simulated time: no sockets, no threads, and datagrams get lost as told."""
+"""A session and an emulated Tello in one simulated time: no sockets, no threads, and datagrams are lost on request."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STATE_TICKS = 5
 
 
 class Rig:
-    """``lost``: the share of datagrams that get lost, each way. ``on``: the drone is there."""
+    """``lost``: the share of datagrams lost in each direction. ``on``: the drone is switched on."""
 
     def __init__(
         self,
@@ -32,9 +32,9 @@ class Rig:
         self.session = TelloSession(options or TelloOptions("drone", video=False), self.bench.clock.now_ns)
         self.sink = RecordingSink()
         self.on = True
-        self.deaf = False  # it hears nothing, and is heard
-        self.mute = False  # it hears, and is not heard
-        self.said: list[str] = []
+        self.deaf = False  # it receives nothing, but sends
+        self.mute = False  # it receives, but sends nothing
+        self.sent: list[str] = []
         self._chance = random.Random(7)
         self._lost = lost
         self._told = 0
@@ -49,12 +49,12 @@ class Rig:
             self.step()
 
     def until(self, condition: Callable[[], object], within_s: float) -> float:
-        """How long it took [s]."""
+        """Return the time until the condition holds [s]."""
         for steps in range(round(within_s / 0.02)):
             if condition():
                 return steps * 0.02
             self.step()
-        raise AssertionError(f"not within {within_s} s: {self.sink.links[-3:]}, {self.sink.newest}, {self.said[-10:]}")
+        raise AssertionError(f"not within {within_s} s: {self.sink.links[-3:]}, {self.sink.newest}, {self.sent[-10:]}")
 
     def ready(self) -> None:
         self.until(lambda: self.session.ready, 8.0)
@@ -65,7 +65,7 @@ class Rig:
         session, board = self.session, self.bench.logic
         if self.now_ns >= session.due_ns:
             for datagram in session.poll(self.now_ns):
-                self.said.append(datagram.decode())
+                self.sent.append(datagram.decode())
                 if self.on and not self.deaf and not self._is_lost():
                     board.receive(datagram, PILOT)
         answers, self._told = self.bench.answers[self._told :], len(self.bench.answers)
@@ -85,16 +85,16 @@ class Rig:
         return self.session.command(action, self.now_ns)
 
     def restart_drone(self) -> None:
-        """Another one, switched on just now."""
+        """Replace the drone with one that was just switched on."""
         now_ns = self.now_ns
         self.bench = Bench(self._sdk, self._pads)
         self.bench.clock.now_ns = now_ns
         self._told = 0
         self.on = True
 
-    def take_said(self) -> list[str]:
-        said, self.said = self.said, []
-        return said
+    def take_sent(self) -> list[str]:
+        sent, self.sent = self.sent, []
+        return sent
 
     @property
     def feedback(self) -> Feedback:

@@ -1,4 +1,4 @@
-"""Which answer belongs to which command."""
+"""The matching of answers to commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def asked(conversation: Conversation, text: str) -> list[str | None]:
     return replies
 
 
-def test_one_question_at_a_time() -> None:
+def test_one_request_at_a_time() -> None:
     talk = Conversation()
     first, second = asked(talk, "sdk?"), asked(talk, "sn?")
     assert talk.messages(0) == ["sdk?"]
@@ -28,7 +28,7 @@ def test_one_question_at_a_time() -> None:
     assert talk.counts == {"answered": 2, "unanswered": 0, "stray": 0}
 
 
-def test_what_is_not_answered_is_said_again_and_then_given_up() -> None:
+def test_an_unanswered_request_is_repeated_and_then_fails() -> None:
     talk = Conversation()
     replies = asked(talk, "wifi?")
     said = [talk.messages(n * STEP) for n in range(TRIES + 1)]
@@ -37,7 +37,7 @@ def test_what_is_not_answered_is_said_again_and_then_given_up() -> None:
     assert talk.counts["unanswered"] == 1
 
 
-def test_a_late_answer_to_something_else_is_not_taken() -> None:
+def test_a_late_answer_to_another_request_is_ignored() -> None:
     talk = Conversation()
     asked(talk, "wifi?")
     talk.messages(0)
@@ -46,7 +46,7 @@ def test_a_late_answer_to_something_else_is_not_taken() -> None:
     assert not talk.idle
 
 
-def test_while_a_take_off_is_not_answered_nothing_is_asked_that_is_answered_alike() -> None:
+def test_requests_with_the_same_answers_wait_for_an_unanswered_take_off() -> None:
     talk = Conversation()
     talk.moved("takeoff", 0)
     streamon, wifi = asked(talk, "streamon"), asked(talk, "wifi?")
@@ -60,7 +60,7 @@ def test_while_a_take_off_is_not_answered_nothing_is_asked_that_is_answered_alik
     assert streamon == ["ok"]
 
 
-def test_an_error_while_something_is_moved_is_the_motions() -> None:
+def test_an_error_during_a_motion_belongs_to_the_motion() -> None:
     talk = Conversation()
     talk.moved("takeoff", 0)
     replies = asked(talk, "wifi?")
@@ -69,7 +69,7 @@ def test_an_error_while_something_is_moved_is_the_motions() -> None:
     assert replies == []
 
 
-def test_a_motion_that_is_never_answered_is_forgotten() -> None:
+def test_an_unanswered_motion_expires() -> None:
     talk = Conversation()
     talk.moved("land", 0)
     replies = asked(talk, "mon")
@@ -79,7 +79,7 @@ def test_a_motion_that_is_never_answered_is_forgotten() -> None:
     assert replies == ["ok"]
 
 
-def test_a_drone_that_is_gone_answers_nothing() -> None:
+def test_a_lost_drone_fails_all_requests() -> None:
     talk = Conversation()
     first, second = asked(talk, "sdk?"), asked(talk, "sn?")
     talk.messages(nanoseconds(1))

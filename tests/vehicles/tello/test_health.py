@@ -1,4 +1,4 @@
-"""What is told of heat and mission pads, once each."""
+"""Reports of heat and mission pads, once each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def hot(celsius: float) -> State:
     return State(temperature_c=(celsius - 3, celsius))
 
 
-def test_heat_is_told_when_it_comes_and_goes() -> None:
+def test_heat_is_reported_when_it_begins_and_ends() -> None:
     health = Health()
     assert health.changes(hot(89)) == []
     (told,) = health.changes(hot(90))
@@ -22,7 +22,7 @@ def test_heat_is_told_when_it_comes_and_goes() -> None:
     assert health.changes(State()) == []
 
 
-def test_a_pad_that_flickers_is_told_once() -> None:
+def test_a_flickering_pad_is_reported_once() -> None:
     health = Health()
     seen = State(pad=Pad(3, (10.0, 20.0, 80.0), None))
     (told,) = health.changes(seen)

@@ -1,4 +1,4 @@
-"""The driver on the network: parameters, several drones, ports that are taken, other people's datagrams."""
+"""The driver on the network: parameters, several drones, ports in use, other senders' datagrams."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_two_drones_through_two_pairs_of_ports() -> None:
             assert sink.wait(lambda sink=sink: sink.frame_counts["front"] > 2, PATIENCE_S)  # type: ignore[misc]
 
 
-def test_a_port_that_is_in_use_is_told_and_had_when_it_is_free() -> None:
+def test_a_port_in_use_is_reported_and_taken_when_free() -> None:
     addresses = Addresses.free()
     with (
         emulated() as (firmware,),
@@ -94,7 +94,7 @@ def test_a_port_that_is_in_use_is_told_and_had_when_it_is_free() -> None:
             up(sink)
 
 
-def test_an_interface_that_is_not_there_is_told() -> None:
+def test_a_missing_interface_is_reported() -> None:
     with opened("tello://127.0.0.1?interface=nosuch0&video=0") as (_, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
         assert "nosuch0" in sink.links[-1][1]
@@ -110,7 +110,7 @@ def test_the_loopback_interface_can_be_named() -> None:
         up(sink)
 
 
-def test_datagrams_of_others_are_left_out() -> None:
+def test_datagrams_of_others_are_ignored() -> None:
     addresses = Addresses.free()
     with (
         emulated() as (firmware,),
@@ -118,7 +118,7 @@ def test_datagrams_of_others_are_left_out() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
     ):
         up(sink)
-        stranger.bind((addresses.drone, 0))  # not the drone's
+        stranger.bind((addresses.drone, 0))  # not the drone's port
         for _ in range(20):
             stranger.sendto(b"bat:1;h:500;tof:500;time:999;", (addresses.pilot, 8890))
         count = sink.feedback_count
@@ -177,7 +177,7 @@ def test_an_old_drone_has_fewer_parameters() -> None:
             driver.set_parameter("camera.fps", 15)
 
 
-def test_a_flip_is_said_once_and_a_busy_drone_refuses_settings() -> None:
+def test_a_flip_is_sent_once_and_a_busy_drone_refuses_settings() -> None:
     with emulated(speed=3.0) as (firmware,), opened(address(firmware, video=0)) as (driver, sink):
         up(sink)
         driver.apply(Takeoff())
@@ -188,7 +188,7 @@ def test_a_flip_is_said_once_and_a_busy_drone_refuses_settings() -> None:
         assert driver.set_parameter("tello.flip", "none") == "none"
 
 
-def test_before_it_is_opened_nothing_can_be_written() -> None:
+def test_parameters_cannot_be_written_before_opening() -> None:
     driver = make_driver("tello://127.0.0.1")
     assert driver.parameters() == []
     with pytest.raises(ParameterError, match="is not open"):

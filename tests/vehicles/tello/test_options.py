@@ -1,4 +1,4 @@
-"""What ``tello://`` addresses ask for, and what makes no sense."""
+"""Valid and invalid ``tello://`` addresses."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def test_all_options() -> None:
         ("tello://d?interface=../x", "must be the name of a network interface"),
         ("tello://d?velocity_axes=bdy", "did you mean 'body'"),
         ("tello://d?state_port=80", "from 1025 to 65535"),
-        ("tello://d?state_port=9000&video_port=9000", "can't both come to port 9000"),
+        ("tello://d?state_port=9000&video_port=9000", "can't share port 9000"),
         ("tello://d?cx=10", "needs fx"),
         ("tello://d?concealed=31", "from 0 to 30"),
     ],
 )
-def test_what_makes_no_sense_is_refused(address: str, said: str) -> None:
+def test_invalid_addresses_are_refused(address: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
         TelloDriver(parse_uri(address))
 

@@ -1,4 +1,4 @@
-"""The driver's page says what the code does."""
+"""The driver's page matches the code."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def test_times() -> None:
     assert f"`wifi?` every {ALIVE_NS / 1e9:g} s" in section("docs/tello.md", "### Commands sent to the drone")
 
 
-def test_what_a_full_stick_is() -> None:
+def test_the_effect_of_a_full_stick() -> None:
     full = Scale()
     assert (full.speed, full.climb, full.yaw_rate) == (1.0, 1.0, 1.75)
     assert "taken for 1 m/s, 1 m/s of climb and 1.75 rad/s" in section("docs/tello.md", "## The driver")
 
 
-def test_nan_is_no_full_stick() -> None:
+def test_nan_is_not_a_full_stick() -> None:
     for action in (Attitude, Velocity):
         assert sticks_of(action(*[math.nan] * 4), Scale(), Scale()) == sticks_of(action(), Scale(), Scale())

@@ -44,105 +44,105 @@ def test_a_flight(lost: float) -> None:
     rig.do(Hover())
     rig.until(lambda: rig.state is FlightState.HOVERING, 1.0)
     rig.run(30.0)
-    assert rig.bench.truth.state is FlightState.HOVERING  # it did not land by itself
+    assert rig.bench.truth.state is FlightState.HOVERING  # it did not land for lack of commands
     rig.do(Land())
     rig.until(lambda: rig.state is FlightState.LANDING, 2.0)
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
     assert rig.bench.flight is FlightState.LANDED
 
 
-def test_sticks_come_twenty_times_a_second_and_a_new_one_at_once() -> None:
+def test_sticks_are_sent_twenty_times_a_second_and_new_ones_at_once() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
-    rig.take_said()
+    rig.take_sent()
     rig.run(2.0)
-    sticks = [text for text in rig.take_said() if text.startswith("rc")]
+    sticks = [text for text in rig.take_sent() if text.startswith("rc")]
     assert set(sticks) == {"rc 0 0 0 0"}
     assert 30 <= len(sticks) <= 45
     rig.do(Velocity(left=0.3))
     rig.step()
     rig.step()
-    assert "rc -30 0 0 0" in rig.take_said()
+    assert "rc -30 0 0 0" in rig.take_sent()
 
 
-def test_a_drone_that_another_program_flies_gets_no_sticks_before_it_is_taken() -> None:
+def test_a_drone_flown_by_another_program_gets_no_sticks_before_we_take_it() -> None:
     rig = Rig()
     rig.ready()
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith(("rc", "land", "stop"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "land", "stop"))]
     rig.do(Hover())
     rig.run(0.2)
-    assert "rc 0 0 0 0" in rig.take_said()
+    assert "rc 0 0 0 0" in rig.take_sent()
     rig.do(Land())
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
     rig.run(1.0)
-    rig.take_said()
+    rig.take_sent()
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(1.0)
-    assert not [text for text in rig.said if text.startswith("rc")], "nor the next flight"
+    assert not [text for text in rig.sent if text.startswith("rc")], "nor the next flight"
 
 
-def test_nothing_moves_a_drone_that_stands() -> None:
+def test_nothing_moves_a_landed_drone() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Velocity(forward=1.0))
     rig.do(Hover())
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith("rc")]
+    assert not [text for text in rig.sent if text.startswith("rc")]
 
 
-def test_a_drone_that_does_not_take_off_is_told() -> None:
+def test_a_drone_that_does_not_take_off_is_reported() -> None:
     rig = Rig()
     rig.ready()
     rig.deaf = True
     rig.do(Takeoff())
     rig.run(9.0)
-    assert rig.said.count("takeoff") in (5, 6)
+    assert rig.sent.count("takeoff") in (5, 6)
     assert "no_takeoff" in rig.reasons
     assert rig.state is FlightState.LANDED
-    rig.take_said()
+    rig.take_sent()
     rig.run(3.0)
-    assert "takeoff" not in rig.said
+    assert "takeoff" not in rig.sent
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.5, 0.9])
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_a_take_off_that_a_landing_withdraws_before_it_shows_is_landed(after_s: float, lost: float) -> None:
-    """It still stood when it was landed, so nothing was sent, and it rose all the same and hovered for good."""
+def test_a_take_off_withdrawn_before_it_shows_is_landed(after_s: float, lost: float) -> None:
+    """The drone was still on the ground, so nothing was sent; it then rose anyway and hovered for good."""
     rig = Rig(lost=lost)
     rig.ready()
     rig.do(Takeoff())
-    rig.until(lambda: "takeoff" in rig.said, 1.0)
+    rig.until(lambda: "takeoff" in rig.sent, 1.0)
     rig.run(after_s)
     assert rig.state is FlightState.LANDED
     rig.do(Land())
     rig.run(0.3)
     rig.do(Velocity(up=1.0))
-    rig.do(Hover())  # what stands is not flown by them, nor let rise
+    rig.do(Hover())  # a hover neither flies a landed drone nor lets it rise
     rig.run(15.0)
     assert rig.bench.flight is FlightState.LANDED
     assert rig.state is FlightState.LANDED
-    rig.take_said()
+    rig.take_sent()
     rig.run(3.0)
-    assert not [text for text in rig.said if text.startswith(("rc", "land", "takeoff"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "land", "takeoff"))]
 
 
-def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
-    """It was, while somebody walked up to it: until 8 s had passed since the take-off was asked for."""
+def test_a_drone_that_falls_over_during_its_take_off_is_not_restarted() -> None:
+    """It once was, while a person walked up to it, until 8 s after the take-off command."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.TAKING_OFF, 4.0)
     rig.bench.logic.receive(b"emergency", PILOT)
-    rig.take_said()
+    rig.take_sent()
     rig.until(lambda: rig.state is FlightState.LANDED, 5.0)
     rig.run(8.0)
-    assert "takeoff" not in rig.said
+    assert "takeoff" not in rig.sent
     assert rig.reasons.count("no_takeoff") == 1
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
@@ -150,7 +150,7 @@ def test_a_drone_that_falls_over_in_its_take_off_is_not_started_again() -> None:
 
 @pytest.mark.parametrize("after_s", [0.0, 0.2, 0.5])
 def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> None:
-    """They seemed to, and then to stop: what rose was told not to be started again, LANDED, and was not steered."""
+    """They once seemed to start and stop: the rising drone was reported as not restarted, LANDED, and not steered."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -158,7 +158,7 @@ def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> No
     rig.run(3.0)
     rig.do(Land())
     rig.until(lambda: rig.bench.truth.state is FlightState.LANDED, 10.0)
-    rig.session.on_reply(b"ok", rig.now_ns)  # real ones answer as they touch down
+    rig.session.on_reply(b"ok", rig.now_ns)  # real drones answer at touchdown
     rig.until(lambda: rig.state is FlightState.LANDED, 0.2)
     rig.run(after_s)
     rig.do(Takeoff())
@@ -166,12 +166,12 @@ def test_motors_that_ran_before_a_landing_show_no_take_off(after_s: float) -> No
     assert rig.state is FlightState.TAKING_OFF
     rig.until(lambda: rig.state is FlightState.HOVERING, 2.0)
     assert "no_takeoff" not in rig.reasons
-    rig.take_said()
+    rig.take_sent()
     rig.run(1.0)
-    assert "rc 0 0 0 0" in rig.said
+    assert "rc 0 0 0 0" in rig.sent
 
 
-def test_a_drone_that_refuses_to_take_off_is_told() -> None:
+def test_a_refused_take_off_is_reported() -> None:
     rig = Rig()
     rig.ready()
     rig.bench.simulation.set_charge(0, 0.01)
@@ -180,7 +180,7 @@ def test_a_drone_that_refuses_to_take_off_is_told() -> None:
     assert rig.state is FlightState.LANDED
 
 
-def test_a_landing_can_be_broken_off() -> None:
+def test_a_landing_can_be_aborted() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -207,16 +207,16 @@ def test_an_emergency_stop_is_kept_until_the_reset(lost: float) -> None:
     rig.do(Hover())
     rig.run(3.0)
     assert rig.state is FlightState.EMERGENCY
-    rig.take_said()
+    rig.take_sent()
     rig.run(5.0)
-    assert "emergency" not in rig.said
+    assert "emergency" not in rig.sent
     rig.do(ResetEmergency())
     rig.until(lambda: rig.state is FlightState.LANDED, 1.0)
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
 
 
-def test_a_stop_that_does_not_show_can_not_be_reset() -> None:
+def test_a_stop_that_does_not_show_cannot_be_reset() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -229,8 +229,8 @@ def test_a_stop_that_does_not_show_can_not_be_reset() -> None:
     assert rig.do(Idle()) == Idle()
 
 
-def test_a_stop_that_is_never_shown_is_given_up_told_and_the_drone_lands_by_itself() -> None:
-    """The Wi-Fi is out when it is pressed, and back long after: nobody commands, and nothing keeps it from landing."""
+def test_a_stop_that_never_shows_is_abandoned_and_reported_and_the_drone_lands() -> None:
+    """The Wi-Fi fails before the stop and returns long after: no commands arrive, and the drone lands without them."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -238,23 +238,23 @@ def test_a_stop_that_is_never_shown_is_given_up_told_and_the_drone_lands_by_itse
     rig.on = False
     rig.run(2.0)
     rig.do(EmergencyStop())
-    rig.take_said()
+    rig.take_sent()
     rig.run(9.8)
-    assert rig.take_said().count("emergency") > 75, "also to a drone that is not heard"
+    assert rig.take_sent().count("emergency") > 75, "also to a silent drone"
     rig.run(0.6)
     assert rig.reasons.count("stop_given_up") == 1
-    rig.take_said()
+    rig.take_sent()
     rig.on = True
     rig.until(lambda: rig.state is FlightState.HOVERING, 5.0)
-    assert "emergency" not in rig.said, "it does not fall minutes later"
+    assert "emergency" not in rig.sent, "it must not fall minutes later"
     rig.until(lambda: rig.state is FlightState.LANDED, 30.0)
     assert rig.bench.flight is FlightState.LANDED
-    assert not [text for text in rig.said if text.startswith(("rc", "wifi?", "land", "emergency"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "wifi?", "land", "emergency"))]
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
 
 
-def test_a_drone_whose_stop_was_given_up_can_be_landed_and_the_reset_is_allowed() -> None:
+def test_after_an_abandoned_stop_the_drone_can_land_and_a_reset_is_allowed() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -262,12 +262,12 @@ def test_a_drone_whose_stop_was_given_up_can_be_landed_and_the_reset_is_allowed(
     rig.deaf = True
     rig.do(EmergencyStop())
     rig.run(11.0)
-    assert rig.state is FlightState.HOVERING, "no emergency is told of what flies"
+    assert rig.state is FlightState.HOVERING, "a flying drone reports no emergency"
     rig.deaf = False
     rig.do(ResetEmergency())
     rig.do(Hover())
     rig.run(6.0)
-    assert "wifi?" in rig.said, "once something is commanded it is kept awake again"
+    assert "wifi?" in rig.sent, "a command makes us keep it awake again"
     rig.do(Land())
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
@@ -286,7 +286,7 @@ def test_a_stop_shows_while_it_is_repeated() -> None:
 
 
 def test_an_answer_alone_does_not_end_a_stop() -> None:
-    """An "ok" does not say what it answers: it may be that of a landing before."""
+    """An "ok" does not name its command: it may belong to an earlier landing."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -295,7 +295,7 @@ def test_an_answer_alone_does_not_end_a_stop() -> None:
     rig.do(EmergencyStop())
     rig.step()
     rig.step()
-    for _ in range(2):  # the take-off's, and one more
+    for _ in range(2):  # the take-off's answer, and one more
         rig.session.on_reply(b"ok", rig.now_ns)
     rig.run(2.0)
     with pytest.raises(DriverError, match="motors still run"):
@@ -304,8 +304,8 @@ def test_an_answer_alone_does_not_end_a_stop() -> None:
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
 
 
-def test_a_stop_in_a_take_off_goes_on_until_the_motors_are_off() -> None:
-    """They did not turn when it was pressed, and turn when the drone has heard the take-off but not the stop."""
+def test_a_stop_during_a_take_off_continues_until_the_motors_are_off() -> None:
+    """They were not turning at the stop, and turn once the drone received the take-off but not the stop."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -324,23 +324,23 @@ def test_attitude_is_a_share_of_the_stick() -> None:
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
-    rig.take_said()
+    rig.take_sent()
     applied = rig.do(Attitude(roll=0.1, pitch=-0.9, climb=5.0, yaw_rate=0.875))
     assert applied == Attitude(roll=0.1, pitch=-0.2, climb=1.0, yaw_rate=0.875)
     rig.run(0.1)
-    assert rig.said[-1] == "rc 50 -100 100 -50"
+    assert rig.sent[-1] == "rc 50 -100 100 -50"
 
 
-# Losing and finding ------------------------------------------------------------------------------------------------
+# Link loss and recovery --------------------------------------------------------------------------------------------
 
 
-def test_a_drone_that_is_not_there_is_told_and_looked_for() -> None:
+def test_an_absent_drone_is_reported_and_retried() -> None:
     rig = Rig()
     rig.on = False
     rig.run(2.5)
     assert [state for state, _ in rig.sink.links] == [LinkState.CONNECTING, LinkState.LOST]
     assert "no state from drone, UDP port 8889" in rig.sink.links[-1][1]
-    assert 4 <= rig.said.count("command") <= 6
+    assert 4 <= rig.sent.count("command") <= 6
     with pytest.raises(DriverError, match="no data from"):
         rig.do(Takeoff())
     rig.on = True
@@ -349,15 +349,15 @@ def test_a_drone_that_is_not_there_is_told_and_looked_for() -> None:
     assert rig.sink.link_state is LinkState.UP
 
 
-def test_a_firewall_is_thought_of_when_answers_come_and_no_state() -> None:
+def test_a_firewall_is_suspected_when_answers_arrive_without_state() -> None:
     rig = Rig()
     rig.bench.logic.state_string = lambda: None  # type: ignore[method-assign]
     rig.run(2.5)
     assert rig.sink.link_state is LinkState.LOST
-    assert "though it answers: does a firewall of this host let UDP port 8890 in?" in rig.sink.links[-1][1]
+    assert "though it answers: does a firewall of this host block UDP port 8890?" in rig.sink.links[-1][1]
 
 
-def test_a_link_that_breaks_in_flight_is_found_again_and_resumes_nothing() -> None:
+def test_a_link_restored_in_flight_resumes_nothing() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -367,16 +367,16 @@ def test_a_link_that_breaks_in_flight_is_found_again_and_resumes_nothing() -> No
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 1.2)
-    rig.take_said()
+    rig.take_sent()
     rig.run(1.0)
-    assert set(rig.take_said()) == {"command", "rc 0 0 0 0"}  # it may hear us
+    assert set(rig.take_sent()) == {"command", "rc 0 0 0 0"}  # it may receive us
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
     rig.until(lambda: rig.state is FlightState.HOVERING, 3.0)  # in the air, by its motors
-    assert "rc 0 30 0 0" not in rig.said
+    assert "rc 0 30 0 0" not in rig.sent
 
 
-def test_a_landing_goes_on_while_the_drone_is_not_heard() -> None:
+def test_a_landing_continues_while_the_drone_is_silent() -> None:
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -384,39 +384,39 @@ def test_a_landing_goes_on_while_the_drone_is_not_heard() -> None:
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
     rig.do(Land())
-    rig.take_said()
+    rig.take_sent()
     rig.run(2.9)
-    assert rig.said.count("land") in (2, 3)
+    assert rig.sent.count("land") in (2, 3)
     rig.on = True
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 12.0)
     rig.until(lambda: rig.state is FlightState.LANDED, 4.0)
 
 
-def test_a_landing_of_a_drone_that_is_not_heard_is_not_kept_for_ever() -> None:
-    """It was sent to whoever flew the drone by then, minutes or hours later."""
+def test_a_landing_of_a_lost_drone_expires() -> None:
+    """It was once sent minutes or hours later, to a drone that another pilot flew by then."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
-    for _ in range(8):  # whoever still wants it asks again
+    for _ in range(8):  # a pilot that still wants it sends it again
         rig.do(Land())
         rig.run(1.0)
-    assert rig.take_said().count("land") >= 5
+    assert rig.take_sent().count("land") >= 5
     rig.run(3.0)
     assert rig.reasons.count("landing_given_up") == 1
-    rig.take_said()
+    rig.take_sent()
     rig.run(60.0)
-    assert not [text for text in rig.take_said() if text.startswith(("land", "rc"))], "it lands by itself when alone"
+    assert not [text for text in rig.take_sent() if text.startswith(("land", "rc"))], "without commands it lands"
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(0.5)
-    assert "land" not in rig.said
+    assert "land" not in rig.sent
 
 
 def unheard() -> Rig:
-    """It hears, and has not been heard for a while; whoever flew it is there and commands nothing."""
+    """Return a drone that receives but has been silent for a while; its pilot is there and sends no commands."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -427,19 +427,19 @@ def unheard() -> Rig:
     return rig
 
 
-def test_what_is_not_heard_any_more_lands_by_itself() -> None:
-    """``command`` and level sticks kept it in the air until its battery was empty."""
+def test_a_silent_drone_is_left_to_its_automatic_landing() -> None:
+    """``command`` and level sticks once kept it in the air until its battery was empty."""
     rig = unheard()
     rig.run(3.1)
-    assert "rc 0 0 0 0" in rig.take_said(), "it does not fly on with the sticks of before"
+    assert "rc 0 0 0 0" in rig.take_sent(), "it does not continue with the earlier sticks"
     for _ in range(50):
         rig.session.command(Hover(), rig.now_ns, new=False)  # the library's own
-        rig.session.command(Velocity(forward=0.3), rig.now_ns)  # a program that goes on
+        rig.session.command(Velocity(forward=0.3), rig.now_ns)  # a program that continues
         rig.run(0.5)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     assert rig.bench.flight is FlightState.LANDED
     rig.run(6.0)
-    assert set(rig.take_said()) == {"command"}, "it may have been switched off and on"
+    assert set(rig.take_sent()) == {"command"}, "it may have been switched off and on"
     rig.mute = False
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
     rig.run(3.0)
@@ -447,8 +447,8 @@ def test_what_is_not_heard_any_more_lands_by_itself() -> None:
 
 
 @pytest.mark.parametrize("after_s", [0.1, 0.6])
-def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float) -> None:
-    """``command``, twice a second, kept it in the air for as long as it was not heard."""
+def test_a_take_off_lost_before_it_shows_ends_in_an_automatic_landing(after_s: float) -> None:
+    """``command``, twice a second, once kept it in the air for as long as it was silent."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -463,26 +463,26 @@ def test_a_take_off_that_is_lost_before_it_shows_lands_by_itself(after_s: float)
 
 
 @pytest.mark.parametrize("asked_s", [1.0, 10.0])
-def test_what_a_person_asks_for_reaches_what_is_not_heard(asked_s: float) -> None:
+def test_a_persons_command_reaches_a_silent_drone(asked_s: float) -> None:
     rig = unheard()
     rig.run(asked_s)
-    rig.take_said()
+    rig.take_sent()
     rig.do(Hover())
     rig.run(0.2)
-    assert "rc 0 0 0 0" in rig.take_said()
+    assert "rc 0 0 0 0" in rig.take_sent()
     rig.do(Land())
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 8.0)
-    assert "land" in rig.said
+    assert "land" in rig.sent
 
 
-def test_a_stop_reaches_what_lands_by_itself() -> None:
+def test_a_stop_reaches_a_drone_in_its_automatic_landing() -> None:
     rig = unheard()
     rig.run(10.0)
     rig.do(EmergencyStop())
     rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
 
 
-def test_what_is_heard_again_in_the_air_is_flown_on() -> None:
+def test_a_drone_found_again_in_the_air_is_flown_further() -> None:
     rig = unheard()
     rig.run(8.0)
     rig.mute = False
@@ -492,8 +492,8 @@ def test_what_is_heard_again_in_the_air_is_flown_on() -> None:
     assert rig.state is FlightState.HOVERING
 
 
-def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_up() -> None:
-    """The library's own hover kept it awake, and so from landing by itself."""
+def test_an_automatic_hover_leaves_a_drone_alone_after_an_abandoned_stop() -> None:
+    """The library's own hover once kept it awake and prevented its automatic landing."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -502,17 +502,17 @@ def test_a_hover_that_nobody_decided_leaves_a_drone_alone_whose_stop_was_given_u
     rig.do(EmergencyStop())
     rig.run(11.0)
     rig.deaf = False
-    rig.take_said()
-    for _ in range(8):  # then it lands by itself, and on the ground it is kept awake
+    rig.take_sent()
+    for _ in range(8):  # it lands, and is kept awake on the ground
         rig.session.command(Hover(), rig.now_ns, new=False)
         rig.run(0.5)
-    assert not [text for text in rig.said if text.startswith(("rc", "wifi?"))]
+    assert not [text for text in rig.sent if text.startswith(("rc", "wifi?"))]
     rig.session.command(Land(), rig.now_ns, new=False)
     rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
 
 
-def test_a_drone_whose_stop_was_given_up_is_not_asked_who_it_is() -> None:
-    """The question, as any command, kept it in the air for another 15 s, and for ever where it was not answered."""
+def test_after_an_abandoned_stop_the_version_is_not_requested() -> None:
+    """That request, like any command, kept it in the air for another 15 s, or forever if it was not answered."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())
@@ -521,30 +521,30 @@ def test_a_drone_whose_stop_was_given_up_is_not_asked_who_it_is() -> None:
     rig.run(2.0)
     rig.do(EmergencyStop())
     rig.run(10.4)
-    rig.take_said()
+    rig.take_sent()
     rig.on = True
     rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
     rig.until(lambda: rig.bench.flight is FlightState.LANDING, 3.0)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     rig.do(Hover())
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
 
 
-def test_what_another_program_left_in_the_air_lands_by_itself() -> None:
-    """A question every 4 s kept it there until its battery was empty."""
+def test_a_drone_left_in_the_air_by_another_program_lands() -> None:
+    """A request every 4 s once kept it there until its battery was empty."""
     rig = Rig()
     rig.ready()
     rig.bench.logic.receive(b"takeoff", PILOT)
     rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
     rig.run(1.0)
-    rig.take_said()
+    rig.take_sent()
     rig.until(lambda: rig.state is FlightState.LANDED, 25.0)
-    assert not rig.said
+    assert not rig.sent
     rig.run(5.0)
-    assert set(rig.said) == {"wifi?"}, "on the ground it is kept awake"
+    assert set(rig.sent) == {"wifi?"}, "on the ground it is kept awake"
 
 
-def test_what_is_found_in_the_air_and_does_not_answer_is_not_asked_for_ever() -> None:
+def test_a_drone_found_in_the_air_without_answers_is_not_asked_forever() -> None:
     rig = Rig()
     rig.on = False
     for text in (b"command", b"takeoff"):
@@ -552,15 +552,15 @@ def test_what_is_found_in_the_air_and_does_not_answer_is_not_asked_for_ever() ->
     rig.until(lambda: rig.bench.truth.state is FlightState.HOVERING, 5.0)
     rig.on = rig.deaf = True
     rig.run(6.0)
-    assert "sdk?" in rig.take_said()
+    assert "sdk?" in rig.take_sent()
     rig.run(5.0)
-    assert not rig.take_said()
+    assert not rig.take_sent()
     rig.deaf = False
     rig.do(Hover())
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
 
 
-def test_a_drone_that_was_started_again_is_set_up_again() -> None:
+def test_a_restarted_drone_is_set_up_again() -> None:
     rig = Rig(TelloOptions("drone", video=False, pads=True))
     rig.ready()
     rig.run(1.0)
@@ -575,7 +575,7 @@ def test_a_drone_that_was_started_again_is_set_up_again() -> None:
     assert rig.bench.logic.fps == 5.0
 
 
-def test_a_drone_that_does_not_hear_us_is_told() -> None:
+def test_a_drone_that_does_not_receive_us_is_reported() -> None:
     rig = Rig()
     rig.ready()
     rig.run(0.1)
@@ -589,7 +589,7 @@ def test_a_drone_that_does_not_hear_us_is_told() -> None:
 @pytest.mark.parametrize(
     ("sdk", "serial"), [(Sdk.V1_3, ""), (Sdk.V2_0, "0TQEMULATED001"), (Sdk.V3_0, "0TQEMULATED001")]
 )
-def test_the_version_is_found_out(sdk: Sdk, serial: str) -> None:
+def test_the_version_is_detected(sdk: Sdk, serial: str) -> None:
     rig = Rig(sdk=sdk)
     rig.ready()
     rig.run(1.0)
@@ -597,7 +597,7 @@ def test_the_version_is_found_out(sdk: Sdk, serial: str) -> None:
     assert rig.session.serial == serial
 
 
-def test_ports_of_its_own_need_a_drone_that_knows_them() -> None:
+def test_custom_ports_need_sdk_3() -> None:
     options = TelloOptions("drone", video=False, state_port=9990)
     rig = Rig(options)
     rig.ready()
@@ -609,25 +609,25 @@ def test_ports_of_its_own_need_a_drone_that_knows_them() -> None:
     assert old.reasons.count("ports_refused") == 1
 
 
-def test_video_is_asked_for_until_it_comes() -> None:
+def test_video_is_requested_until_it_arrives() -> None:
     came_ns = [0]
     rig = Rig(TelloOptions("drone"))
     rig.session._video_ns = lambda: came_ns[0]
     rig.ready()
     rig.run(5.0)
-    assert rig.said.count("streamon") in (2, 3)
+    assert rig.sent.count("streamon") in (2, 3)
     assert rig.bench.logic.streaming
-    rig.take_said()
+    rig.take_sent()
     for _ in range(100):
         came_ns[0] = rig.now_ns
         rig.step()
-    assert "streamon" not in rig.said
+    assert "streamon" not in rig.sent
 
 
-# What it tells -----------------------------------------------------------------------------------------------------
+# Reports -----------------------------------------------------------------------------------------------------------
 
 
-def test_pads_are_told_when_they_come_and_go() -> None:
+def test_pads_are_reported_when_they_appear_and_disappear() -> None:
     x, y, _ = Rig().bench.truth.position_m
     rig = Rig(TelloOptions("drone", video=False, pads=True), pads={5: (x, y)})
     rig.ready()
@@ -687,7 +687,7 @@ _NOISE = st.binary(max_size=300) | st.text(alphabet="okerounmidpthbatvgxyz:;-.01
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.booleans(), _NOISE), max_size=60), st.booleans())
-def test_nothing_that_comes_raises(datagrams: list[tuple[bool, bytes]], flying: bool) -> None:
+def test_no_input_raises(datagrams: list[tuple[bool, bytes]], flying: bool) -> None:
     rig = Rig()
     rig.run(0.5)
     if flying:
@@ -713,8 +713,8 @@ def test_recorded_states_that_were_damaged_do_not_raise(data: st.DataObject) -> 
     assert not rig.sink.problems
 
 
-def test_a_state_that_arrives_late_is_left_out() -> None:
-    """One from before, with fewer seconds of running motors, would make the next look as if they ran again."""
+def test_a_late_state_is_ignored() -> None:
+    """An earlier one, with fewer seconds of running motors, would make the next one look like a start of the motors."""
     rig = Rig()
     rig.ready()
     rig.do(Takeoff())

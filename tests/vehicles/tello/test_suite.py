@@ -1,4 +1,4 @@
-"""The driver keeps the drivers' contract, against the emulated firmware of a Tello."""
+"""The driver passes the driver suite against the emulated firmware of a Tello."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tests.support.tello_addresses import Addresses
 
 
 class TestTello(DriverSuite):
-    """One drone for each test, at an address of its own on this machine, where it has a Tello's own ports."""
+    """One drone for each test, at its own address of this machine, with a Tello's usual ports."""
 
     firmware: TelloFirmware
     uri = "tello://127.0.0.1"
     untouched_parameters = frozenset({"tello.flip"})  # refused on the ground
     connect_timeout_s = 20.0
     feedback_timeout_s = 10.0
-    frame_timeout_s = 40.0  # the emulated drone begins to draw with the first picture
+    frame_timeout_s = 40.0  # the emulated drone creates its renderer with the first picture
     takeoff_timeout_s = 30.0
     emergency_timeout_s = 10.0
     lost_timeout_s = 10.0

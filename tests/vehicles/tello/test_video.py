@@ -1,4 +1,4 @@
-"""H.264 with pieces lost, to pictures; compared with the pictures of a stream that lost nothing."""
+"""Pictures from H.264 with lost pieces, compared with those of an intact stream."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SETTINGS = OneCamera("front", 30.0, 600)
 
 
 def scene(number: int) -> Pixels:
-    """A bright square that wanders over noise."""
+    """Return a picture of a bright square that wanders over noise."""
     picture = np.random.default_rng(1).integers(60, 120, (240, 320, 3)).astype(np.uint8)
     at = 20 + 2 * number
     picture[80:140, at : at + 60] = 240
@@ -47,7 +47,7 @@ def stream() -> list[bytes]:
 
 
 def units(stream: list[bytes], lost: set[tuple[int, int]] | None = None) -> list[tuple[int, AccessUnit]]:
-    """Pictures as they come when these pieces (number of the picture, of its piece) get lost."""
+    """Return pictures after the loss of these pieces (number of the picture, number of its piece)."""
     assembly = Assembly()
     got: list[tuple[int, AccessUnit]] = []
     for number, picture in enumerate(stream):
@@ -73,7 +73,7 @@ def _shown_whole() -> dict[int, Pixels]:
 
 
 def differ(one: Pixels, other: Pixels) -> float:
-    """Mean of the difference, in steps of 0 to 255."""
+    """Return the mean difference, in steps of 0 to 255."""
     return float(np.abs(one.astype(int) - other).mean())
 
 
@@ -86,11 +86,11 @@ def test_without_loss_every_picture_is_shown_and_like_the_scene(stream: list[byt
         assert inside > 220
 
 
-def test_keys_come_as_often_as_a_tellos(stream: list[bytes]) -> None:
+def test_keys_are_as_frequent_as_a_tellos(stream: list[bytes]) -> None:
     assert [number for number, unit in units(stream) if unit.is_key] == list(range(0, COUNT, GROUP))
 
 
-def test_a_picture_that_is_missing_leaves_others_that_are_nearly_right(stream: list[bytes]) -> None:
+def test_after_a_missing_picture_the_others_are_nearly_right(stream: list[bytes]) -> None:
     whole = shown(stream)
     lost = {(10, at) for at in range(len(pieces(stream[10])))}
     damaged = shown(stream, lost)
@@ -98,17 +98,17 @@ def test_a_picture_that_is_missing_leaves_others_that_are_nearly_right(stream: l
     for number in range(10):
         assert np.array_equal(damaged[number], whole[number])
     assert 0 < differ(damaged[12], whole[12]) < 12
-    assert np.array_equal(damaged[GROUP], whole[GROUP])  # the next key mends it
+    assert np.array_equal(damaged[GROUP], whole[GROUP])  # the next key repairs it
 
 
-def test_unless_it_is_allowed_nothing_damaged_is_shown(stream: list[bytes]) -> None:
+def test_without_concealment_nothing_damaged_is_shown(stream: list[bytes]) -> None:
     whole = shown(stream)
     damaged = shown(stream, {(10, 0), (2 * GROUP + 3, 0)}, concealed=0)
     assert sorted(damaged) == [*range(10), *range(GROUP, 2 * GROUP + 3)]
     assert all(np.array_equal(pixels, whole[number]) for number, pixels in damaged.items())
 
 
-def test_after_a_damaged_key_nothing_is_shown_up_to_the_next(stream: list[bytes]) -> None:
+def test_after_a_damaged_key_nothing_is_shown_until_the_next(stream: list[bytes]) -> None:
     assert len(pieces(stream[GROUP])) > 2
     assert sorted(shown(stream, {(GROUP, 1)})) == [*range(GROUP), *range(2 * GROUP, COUNT)]
 
@@ -117,7 +117,7 @@ def test_nothing_is_shown_before_a_whole_key(stream: list[bytes]) -> None:
     assert min(shown(stream, {(0, 1)})) == GROUP
 
 
-def test_after_too_much_damage_nothing_is_shown_up_to_the_next_key(stream: list[bytes]) -> None:
+def test_after_too_much_damage_nothing_is_shown_until_the_next_key(stream: list[bytes]) -> None:
     gone = [5, 8, 11]
     lost = {(number, at) for number in gone for at in range(len(pieces(stream[number])))}
     pictures = shown(stream, lost)
@@ -138,7 +138,7 @@ def test_a_restart_waits_for_a_key(stream: list[bytes]) -> None:
 
 
 def handed_on(stream: list[bytes], lost: set[tuple[int, int]] | None = None, left_out: int | None = None) -> list[int]:
-    """The numbers of the pictures that count as whole; ``left_out`` never reaches the decoder."""
+    """Return the numbers of the pictures that count as whole; ``left_out`` never reaches the decoder."""
     whole: list[int] = []
     video = TelloVideo(2, lambda coded: whole.append(coded.captured_ns))
     for number, unit in units(stream, lost):
@@ -153,7 +153,7 @@ def test_every_picture_is_whole_without_loss_and_has_its_size(stream: list[bytes
     assert [unit.number for _, unit in units(stream)] == list(range(COUNT))
 
 
-def test_a_patched_picture_and_what_builds_on_it_are_not_whole(stream: list[bytes]) -> None:
+def test_a_patched_picture_and_its_successors_are_not_whole(stream: list[bytes]) -> None:
     assert handed_on(stream, {(10, 0)}) == [*range(10), *range(GROUP, COUNT)]
     assert handed_on(stream, {(GROUP, 1)}) == [*range(GROUP), *range(2 * GROUP, COUNT)]
     assert handed_on(stream, left_out=10) == [*range(10), *range(GROUP, COUNT)]
@@ -200,7 +200,7 @@ def test_any_flipped_bits_are_survived(seed: int) -> None:
     shown(stream)
 
 
-def test_the_emulated_camera_is_the_one_that_is_announced() -> None:
+def test_the_emulated_camera_matches_the_drivers() -> None:
     front, bottom = cameras_of(parse_uri("tello://d"))
     assert front.intrinsics is not None
     announced = front.intrinsics

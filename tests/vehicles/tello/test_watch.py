@@ -1,4 +1,4 @@
-"""What the drone is doing, from its state alone."""
+"""The phase of flight from the drone's state alone."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PERIOD_S = 0.1
 
 
 class Film:
-    """States ten times a second, as a table: what is seen, for how long."""
+    """States ten times a second, given as a table: readings and their duration."""
 
     def __init__(self) -> None:
         self.watch = FlightWatch()
@@ -29,17 +29,17 @@ class Film:
         return self.watch.phase
 
 
-def test_a_drone_that_stands_is_known_at_once() -> None:
+def test_a_landed_drone_is_recognised_at_once() -> None:
     assert Film().show(0.1) is FlightState.LANDED
 
 
-def test_a_drone_that_is_found_in_the_air_is_known_within_two_seconds() -> None:
+def test_a_drone_found_in_the_air_is_recognised_within_two_seconds() -> None:
     film = Film()
     assert film.show(0.2, tof=90, h=80, motors=True) is FlightState.UNKNOWN
     assert film.show(1.5, tof=90, h=80, motors=True) is FlightState.HOVERING
 
 
-def test_one_that_is_held_in_a_hand_is_not_flying() -> None:
+def test_a_drone_held_in_a_hand_is_not_flying() -> None:
     film = Film()
     assert film.show(0.5, tof=120, h=0) is FlightState.UNKNOWN
     assert film.show(2.0, tof=120, h=0) is FlightState.LANDED
@@ -47,7 +47,7 @@ def test_one_that_is_held_in_a_hand_is_not_flying() -> None:
     assert film.show(3.0, tof=120, h=100) is FlightState.LANDED
 
 
-def test_take_off_and_landing_as_they_are_seen() -> None:
+def test_a_take_off_and_a_landing() -> None:
     film = Film()
     film.show(3.0)
     film.watch.rising = True
@@ -61,18 +61,18 @@ def test_take_off_and_landing_as_they_are_seen() -> None:
     assert film.show(2.0, tof=10, h=-60) is FlightState.LANDED
 
 
-def test_an_answer_tells_that_it_landed_before_the_motors_are_seen_to_stand() -> None:
+def test_an_answer_reports_the_landing_before_the_motors_are_seen_to_stop() -> None:
     film = Film()
     film.show(3.0, tof=80, h=80, motors=True)
     film.watch.sinking = True
     film.show(1.0, tof=50, h=50, motors=True)
     film.watch.landing_answered = True
-    assert film.show(0.2, tof=50, h=50, motors=True) is FlightState.LANDING  # an answer alone is none
+    assert film.show(0.2, tof=50, h=50, motors=True) is FlightState.LANDING  # an answer alone does not count
     assert film.show(0.1, tof=10, h=0, motors=True) is FlightState.LANDED
     assert film.show(2.0, tof=10, h=0) is FlightState.LANDED
 
 
-def test_a_take_off_that_stays_low_ends_as_one() -> None:
+def test_a_take_off_that_stays_low_ends_too() -> None:
     film = Film()
     film.show(3.0)
     film.watch.rising = True
@@ -81,7 +81,7 @@ def test_a_take_off_that_stays_low_ends_as_one() -> None:
     assert film.show(6.0, tof=30, h=20, motors=True) is FlightState.HOVERING
 
 
-def test_motors_that_stop_end_the_flight() -> None:
+def test_stopped_motors_end_the_flight() -> None:
     film = Film()
     assert film.show(3.0, tof=80, h=80, motors=True) is FlightState.HOVERING
     assert film.show(4.0, tof=None, h=80) is FlightState.LANDED
@@ -104,7 +104,7 @@ def test_heights(distance: float | None, height: float | None, metres: float | N
 
 
 def test_axes_of_the_velocity() -> None:
-    state = State(yaw_deg=90.0, speed_dm_s=(0.0, 5.0, -2.0))  # its nose points to the right of the start's heading
+    state = State(yaw_deg=90.0, speed_dm_s=(0.0, 5.0, -2.0))  # its nose points to the right of the initial heading
     assert velocity_m_s(state, VelocityAxes.START) == pytest.approx((0.5, 0.0, 0.2))
     assert velocity_m_s(state, VelocityAxes.BODY) == pytest.approx((0.0, -0.5, 0.2))
     assert velocity_m_s(state, VelocityAxes.NONE) is None

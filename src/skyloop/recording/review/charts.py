@@ -1,4 +1,4 @@
-"""A page that needs nothing else: style, script, data, and charts as SVG, coloured by the page's classes."""
+"""A self-contained report page: style, script, data, and charts as SVG, coloured by the page's classes."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from skyloop.files import write
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 1120  #: of all charts with a time axis; the page scales them
+WIDTH: Final = 1120  #: width of all charts with a time axis; the page scales them
 LEFT: Final = 64  #: space for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
 AXIS: Final = 20  #: space for the labels of the time axis
-BUCKETS: Final = 700  #: a line has at most twice as many points: least and greatest of each bucket
-GAP_FACTOR: Final = 8.0  #: a step longer than so many usual ones is a gap in the line
+BUCKETS: Final = 700  #: a line has at most twice as many points: minimum and maximum of each bucket
+GAP_FACTOR: Final = 8.0  #: a step longer than this many usual ones is a gap in the line
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A series over time; NaN where nothing is known. ``style`` is the CSS class of its colour."""
+    """A series over time; NaN where unknown. ``style`` is the CSS class of its colour."""
 
     label: str
     t_s: Floats
     values: Floats
     style: str = "c1"
     dashed: bool = False
-    steps: bool = False  #: drawn in steps: a value holds until the next one
+    steps: bool = False  #: draw steps: a value holds until the next one
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A stretch of time with a name; ``style`` is the CSS class of its colour."""
+    """A named interval; ``style`` is the CSS class of its colour."""
 
     begin_s: float
     end_s: float
@@ -51,7 +51,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A moment with a text; ``style`` is the CSS class of its colour."""
+    """A labelled moment; ``style`` is the CSS class of its colour."""
 
     t_s: float
     text: str
@@ -60,7 +60,7 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class TimeAxis:
-    """The horizontal axis of time."""
+    """The horizontal time axis."""
 
     begin_s: float
     end_s: float
@@ -72,7 +72,7 @@ class TimeAxis:
 
 
 def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: float) -> list[Span]:
-    """Return the stretches with one name that has a style, where ``*`` is any other; the last ends at ``end_s``."""
+    """Return the intervals of names with a style (``*`` is any other name); the last ends at ``end_s``."""
     found: list[Span] = []
     if not len(t_s):
         return found
@@ -87,7 +87,7 @@ def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: f
 
 
 def ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers from low to high, at most so many or one more: 1, 2 or 5 times a power of ten apart."""
+    """Return round numbers from low to high, at most ``most`` + 1, at 1, 2 or 5 times a power of ten."""
     if not high > low:
         return [low]
     raw = (high - low) / most
@@ -98,7 +98,7 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> tuple[float, float]:
-    """Return limits of the vertical axis, so far apart at least: all known values with a margin, and 0 if wanted."""
+    """Return vertical limits at least ``least_span`` apart: all known values with a margin, and 0 if wanted."""
     known = [values for line in lines if (values := line.values[np.isfinite(line.values)]).size]
     if not known:
         return 0.0, least_span
@@ -113,7 +113,7 @@ def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> t
 
 
 def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, Floats]:
-    """Reduce points to at most two per bucket, the least and the greatest, so that no peak is lost."""
+    """Reduce points to at most two per bucket, minimum and maximum, so that no peak is lost."""
     if len(t_s) <= 2 * buckets:
         return t_s, values
     keep: list[int] = []
@@ -163,7 +163,7 @@ def time_chart(
 
 
 def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Sequence[Mark], axis: TimeAxis) -> str:
-    """Draw rows of named stretches, and below them a row of marks."""
+    """Draw rows of named intervals, and below them a row of marks."""
     each = 24
     height = TOP + each * (len(rows) + bool(marks)) + AXIS
     parts = [_grid(axis, height)]
@@ -233,7 +233,7 @@ def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) 
 
 
 def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int = 48) -> str:
-    """Pieces of one path, from the colour of the start to that of the end."""
+    """Draw a path in pieces, from the colour of the start to that of the end."""
     if len(points) < 2:
         return ""
     span = max(float(t_s[-1] - t_s[0]), 1e-9)
@@ -298,7 +298,7 @@ def _number(value: float) -> str:
 
 
 class Page:
-    """Collects the parts of a page and the numbers that its cursor shows."""
+    """Collects the parts of a page and the values shown at its cursor."""
 
     def __init__(self, title: str, axis: TimeAxis) -> None:
         self._title = title
@@ -312,7 +312,7 @@ class Page:
         self._parts.append(html)
 
     def chart(self, title: str, unit: str, lines: Sequence[Line], limits: tuple[float, float]) -> None:
-        """Append a panel with lines over time, their legend, and their values at the cursor."""
+        """Append a panel with lines over time, their legend and their values at the cursor."""
         name = f"chart{len(self._charts)}"
         self._charts[name] = [[_numbers(part) for part in thin(line.t_s, line.values)] for line in lines]
         drawn = time_chart(name, lines, self.axis, limits)
@@ -322,7 +322,7 @@ class Page:
         )
 
     def way(self, t_s: Floats, x: Floats, y: Floats) -> None:
-        """Let the cursor show the position on the map."""
+        """Make the cursor show the position on the map."""
         step = max(1, len(t_s) // 2000)
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 
@@ -362,13 +362,13 @@ _FILES = ("page.css", "page.js")
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return figures side by side, as HTML."""
+    """Return figures side by side as HTML."""
     cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in pairs)
     return f'<dl class="facts">{cells}</dl>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], classes: Sequence[str]) -> str:
-    """Return a table as HTML, as its cells are; a column of the class ``n`` is one of numbers."""
+    """Return a table as HTML with unescaped cells; class ``n`` marks a column of numbers."""
     titles = "".join(f'<th class="{kind}">{escape(title)}</th>' for title, kind in zip(head, classes, strict=True))
     lines = "".join(
         "<tr>" + "".join(f'<td class="{kind}">{cell}</td>' for cell, kind in zip(row, classes, strict=True)) + "</tr>"
@@ -386,5 +386,5 @@ def _legend(lines: Sequence[Line]) -> str:
 
 
 def _numbers(values: Floats) -> list[float | None]:
-    """Rounded to what can be seen; what is not known is None."""
+    """Round values to visible precision; unknown ones become None."""
     return [round(number, 4) if math.isfinite(number) else None for number in values.tolist()]

@@ -1,4 +1,4 @@
-"""Comparison of two recordings' commands over time: what a changed controller does differently; as a page or image."""
+"""Compare two recordings' commands over time, to see what a changed controller does differently; as a page or image."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.charts import Line, Mark, Page, TimeAxis, band_chart, facts, limits, spans, table
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
-RATE_HZ: Final = 100.0  #: rate at which both are compared; a command holds until the next one
-PART: Final = 0.01  #: greatest difference of set-points that are equal, in their SI unit
+RATE_HZ: Final = 100.0  #: rate of the comparison; a command holds until the next one
+PART: Final = 0.01  #: greatest difference of set-points that count as equal, in their SI unit
 _POSITION: Final = "replay.position_s"
 _UNITS: Final = {
     **dict.fromkeys(("roll", "pitch", "yaw"), "rad"),
@@ -33,14 +33,14 @@ What = Literal["asked", "applied"]
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """One recording's commands: actions, and their numbers with NaN where an action has none of that name."""
+    """One recording's commands: actions, and their values, NaN where an action has none of that name."""
 
     times_s: NDArray[np.float64]
     names: NDArray[np.str_]
     numbers: dict[str, NDArray[np.float64]]
 
     def at(self, times_s: NDArray[np.float64]) -> Commands:
-        """Return the commands in force at some times [s]: the newest of each; none before the first."""
+        """Return the commands in effect at some times [s]; none before the first."""
         index = np.searchsorted(self.times_s, times_s, side="right") - 1
         before = index < 0
         index = np.maximum(index, 0)
@@ -54,27 +54,27 @@ class Commands:
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
-    """The difference of one number of the set-points, over the time in which both have it."""
+    """The difference of one set-point value, over the time when both have it."""
 
     name: str
     unit: str
     rms: float
     largest: float
     largest_at_s: float
-    seconds: float  #: how long both had it
+    seconds: float  #: time during which both have it
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two flights' commands on one time axis, which starts with the older recording."""
+    """Two flights' commands on one time axis that starts with the older recording."""
 
-    aligned: str  #: how the times were aligned, in words
+    aligned: str  #: how the times are aligned, in words
     old: Commands
     new: Commands
-    seconds: float  #: compared
-    same_action: float  #: share of that time in which both did the same kind of thing
+    seconds: float  #: compared time
+    same_action: float  #: share of that time with the same kind of action in both
     fields: tuple[FieldDifference, ...]
-    part_at_s: float | None  #: when they first differ, in kind or by more than :data:`PART`; None: never
+    part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None: never
     counts: tuple[int, int]
 
 
@@ -86,17 +86,16 @@ def compare(
     what: What = "asked",
     part: float = PART,
 ) -> Comparison:
-    """Compare what applications asked for (or what was applied), without the proxies' own commands.
+    """Compare the commands requested by applications (or those applied), without the proxies' own.
 
-    A recording of a replay knows which moment of the old flight each of its own is; else both start with their first
-    command.
+    A recording of a replay maps its times to the old flight; otherwise both recordings start at their first command.
 
     Args:
         old: The older recording.
         new: The newer one.
-        drone: The drone's name; None takes the first of each.
+        drone: The drone's name; None takes each recording's first.
         what: ``"asked"`` or ``"applied"``.
-        part: Greatest difference of set-points that are equal, in their SI unit.
+        part: Greatest difference of set-points that count as equal, in their SI unit.
 
     Raises:
         FileFormatError: A recording has no commands.
@@ -143,7 +142,7 @@ def compare(
 
 
 def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset_ns: int) -> Commands:
-    """``offset_ns`` is added to this recording's times to make them the old one's."""
+    """Return a recording's commands; ``offset_ns`` converts its times to the old recording's."""
     times, names = [], []
     numbers: dict[str, list[float]] = {name: [] for name in ACTION_FIELDS}
     for item in recording.items(drone, (Channel.COMMANDS,)):
@@ -165,12 +164,12 @@ def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset
 
 
 def _align(old: Recording, old_name: str, new: Recording, new_name: str) -> tuple[int, str, int]:
-    """The old recording's first moment, how the times fit, and what to add to the new one's times [ns]."""
+    """Return the old recording's start, how the times fit, and the offset to add to the new one's times [ns]."""
     zero_ns = begin_ns(old, old_name)
     spans = [_span(recording, name) for recording, name in ((old, old_name), (new, new_name))]
     overlap = min(span[1] for span in spans) - max(span[0] for span in spans)
     if overlap > 0.5 * min(span[1] - span[0] for span in spans):
-        return zero_ns, "by their clock, which is the same", 0
+        return zero_ns, "by their common clock", 0
     offsets = []
     for item in new.items(new_name, (Channel.FEEDBACK,)):
         feedback: Feedback = item.value
@@ -180,11 +179,11 @@ def _align(old: Recording, old_name: str, new: Recording, new_name: str) -> tupl
     if len(offsets) > 1 and np.ptp(offsets) < NS_PER_S:
         return zero_ns, "the new one is a replay of the old one", int(np.median(offsets))
     firsts = [_first_command(recording, name) for recording, name in ((old, old_name), (new, new_name))]
-    return zero_ns, "both begin with their first command", firsts[0] - firsts[1]
+    return zero_ns, "both start at their first command", firsts[0] - firsts[1]
 
 
 def _span(recording: Recording, drone: str) -> tuple[int, int]:
-    """First and last command, on the proxy's clock [ns]."""
+    """Return the times of the first and last command, on the proxy's clock [ns]."""
     times = [item.value.applied_ns for item in recording.items(drone, (Channel.COMMANDS,))]
     return (min(times), max(times)) if times else (0, 0)
 
@@ -206,7 +205,7 @@ _NEW: Final[dict[str, Any]] = {"color": "#d9480f", "lw": 1.4, "ls": "--"}
 
 
 def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
-    """Write the comparison of recordings of these names as a ``.html``, or by Matplotlib as a ``.png``.
+    """Write the comparison of two named recordings as ``.html``, or with Matplotlib as ``.png``.
 
     Raises:
         UsageError: The file can't be written.
@@ -229,7 +228,7 @@ def make_page(found: Comparison, old: str, new: str) -> Page:
         facts(
             [
                 ("compared", f"{found.seconds:.1f} s"),
-                ("they part", parted),
+                ("first difference", parted),
                 ("same kind of action", f"{found.same_action:.1%}"),
                 ("commands, old", str(found.counts[0])),
                 ("commands, new", str(found.counts[1])),
@@ -241,7 +240,7 @@ def make_page(found: Comparison, old: str, new: str) -> Page:
         (title, spans(commands.times_s, commands.names, _ACTIONS, axis.end_s))
         for title, commands in (("old", found.old), ("new", found.new))
     ]
-    marks = [] if found.part_at_s is None else [Mark(found.part_at_s, "they part here", "warning")]
+    marks = [] if found.part_at_s is None else [Mark(found.part_at_s, "first difference", "warning")]
     page.add(f'<section class="panel">{band_chart("bands", rows, marks, axis)}</section>')
     for field in found.fields:
         lines = [_line("old", found.old, field.name, "c1"), _line("new", found.new, field.name, "c2")]
@@ -273,7 +272,7 @@ def _picture(found: Comparison, old: str, new: str, path: Path) -> None:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingExtraError("drawing a .png (a .html page needs nothing)", "bench", cause=str(error)) from None
+        raise MissingExtraError("drawing a .png (a .html page needs no extra)", "bench", cause=str(error)) from None
     rows = max(1, len(found.fields))
     figure = Figure(figsize=(12, 1.2 + 2.0 * rows), layout="constrained", dpi=120)
     figure.suptitle(f"{Path(new).name} against {Path(old).name}, {found.aligned}")

@@ -1,6 +1,6 @@
-"""Flights of a recording as episodes for learning: rows at a steady rate, each with what was seen and what was done.
+"""Flights of a recording as episodes for learning: rows at a steady rate, each with observation and action.
 
-Everything but their video is computed from a recording's tables.
+Everything but the video is computed from a recording's tables.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.tables import Table
 from skyloop.recording.review.video import even
 
-MARK: Final = "mark"  #: the name of a logged text that begins another episode, whose task it is
-TAUGHT: Final = "action"  #: the name of logged arrays: what ought to have been done about a picture
+MARK: Final = "mark"  #: name of a logged text that starts another episode and names its task
+TAUGHT: Final = "action"  #: name of logged arrays: the taught action for an image
 _STILL: Final = "hover"
 _STEERED: Final = (FlightState.HOVERING.value, FlightState.FLYING.value)
-_GAP_S: Final = 0.5  #: without a picture, or a state, for so long, an episode ends
-_SHORTEST_S: Final = 1.0
+_GAP_S: Final = 0.5  #: an episode ends after this long without an image or a state
+_SHORTEST_S: Final = 1.0  # shorter episodes are left out
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -38,13 +38,13 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """What each row holds.
+    """The columns of each row.
 
     Attributes:
-        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`.
-        set_point: The set-point that was commanded, a key of :data:`~skyloop.messages.rows.ACTIONS`.
-        cameras: Whose pictures a row has.
-        fps: Rows a second.
+        state: Names of the state's numbers, from :data:`~skyloop.messages.rows.STATE`.
+        set_point: Kind of the commanded set-point, a key of :data:`~skyloop.messages.rows.ACTIONS`.
+        cameras: Cameras whose images a row has.
+        fps: Rows per second.
     """
 
     state: tuple[str, ...]
@@ -60,13 +60,13 @@ class Form:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One flight, or one part of it that the application marked.
+    """One flight, or a part of it marked by the application.
 
     Attributes:
-        task: What was to be done, in words.
-        state: At the capture of the first camera's picture, shape (rows, len(form.state)), float64.
-        action: Taught, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
-        frames_ns: By camera, the capture of each row's picture, on the proxy's clock, shape (rows,).
+        task: The task, in words.
+        state: State at the capture of the first camera's image, shape (rows, len(form.state)), float64.
+        action: Action taught, or commanded by the time of the next row, shape (rows, len(form.action)), float64.
+        frames_ns: Capture of each row's image by camera, on the proxy's clock, shape (rows,).
     """
 
     task: str
@@ -80,7 +80,7 @@ class Episode:
 
 
 def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
-    """Return what can be known in each row of a recording.
+    """Return the columns available in each row of a recording.
 
     Raises:
         FileFormatError: The recording has no feedback, no set-points, or no frames of a camera.
@@ -89,7 +89,7 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
     feedback, commands = tables.get("feedback"), tables.get("commands")
     state = tuple(name for name in STATE if feedback is not None and feedback.known(name))
     if not state:
-        raise FileFormatError("the recording knows nothing of the drone's state: record the channel feedback")
+        raise FileFormatError("the recording has no states of the drone: record the channel feedback")
     for camera in cameras:
         if f"frames.{camera}" not in tables:
             raise FileFormatError(f"the recording has no frames of {camera}")
@@ -108,22 +108,22 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
 def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode]:
     """Cut a recording into episodes.
 
-    An episode lasts while the drone follows set-points, without a gap in pictures or state, and is cut at marks. Its
-    rows are ``1 / form.fps`` apart. Each has the newest picture of every camera, the state at the first camera's
-    capture, and the set-point in force when the next row begins: what was done about that picture. Hovering is a
-    set-point of zeros. Where an application logs arrays with the name ``action``, they are the actions instead: each
-    row has the first one at or after its picture's capture, and a gap in them ends an episode.
+    An episode lasts while the drone follows set-points without a gap in images or state, and is cut at marks. Its rows
+    are ``1 / form.fps`` apart. Each has the newest image of every camera, the state at the first camera's capture, and
+    the set-point in effect when the next row begins: the reaction to that image. Hovering is a set-point of zeros. If
+    an application logs arrays named ``action``, they are the actions instead: each row has the first one at or after
+    its image's capture, and a gap in them ends an episode.
 
     Args:
-        tables: Of one drone.
-        form: What each row holds.
-        task: What was to be done, where no mark says it.
+        tables: Tables of one drone.
+        form: Columns of each row.
+        task: The task where no mark names one.
 
     Returns:
-        Those that last a second at least.
+        The episodes that last at least a second.
 
     Raises:
-        FileFormatError: A logged action has another number of values than the set-points of the form.
+        FileFormatError: A logged action's number of values differs from the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
     state_ns, frames = (
@@ -160,13 +160,13 @@ def _times(table: Table, column: str) -> Times:
 
 
 def _piloted(commands: Table) -> NDArray[np.bool_]:
-    """Which commands an application gave, and not the proxy itself."""
+    """Return which commands came from an application rather than the proxy."""
     given: NDArray[np.bool_] = commands.numbers("app_id") > 0
     return given
 
 
 def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
-    """Return times and values of the actions that were logged; None if none were."""
+    """Return times and values of the logged actions; None if there are none."""
     if logs is None or "values" not in logs.columns:
         return None
     kept = (logs["name"] == TAUGHT) & (logs["values"] != "")
@@ -175,7 +175,7 @@ def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
     rows = [[float(number) for number in text.split()] for text in logs["values"][kept]]
     if any(len(row) != len(form.action) for row in rows):
         raise FileFormatError(
-            f"an array that is logged as {TAUGHT} must have the {len(form.action)} numbers of a set-point "
+            f"an array logged as {TAUGHT} must have the {len(form.action)} numbers of a set-point "
             f"({', '.join(form.action)})"
         )
     times = _times(logs, "at_ns")[kept]
@@ -184,12 +184,12 @@ def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
 
 
 def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, int, str]]:
-    """Return begin and end [ns] and the task of each stretch that follows set-points, cut at marks."""
+    """Return start, end [ns] and task of each stretch that follows set-points, cut at marks."""
     times, steered = _times(feedback, "captured_ns"), np.isin(feedback["state"], _STEERED)
     marks: list[tuple[int, str]] = []
     if logs is not None and "text" in logs.columns:
         marked = (logs["name"] == MARK) & (logs["text"] != "")
-        # The time of a table is relative; a mark lies in the file where it was received, between two states.
+        # A table's times are relative; a mark is in the file where it was received, between two states.
         for t_s, text in zip(logs.numbers("t_s")[marked], logs["text"][marked], strict=True):
             marks.append((int(np.interp(t_s, feedback.numbers("t_s"), times)), str(text)))
     parts = []
@@ -208,13 +208,13 @@ def _parts(feedback: Table, logs: Table | None, task: str) -> list[tuple[int, in
 
 
 def _runs(good: NDArray[np.bool_]) -> list[slice]:
-    """Return the stretches that are true."""
+    """Return the stretches of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], good, [False])).astype(np.int8)))
     return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
-    """Return the state at times, interpolated: angles the short way round."""
+    """Return the state at times, interpolated: angles the shorter way around."""
     times = _times(feedback, "captured_ns")
     columns = []
     for name in form.state:
@@ -227,7 +227,7 @@ def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
 
 
 def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
-    """Return the set-point in force at times; zeros before the first and while it hovers."""
+    """Return the set-point in effect at times; zeros before the first and while hovering."""
     kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
     times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]
     values = np.stack([np.nan_to_num(commands.numbers(f"asked_{name}")[kept]) for name in form.action], axis=1)
@@ -242,21 +242,21 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: pictures: training reads them in any order
-_LOOKED_AT_EVERY: Final = 16  #: a row of these, for what is said of all
-_THINNED: Final = 4  #: of a picture that is looked at, each fourth row and column
+_KEY_EVERY: Final = 2  #: images between key frames: training reads them in any order
+_LOOKED_AT_EVERY: Final = 16  #: rows sampled for the statistics
+_THINNED: Final = 4  #: sampled images use every fourth row and column
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
 Pixels = NDArray[np.uint8]
 
 
 class Film:
-    """One camera's pictures of all episodes at a steady rate: H.264 in an MP4 file, there once it is closed well.
+    """One camera's images of all episodes at a steady rate: H.264 in an MP4 file that exists once closed without error.
 
     Attributes:
-        width: Of the pictures [px]; 0 before the first.
-        height: Of the pictures [px].
-        repeated: Rows whose picture could not be decoded, for which the one before stands.
+        width: Width of the images [px]; 0 before the first.
+        height: Height of the images [px].
+        repeated: Number of rows whose image could not be decoded and repeats the one before.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -281,17 +281,17 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Complete the file; after an error it is removed."""
+        """Complete the file; remove it after an error."""
         if kind is None and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._opened.__exit__(kind, error, trace)
 
     def add(self, recording: Recording, drone: str, camera: str, wanted_ns: Sequence[Times]) -> None:
-        """Encode the pictures of a recording's rows, by the capture of each, of each episode in order.
+        """Encode the images of a recording's rows, given by their captures, episode by episode.
 
         Raises:
-            FileFormatError: The first picture can't be decoded.
-            UsageError: A picture has another size than the first.
+            FileFormatError: The first image can't be decoded.
+            UsageError: An image's size differs from the first.
             MissingExtraError: OpenCV, or a PyAV with x264, is not installed.
         """
         wanted = np.concatenate([np.empty(0, np.int64), *wanted_ns])
@@ -312,14 +312,14 @@ class Film:
             while at < len(wanted) and wanted[at] <= captured_ns:
                 self._encode(image, recording.path)
                 at += 1
-        for _ in wanted[at:]:  # their pictures are missing at the end of a file that was cut off
+        for _ in wanted[at:]:  # their images are missing at the end of a truncated file
             if image is None:
-                raise FileFormatError(f"{recording.path}: no picture of {camera} can be decoded")
+                raise FileFormatError(f"{recording.path}: no image of {camera} can be decoded")
             self.repeated += 1
             self._encode(image, recording.path)
 
     def stats(self) -> dict[str, Any]:
-        """Return least, greatest, mean, deviation and quantiles of each channel: red, green, blue, 0 to 1."""
+        """Return minimum, maximum, mean, deviation and quantiles of each channel: red, green, blue, 0 to 1."""
         pixels = np.concatenate([image.reshape(-1, 3) for image in self._looked_at])[:, ::-1] / 255.0
         found = numbers_stats(pixels)
         return {name: [self._rows] if name == "count" else [[[v]] for v in value] for name, value in found.items()}
@@ -332,8 +332,8 @@ class Film:
             self._begin(width, height)
         if (width, height) != (self.width, self.height):
             raise UsageError(
-                f"{path} has pictures of {width}×{height}, the first ones were {self.width}×{self.height}: "
-                "export what does not go together one by one"
+                f"{path} has images of {width}×{height}, the first ones were {self.width}×{self.height}: "
+                "export recordings that don't match separately"
             )
         if self._rows % _LOOKED_AT_EVERY == 0:
             self._looked_at.append(image[::_THINNED, ::_THINNED].copy())
@@ -354,7 +354,7 @@ class Film:
 
 
 def numbers_stats(values: NDArray[Any]) -> dict[str, Any]:
-    """Return what a dataset says of a column's numbers, each as a list: one, or one for each of a row's."""
+    """Return a dataset's statistics of a column, each a list: one value, or one per number of a row."""
     columns = values.reshape(len(values), -1).astype(np.float64)
     found = {"min": columns.min(0), "max": columns.max(0), "mean": columns.mean(0), "std": columns.std(0)}
     found |= {name: np.quantile(columns, share, axis=0) for name, share in _QUANTILES.items()}

@@ -1,7 +1,7 @@
 """Export of recorded flights as a LeRobotDataset, version 3.0.
 
-The layout is that of https://huggingface.co/docs/lerobot/lerobot-dataset-v3: one Parquet file of rows, one video of
-each camera, and in ``meta/`` what they hold.
+The layout is https://huggingface.co/docs/lerobot/lerobot-dataset-v3: one Parquet file of rows, one video per camera,
+and their description in ``meta/``.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _OTHERS: Final = {"timestamp": "float32"} | dict.fromkeys(
 )
 _PURPOSE: Final = "exporting for LeRobot"
 
-#: Called with what is being done, and the share of it that is done, from 0 to 1.
+#: Called with the current step and its progress, 0 to 1.
 Doing = Callable[[str, float], object]
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What an export wrote."""
+    """The result of an export."""
 
     folder: Path
     form: Form
     episodes: int
     rows: int
-    repeated: int  #: pictures that could not be decoded, for which the one before stands
+    repeated: int  #: images that could not be decoded and repeat the one before
 
 
 @dataclass(slots=True)
@@ -73,34 +73,34 @@ def export_lerobot(
 ) -> Exported:
     """Write flights as episodes of a LeRobotDataset.
 
-    An episode lasts while the drone follows set-points; a logged text with the name ``mark`` begins another, whose task
-    it is. What a row holds is in :func:`skyloop.recording.review.episodes.episodes`.
+    An episode lasts while the drone follows set-points; a logged text named ``mark`` starts another and names its task.
+    :func:`skyloop.recording.review.episodes.episodes` describes the rows.
 
     Args:
-        recordings: Of drones that were flown alike.
-        folder: Must not exist, or be empty.
+        recordings: Recordings of drones flown alike.
+        folder: Folder of the dataset; it must be new or empty.
         drone: The drone's name in each recording; None: each one's first.
-        cameras: Whose pictures; None: all of the first recording.
-        fps: Rows a second.
-        task: What was to be done, where no mark says it.
-        doing: Called as the work goes on.
+        cameras: Cameras to export; None: all of the first recording.
+        fps: Rows per second.
+        task: The task where no mark names one.
+        doing: Called with progress.
 
     Raises:
-        UsageError: The folder can't be written or is not empty, the recordings don't go together, or ``fps`` is out of
+        UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of
             range.
         UnknownNameError: A recording has no such drone.
-        FileFormatError: A recording has no feedback, set-points or frames, or there is no episode in all of them.
+        FileFormatError: A recording has no feedback, set-points or frames, or none has an episode.
         MissingExtraError: PyArrow, PyAV or OpenCV is not installed.
     """
     doing = doing or (lambda *_: None)
     writer = _Writer(folder)
     require_pyav(_PURPOSE)
     if not LEAST_FPS <= fps <= MOST_FPS:
-        raise UsageError(f"rows a second must be from {LEAST_FPS:g} to {MOST_FPS:g}, not {fps!r}")
+        raise UsageError(f"fps is {fps!r} and must be from {LEAST_FPS:g} to {MOST_FPS:g}")
     form, flights = _read(recordings, drone, cameras, fps, task, doing)
     whole = [episode for flight in flights for episode in flight.episodes]
     if not whole:
-        raise FileFormatError("no flight that was recorded follows set-points for a second or more, with its pictures")
+        raise FileFormatError("no recorded flight follows set-points for at least a second with images")
     writer.make_folders()
     films: dict[str, Film] = {}
     for camera in form.cameras:
@@ -145,7 +145,7 @@ def _read(
         if here != form:
             raise UsageError(
                 f"{recording.path} has {_words(here)}, and {recordings[0].path} {_words(form)}: "
-                "export what does not go together one by one, or choose the cameras that all have"
+                "export recordings that don't match separately, or choose the cameras that all have"
             )
         flights.append(_Flights(recording, name, episodes(found, form, task)))
     if form is None:
@@ -157,7 +157,7 @@ def _words(form: Form) -> str:
     return f"{form.set_point} set-points, the state {', '.join(form.state)} and the cameras {', '.join(form.cameras)}"
 
 
-# What the files hold -----------------------------------------------------------------------------------------------
+# Contents of the files ---------------------------------------------------------------------------------------------
 
 
 def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[str, NDArray[Any]]:
@@ -175,7 +175,7 @@ def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[st
 
 
 def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
-    """Which rows and which part of each video are an episode's."""
+    """Return each episode's rows and part of each video."""
     ends = np.cumsum([len(episode) for episode in whole])
     begins = ends - [len(episode) for episode in whole]
     zeros = np.zeros(len(whole), np.int64)
@@ -260,7 +260,7 @@ class _Writer:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"{self._folder} can't be made: {error.strerror}") from error
+            raise UsageError(f"{self._folder} can't be created: {error.strerror}") from error
 
     def table(self, name: str, columns: Mapping[str, Any], metadata: dict[str, str] | None = None) -> None:
         """Write columns; those of shape (rows, n) as lists."""
@@ -275,7 +275,7 @@ class _Writer:
             self._pq.write_table(pa.table(arrays).replace_schema_metadata(metadata), part)
 
     def tasks(self, tasks: Sequence[str]) -> None:
-        """Write the tasks, as Pandas writes a frame whose index they are: that is how they are read."""
+        """Write the tasks as the index of a Pandas frame, as readers expect."""
         columns = {"task_index": np.arange(len(tasks)), "task": list(tasks)}
         kinds = [("task_index", "int64", "int64"), ("task", "unicode", "object")]
         described = [

@@ -1,4 +1,4 @@
-"""The report of a flight: one page with its path, its course over time, its key frames and its events."""
+"""The report of a flight: one page with its path, its charts over time, key frames and events."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ _FAILSAFES: Final = {"none": "", "*": "alarm"}
 _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
-_MOST_EVENTS: Final = 500
+_MOST_EVENTS: Final = 500  # listed on the page
 _LONGEST_STEP_S: Final = 0.5  #: over a longer step a velocity is not integrated
-_WIDTH: Final = 360  #: of a thumbnail [px]
-_QUALITY: Final = 80
+_WIDTH: Final = 360  #: width of a thumbnail [px]
+_QUALITY: Final = 80  # JPEG quality of thumbnails
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: share of the usual distance: an even frame is left out if one at an event is nearer than this
-_SAME_CLOCK_S: Final = 60.0  #: a longer delay is left out: the two clocks are unrelated
+_NEAR: Final = 0.4  #: share of the usual spacing: skip an evenly spaced frame this close to one at an event
+_SAME_CLOCK_S: Final = 60.0  #: skip longer delays: the two clocks are unrelated
 
 
 def write_report(
     recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
 ) -> None:
-    """Write the report, reading the recording three times, with at most so many key frames of each camera.
+    """Write the report with at most ``pictures`` key frames per camera, reading the recording three times.
 
     Raises:
         UsageError: The file can't be written.
@@ -75,12 +75,12 @@ def write_report(
     page.add(
         f"<footer>{escape(recording.path.name)}, recorded by Skyloop {escape(recording.start.skyloop)}. Times are "
     )
-    page.add("seconds since the first sample, by the clock of the drone's proxy.</footer>")
+    page.add("seconds since the first sample, on the clock of the drone's proxy.</footer>")
     page.write(path)
 
 
 def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
-    """Create the page's head, the path and the course over time."""
+    """Create the page's head, the path and the charts over time."""
     ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)
@@ -92,7 +92,7 @@ def make_page(recording: Recording, drone: str, found: dict[str, Table], summary
     for note in (*summary.notes, *_losses(summary, drone)):
         page.add(f'<p class="note">{escape(note)}</p>')
     if feedback is None:
-        page.add('<p class="note">no feedback was recorded: there is no course to draw</p>')
+        page.add('<p class="note">no feedback was recorded: there is nothing to draw</p>')
     elif way is not None:
         _path(page, feedback, way)
     page.add('<h2>Course <i class="sub now"></i></h2>')
@@ -114,7 +114,7 @@ def _head(page: Page, recording: Recording, drone: str, summary: Summary) -> Non
 
 
 def _losses(summary: Summary, drone: str) -> Iterator[str]:
-    for what, counts in (("left out by the recorder", summary.dropped), ("never reached it", summary.missed)):
+    for what, counts in (("dropped by the recorder", summary.dropped), ("never reached it", summary.missed)):
         words = ", ".join(f"{count} of {channel}" for channel, count in counts.get(drone, {}).items() if count)
         if words:
             yield f"{words} {what}"
@@ -130,7 +130,7 @@ def _path(page: Page, feedback: Table, way: Way) -> None:
     page.add(f'<span class="sub">{escape(way.source)}; from blue to orange</span></header>')
     page.add(map_chart("path", way.x, way.y, way.t_s) + "</section>")
     page.add('<section class="panel"><header><h3>From the side<i>m, height over x</i></h3></header>')
-    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude_m") else "<p>not known</p>")
+    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude_m") else "<p>unknown</p>")
     page.add("</section></div>")
 
 
@@ -148,14 +148,14 @@ def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
             rows.append((title, spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
     if commands is not None:
         asked = np.where(commands["app_id"] > 0, commands["asked"], "")
-        rows.append(("asked for", spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
+        rows.append(("requested", spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
     return band_chart("bands", [row for row in rows if row[1]], marks(found.get("events")), axis)
 
 
 def _charts(
     recording: Recording, drone: str, found: dict[str, Table]
 ) -> Iterator[tuple[str, str, list[Line], float, bool]]:
-    """Title, unit, lines, least span of the vertical axis, and whether it begins at zero."""
+    """Yield title, unit, lines, least span of the vertical axis, and whether it starts at zero."""
     feedback, commands = found.get("feedback"), found.get("commands")
     if feedback is not None:
         t_s = feedback.numbers("t_s")
@@ -191,7 +191,7 @@ def _charts(
 
 
 def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool = False) -> list[Line]:
-    """What was applied, where a set-point has such a number."""
+    """Return the applied values of set-points that have them."""
     if commands is None:
         return []
     found = []
@@ -204,14 +204,14 @@ def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool =
 
 
 def _turned(yaw: Floats) -> Floats:
-    """In degrees, with a gap where it goes from one end of its range to the other."""
+    """Convert yaw to degrees, with a gap where it wraps around."""
     degrees = np.degrees(yaw)
     jumps = np.abs(np.diff(degrees, prepend=degrees[:1])) > 180.0
     return np.where(jumps, np.nan, degrees)
 
 
 def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterator[Line]:
-    """From the capture to the recorder, and of commands from being sent to being applied [ms]."""
+    """Yield delays from capture to recorder, and of commands from sending to applying [ms]."""
     offset_ns = recording.drone(drone).clock_offset_ns
     colours = iter(_COLOURS)
     for name, samples in found.items():
@@ -228,14 +228,14 @@ def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterat
 
 
 def _clipped(line: Line) -> Line:
-    """One late sample must not flatten all others."""
+    """Clip a line at its 99.5th percentile: one late sample must not flatten all others."""
     if not len(line.values):
         return line
     return Line(line.label, line.t_s, np.minimum(line.values, np.percentile(line.values, 99.5) * 1.05), line.style)
 
 
 def _logged(logs: Table | None) -> Iterator[Line]:
-    """The series of numbers that have a name, at most six."""
+    """Yield the named series of numbers, at most six."""
     if logs is None or "number" not in logs.columns:
         return
     numbers = logs.numbers("number")
@@ -293,17 +293,17 @@ def _channels(page: Page, summary: Summary) -> None:
     page.add("<h2>Channels</h2>" + table(head, rows, ("", "n", "n", "n", "n", "n", "")))
 
 
-# Its course and figures -----------------------------------------------------------------------------------------
+# Path and figures -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Where the drone was, in world axes: x east, y north [m]."""
+    """The path of the drone in world axes: x east, y north [m]."""
 
     t_s: Floats
     x: Floats
     y: Floats
-    source: str  #: where that is known from, in words
+    source: str  #: source of the path, in words
 
     @property
     def length_m(self) -> float:
@@ -312,9 +312,9 @@ class Way:
 
 
 def way_of(feedback: Table) -> Way | None:
-    """Return where the drone was; None if nothing is known of that.
+    """Return the path of the drone; None if unknown.
 
-    From the vehicle's position; else from the simulator's true one; else from its integrated velocity.
+    Taken from the vehicle's position, else the simulator's true one, else the integrated velocity.
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
@@ -331,7 +331,7 @@ def way_of(feedback: Table) -> Way | None:
     steps = np.where(steps > _LONGEST_STEP_S, 0.0, steps)
     east = np.nan_to_num(forward * np.cos(yaw) - left * np.sin(yaw))
     north = np.nan_to_num(forward * np.sin(yaw) + left * np.cos(yaw))
-    return Way(t_s, np.cumsum(east * steps), np.cumsum(north * steps), "summed up from the velocity: it drifts")
+    return Way(t_s, np.cumsum(east * steps), np.cumsum(north * steps), "integrated from the velocity: it drifts")
 
 
 def marks(events: Table | None) -> list[Mark]:
@@ -352,7 +352,7 @@ def airborne_s(feedback: Table) -> float:
 def flight_facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """Return the figures at the head of a report: name and value; only those that are known."""
+    """Return the known figures at the head of a report: name and value."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
@@ -379,7 +379,7 @@ def flight_facts(
 
 
 def moments(first_s: float, last_s: float, events: Table | None, most: int) -> list[tuple[float, str]]:
-    """Select times to show, in order, each with the reason: up to half at events, the others evenly. Pure."""
+    """Select times to show, in order, each with its reason: up to half at events, the others evenly spaced. Pure."""
     if most < 1 or last_s < first_s:
         return []
     chosen: list[tuple[float, str]] = []
@@ -401,7 +401,7 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
 
 
 def figures(recording: Recording, drone: str, camera: str, frames: Table, events: Table | None, most: int) -> list[str]:
-    """Return thumbnails as HTML, each of the first frame from its moment on."""
+    """Return thumbnails as HTML, each of the first frame at or after its moment."""
     t_s, seq = frames.numbers("t_s"), frames["seq"]
     wanted: dict[int, tuple[float, str]] = {}
     for moment, why in moments(float(t_s[0]), float(t_s[-1]), events, most):
@@ -430,7 +430,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
     """Return a small image and its format.
 
-    It is as recorded where it can't be scaled here, and empty if it is damaged, or H.264 that can't be decoded here.
+    Unscaled if it can't be scaled here; empty if damaged, or if it is H.264 that can't be decoded here.
     """
     try:
         image = picture.pixels()

@@ -1,4 +1,4 @@
-"""What is in a recording: counts, rates, gaps, drops and delays by channel; what is wrong with it, and mending that."""
+"""Summarise a recording: counts, rates, gaps, drops and delays by channel; find damage, and recover a damaged file."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from skyloop.recording.scan import Message, Scan, Schema, attachments, open_file
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-GAP_FACTOR: Final = 3.0  #: a step between two messages that is longer than so many usual ones is a gap
-MIN_STEPS: Final = 5  #: with fewer, the usual step is not known
+GAP_FACTOR: Final = 3.0  #: a step between two messages longer than this many usual ones is a gap
+MIN_STEPS: Final = 5  #: with fewer, the usual step is unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
     """Statistics of the time between two stamps of a sample [s]."""
 
-    what: str  #: from what to what
+    what: str  #: the two stamps, in words
     median_s: float
     p99_s: float
 
@@ -40,12 +40,12 @@ class Row:
     topic: str
     schema: str
     count: int
-    rate_hz: float | None  #: None for a single message, or for several at one time
-    gaps: int  #: steps of more than three usual ones; of steady channels only
+    rate_hz: float | None  #: None for a single message, or several at the same time
+    gaps: int  #: steps longer than three usual ones; steady channels only
     longest_s: float | None  #: longest step between two messages [s]
-    missing: int  #: by the gaps in the samples' own numbers
+    missing: int  #: messages missing by gaps in the samples' own numbers
     bytes: int
-    steady: bool  #: whether its messages come at a steady rate, so that rate and gaps are meaningful
+    steady: bool  #: whether messages arrive at a steady rate, so that rate and gaps are meaningful
     delays: tuple[Delay, ...] = ()
 
 
@@ -55,15 +55,15 @@ class Summary:
 
     rows: tuple[Row, ...]
     seconds: float
-    dropped: dict[str, dict[str, int]]  #: by drone and channel: left out by the recorder
-    missed: dict[str, dict[str, int]]  #: by drone and channel: never reached it
-    events: dict[str, int]  #: how many of each severity
-    notes: tuple[str, ...] = ()  #: what is wrong with the file, in words
+    dropped: dict[str, dict[str, int]]  #: samples dropped by the recorder, by drone and channel
+    missed: dict[str, dict[str, int]]  #: samples that never reached the recorder, by drone and channel
+    events: dict[str, int]  #: number by severity
+    notes: tuple[str, ...] = ()  #: problems of the file, in words
 
 
 @dataclass(slots=True)
 class _Tally:
-    """What is gathered of one channel."""
+    """The data gathered of one channel."""
 
     bytes: int = 0
     times: list[int] = field(default_factory=list)
@@ -74,7 +74,7 @@ class _Tally:
         self.delays.setdefault(what, []).append(ns)
 
 
-#: Channels that come at a steady pace.
+#: Channels with a steady rate.
 _STEADY: Final = frozenset({Channel.FEEDBACK, Channel.COMMANDS, Channel.FRAMES})
 
 
@@ -112,17 +112,17 @@ def summarise(recording: Recording, progress: Progress | None = None) -> Summary
 
 
 def notes(recording: Recording) -> list[str]:
-    """Describe what is wrong with the file."""
+    """Describe the problems of the file."""
     found = []
     if recording.cut:
         found.append(f"cut off: {recording.cut} (skyloop log recover repairs it)")
     elif recording.end is None:
-        found.append("repaired, or never closed: what the recorder had not written yet when it was stopped is missing")
+        found.append("repaired, or never closed: samples not yet written when the recorder stopped are missing")
     return [*found, *recording.damaged]
 
 
 def _measure(tally: _Tally, value: Any, received_ns: int) -> None:
-    """Numbers and delays of one sample; ``received_ns`` on the proxy's clock."""
+    """Note numbers and delays of one sample; ``received_ns`` is on the proxy's clock."""
     if isinstance(value, Feedback):
         tally.numbers.append(value.seq)
         tally.delay("capture to proxy", value.published_ns - value.captured_ns)
@@ -163,43 +163,43 @@ def _row(topic: str, tally: _Tally, series: dict[str, Any]) -> Row:
 
 
 def _missing(numbers: list[int]) -> int:
-    """By the gaps in numbers that grow by one; one that is not higher restarts the count."""
+    """Count missing numbers of a sequence that grows by one; a number that is not higher restarts it."""
     steps = np.diff(np.array(numbers, np.int64))
     return int((steps[steps > 1] - 1).sum())
 
 
-# Mending --------------------------------------------------------------------------------------------------------
+# Recovery -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What was recovered."""
+    """The result of a recovery."""
 
     path: Path
-    messages: dict[str, int]  #: by topic
+    messages: dict[str, int]  #: number of messages by topic
     seconds: float
-    size: int  #: of the new file [bytes]
-    lost: int  #: bytes of the old one that could not be read, at most
-    why: tuple[str, ...]  #: what was wrong with it
+    size: int  #: size of the new file [bytes]
+    lost: int  #: greatest number of bytes of the old file that could not be read
+    why: tuple[str, ...]  #: problems of the old file
 
 
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
-    """Read every byte of a recording, and describe what is wrong with it; empty if it is intact."""
+    """Read every byte of a recording and describe its problems; empty if it is intact."""
     for _ in recording.entries(progress=progress):
-        pass  # checksums are looked at as it is read
+        pass  # reading checks the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 
 def recover(recording: Recording, target: Path, progress: Progress | None = None) -> Recovered:
-    """Write what can be read to a new file, which is complete at the end or not there at all.
+    """Write everything readable to a new file, which appears only when complete.
 
     Raises:
-        UsageError: ``target`` exists already, or can't be written.
+        UsageError: ``target`` already exists, or can't be written.
     """
     from mcap.writer import CompressionType, Writer
 
     if target.exists():
-        raise UsageError(f"{target} exists already: choose another name (-o)")
+        raise UsageError(f"{target} already exists: choose another name (-o)")
     found = recording.found
     with replacing(target) as part, part.open("wb") as file:
         counts, read = _copy(found, Writer(file, compression=CompressionType.ZSTD), progress)
@@ -210,7 +210,7 @@ def recover(recording: Recording, target: Path, progress: Progress | None = None
 
 
 def _copy(found: Scan, writer: Writer, progress: Progress | None) -> tuple[dict[str, int], int]:
-    """Return messages by topic, and the bytes of pieces that were read to their end."""
+    """Return messages by topic, and the bytes of completely read pieces."""
     writer.start(PROFILE, "skyloop log recover")
     for record in found.metadata:
         writer.add_metadata(record.name, record.metadata)

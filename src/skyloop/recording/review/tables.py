@@ -1,4 +1,4 @@
-"""The samples of one drone as columns, from which reports and comparisons are made; and their files for others."""
+"""The samples of one drone as columns, the basis of reports and comparisons; and their export to files."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from skyloop.recording.layout import Channel, Drops, FrameRecord, ResultRecord
 from skyloop.recording.plain import Course
 from skyloop.recording.reader import Item, Progress, Recording
 
-#: Columns of the parts of feedback's vectors, in their order.
+#: Columns of the components of feedback's vectors, in order.
 VECTORS: Final[dict[str, tuple[str, str, str]]] = {
     "velocity_m_s": ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"),
     "angular_velocity_rad_s": ("angular_velocity_x_rad_s", "angular_velocity_y_rad_s", "angular_velocity_z_rad_s"),
     "acceleration_m_s2": ("acceleration_x_m_s2", "acceleration_y_m_s2", "acceleration_z_m_s2"),
     "position_m": ("position_x_m", "position_y_m", "position_z_m"),
 }
-#: The numbers that an action may carry, in the order of the columns.
+#: The values that an action can have, in the order of the columns.
 ACTION_FIELDS: Final = (
     *("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate"),
     *("x", "y", "z", "yaw", "speed", "turn_rate"),
 )
-_ABSURD: Final = 1e30  #: greatest number in any unit: its square, and a sum of many, must not overflow
+_ABSURD: Final = 1e30  #: greatest value in any unit: its square, and a sum of many, must not overflow
 Cell = float | int | str | bool | None
 
 
 @dataclass(slots=True)
 class Table:
-    """Columns of one length, of numbers (NaN: not known) or of strings (empty: not known).
+    """Columns of equal length, of numbers (NaN: unknown) or strings (empty: unknown).
 
-    ``t_s`` is the time since the recording's first sample [s], by the proxy's clock; further times are in ns.
+    ``t_s`` is the time since the recording's first sample [s], on the proxy's clock; other times are in ns.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Table:
         return np.where(np.abs(numbers) < _ABSURD, numbers, np.nan)
 
     def known(self, column: str) -> bool:
-        """Whether a column has at least one finite number."""
+        """Return whether a column has at least one finite number."""
         return bool(np.isfinite(self.numbers(column)).any())
 
 
@@ -99,7 +99,7 @@ class _Builder:
 
 
 def _array(cells: list[Cell]) -> NDArray[Any]:
-    """Return integers where all are, floats where all are numbers, else strings."""
+    """Return integers if all cells are, floats if all are numbers, else strings."""
     kinds = {type(cell) for cell in cells}
     if kinds <= {int}:
         return np.array(cells, np.int64)
@@ -132,9 +132,9 @@ def tables(
 def timed(
     recording: Recording, drone: str, channels: Collection[Channel], progress: Progress | None = None
 ) -> Iterator[tuple[Item, int, int]]:
-    """Yield samples with their time and that of the recording's first one, on the proxy's clock [ns].
+    """Yield samples with their time and that of the recording's first sample, on the proxy's clock [ns].
 
-    The first one is that of all channels, so that the tables of several calls have the same start.
+    The first sample is taken from all channels, so that the tables of several calls share their start.
     """
     first_ns = begin_ns(recording, drone)
     course = Course()
@@ -143,7 +143,7 @@ def timed(
 
 
 def begin_ns(recording: Recording, drone: str) -> int:
-    """Return the time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
+    """Return the time of the first sample with a time, on the proxy's clock [ns]; 0 if none has one."""
     course = Course()
     for item in recording.items(drone):
         course.follow(item.value)
@@ -153,7 +153,7 @@ def begin_ns(recording: Recording, drone: str) -> int:
 
 
 def row(item: Item) -> dict[str, Cell]:
-    """Convert a sample to cells by the names of their columns."""
+    """Convert a sample to cells by column name."""
     value = item.value
     cells: dict[str, Cell]
     if isinstance(value, Feedback):
@@ -216,13 +216,13 @@ def _action(prefix: str, action: AnyAction) -> dict[str, Cell]:
 
 
 def _flat(value: Any) -> Cell:
-    """What has parts, as JSON."""
+    """Return a value with parts as JSON."""
     cell: Cell = msgspec.json.encode(value).decode() if isinstance(value, list | dict) else value
     return cell
 
 
 def _cell(value: Any) -> Cell:
-    """Tuples as text, numbers with spaces between."""
+    """Return tuples as text, numbers separated by spaces."""
     if isinstance(value, tuple | list):
         return " ".join(f"{number:.9g}" for number in value)
     cell: Cell = value
@@ -232,18 +232,18 @@ def _cell(value: Any) -> Cell:
 # Files ----------------------------------------------------------------------------------------------------------
 
 
-#: Channels that become a table; frames are listed with their times.
+#: Channels exported as tables; frames are listed with their times.
 TABLES: Final = tuple(Channel)
-_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #: formulas' first characters
+_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #: first characters of formulas
 _NUMBER: Final = r"[-+]?(?:[0-9.]+(?:e[-+]?[0-9]+)?|inf|nan)"
 _NUMBERS: Final = re.compile(rf"{_NUMBER}(?: {_NUMBER})*")
 
 
 def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
-    """Write ``CHANNEL.csv`` for each table: UTF-8, comma, a header line; what is not known is empty.
+    """Write ``CHANNEL.csv`` for each table: UTF-8, comma, a header line; unknown values are empty.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe before it, because applications, and those who
-    made the file, choose such texts.
+    A text that a spreadsheet would take for a formula gets a leading apostrophe, because applications, and the authors
+    of the file, choose such texts.
     """
     _make_folder(folder)
     written = []
@@ -259,7 +259,7 @@ def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
-    """Write ``CHANNEL.parquet`` for each table; what is not known is null.
+    """Write ``CHANNEL.parquet`` for each table; unknown values are null.
 
     Raises:
         MissingExtraError: PyArrow is not installed.
@@ -304,7 +304,7 @@ def read(
 
 
 def _nulls(table: Table) -> dict[str, Any]:
-    """Columns in which what is not known is None."""
+    """Return columns with None for unknown values."""
     return {
         name: [cell or None for cell in values.tolist()] if values.dtype.kind == "U" else values
         for name, values in table.columns.items()
@@ -318,7 +318,7 @@ def _text(cell: Any) -> str:
 
 
 def _harmless(text: str) -> str:
-    """A text that a spreadsheet would take for a formula, with an apostrophe before it; numbers stay as they are."""
+    """Prefix a text that a spreadsheet would take for a formula with an apostrophe; leave numbers alone."""
     return f"'{text}" if text.startswith(_FORMULA) and not _NUMBERS.fullmatch(text) else text
 
 
@@ -326,4 +326,4 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{folder} can't be made: {error.strerror}") from error
+        raise UsageError(f"{folder} can't be created: {error.strerror}") from error

@@ -1,4 +1,4 @@
-"""Export of a camera's frames to MP4: H.264 as it came, anything else encoded."""
+"""Export a camera's frames to MP4: H.264 copied as recorded, anything else encoded."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
-_TIME_BASE: Final = Fraction(1, 60_000)  #: each picture keeps its own time; MPEG-4 takes no more than 65535
-_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first that this PyAV has
+_TIME_BASE: Final = Fraction(1, 60_000)  #: each image keeps its own time; MPEG-4 allows at most 65535
+_CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first one in this PyAV is used
 
 
 @dataclass(frozen=True, slots=True)
 class Videos:
-    """What an export wrote."""
+    """The result of an export."""
 
     videos: tuple[Video, ...]
-    left_out: int  #: frames that are damaged, build on missing ones, or for an encoder have another size
+    left_out: int  #: frames that are damaged, depend on missing ones, or (when encoding) have another size
 
     @property
     def frames(self) -> int:
@@ -51,12 +51,11 @@ def export_mp4(
     encode: bool = False,
     progress: Progress | None = None,
 ) -> Videos:
-    """Write one camera's frames as a video with the times of their capture.
+    """Write one camera's frames as a video with their capture times.
 
-    H.264 is copied as it was recorded, without decoding it, if nothing is drawn into the frames. Where its size or
-    another of its parameters changes, a further file begins: ``film.mp4``, ``film-2.mp4``, … Frames that build on
-    missing ones are left out. All else is encoded into one file; damaged frames, and frames of another size than the
-    first, are left out.
+    H.264 is copied as recorded, without decoding, if nothing is drawn into the frames. If its size or another parameter
+    changes, a new file starts: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing ones are left out.
+    Everything else is encoded into one file, without damaged frames and frames whose size differs from the first.
 
     Args:
         recording: The recording.
@@ -64,8 +63,8 @@ def export_mp4(
         camera: The camera's name.
         path: The file.
         burn_time: Whether to draw the time since the recording's start into a corner of each frame.
-        encode: Whether to encode H.264 as well.
-        progress: Called with the share that was read, 0 to 1.
+        encode: Whether to re-encode H.264, too.
+        progress: Called with the share read so far, 0 to 1.
 
     Raises:
         UnknownNameError: The recording has no such drone or camera.
@@ -81,7 +80,7 @@ def export_mp4(
 
 
 def has_images(recording: Recording, drone: str, camera: str) -> bool:
-    """Whether frames of a camera were recorded as JPEG or PNG, all of them or some."""
+    """Return whether at least some frames of a camera were recorded as JPEG or PNG."""
     images = image_topic(drone, camera)
     return any(series.topic == images for series in recording.series)
 
@@ -109,7 +108,7 @@ def _encoded(
 
     begin = begin_ns(recording, drone) if burn_time else None
     left_out = 0
-    # PyAV would open the file only with the first frame, and raise errors of its own kinds.
+    # PyAV would open the file only with the first frame, and raise its own kinds of errors.
     with replacing(path) as part:
         with part.open("wb") as file, av.open(file, "w", format="mp4") as container:
             encoder = _Encoder(container, begin)
@@ -122,17 +121,17 @@ def _encoded(
 
 
 def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
-    """Decode frames: yield the time of capture [ns], and the image or None for one that can't be decoded."""
+    """Decode frames: yield the capture time [ns] and the image, or None if it can't be decoded."""
     for picture in pictures:
         try:
             image = even(picture.pixels())
         except FileFormatError:
-            image = None  # a damaged frame is left out; the others keep their times
+            image = None  # skip a damaged frame; the others keep their times
         yield picture.header.captured_ns, image
 
 
 class _Encoder:
-    """Encodes frames of the first one's size, and burns in the time since ``begin_ns`` (None: no time)."""
+    """Encodes frames of the first frame's size, and burns in the time since ``begin_ns`` (None: no time)."""
 
     def __init__(self, container: Any, begin_ns: int | None) -> None:
         self._container = container
@@ -143,13 +142,13 @@ class _Encoder:
         self._frames = 0
 
     def add(self, image: NDArray[np.uint8], captured_ns: int) -> bool:
-        """Encode a frame; return False for one of another size, which is left out."""
+        """Encode a frame; return False, and skip it, if its size differs."""
         import av
 
         if self._stream is None:
             self._stream, self._first_ns = _stream(av, self._container, image), captured_ns
         if image.shape[:2] != (self._stream.height, self._stream.width):
-            return False  # the camera was switched to another size, and a video has only one
+            return False  # the camera switched to another size, but a video has only one
         if self._begin_ns is not None:
             _burn(image, (captured_ns - self._begin_ns) / NS_PER_S)
         self._stamp = max(self._stamp + 1, round((captured_ns - self._first_ns) / NS_PER_S / _TIME_BASE))
@@ -160,7 +159,7 @@ class _Encoder:
         return True
 
     def close(self, path: Path) -> Video | None:
-        """Encode what waits; return what was written, or None if that is nothing."""
+        """Encode the waiting frames; return the video, or None if it is empty."""
         stream = self._stream
         if stream is None:
             return None
@@ -186,7 +185,7 @@ def _stream(av: Any, container: Any, image: NDArray[np.uint8]) -> Any:
 
 
 def even(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image without an odd last row or column, as video codecs want it."""
+    """Return an image without an odd last row or column, as video codecs require."""
     height, width = image.shape[0] & ~1, image.shape[1] & ~1
     return np.ascontiguousarray(image[:height, :width])
 
@@ -212,34 +211,34 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 # Copying --------------------------------------------------------------------------------------------------------
 
 
-TIME_BASE: Final = Fraction(1, 90_000)  #: of the files: the clock of video
-MAX_FILES: Final = 50  #: a stream that changes more often is encoded instead
-_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: a longer one is shortened to that: 31 bits hold no six hours
-_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: how long a picture is shown after which none comes
+TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files: the usual video clock
+MAX_FILES: Final = 50  #: encode a stream that changes more often instead
+_LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step: 31 bits hold less than seven hours
+_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration of the last image
 
 
 @dataclass(frozen=True, slots=True)
 class Video:
-    """A video that was written."""
+    """A written video."""
 
     path: Path
     frames: int
-    begin_s: float  #: when its first frame was captured, since that of the first video's
+    begin_s: float  #: capture of its first frame, relative to the first video's
     width: int
     height: int
-    copied: bool  #: whether the frames are as the vehicle encoded them
+    copied: bool  #: whether the frames are the vehicle's own encoding
 
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What an access unit holds."""
+    """The contents of an access unit."""
 
-    parameters: bytes  #: its sequence and picture parameter sets in Annex B form; empty unless it has both
+    parameters: bytes  #: sequence and picture parameter sets in Annex B form; empty unless it has both
     is_picture: bool  #: whether it has a slice of a picture
 
 
 def contents(unit: bytes) -> Contents:
-    """Return what an access unit in Annex B form holds. Pure. ITU-T H.264, 7.3.1 and 7.4.1."""
+    """Parse an access unit in Annex B form. Pure. ITU-T H.264, 7.3.1 and 7.4.1."""
     found = units(unit)
     kinds = {unit_type(one) for one in found}
     sets = [one for one in found if unit_type(one) in (SPS, PPS)] if {SPS, PPS} <= kinds else []
@@ -247,39 +246,39 @@ def contents(unit: bytes) -> Contents:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """Return the name of a video's file: ``film.mp4``, then ``film-2.mp4`` and so on."""
+    """Return a video's file name: ``film.mp4``, then ``film-2.mp4`` and so on."""
     return path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 class TooManyChangesError(FileFormatError):
-    """The stream changes so often that a file for each part of it would be of no use."""
+    """The stream changes too often to write a file for each part."""
 
 
 class StreamCopy:
-    """Writes one camera's frames, in their order, to a video; where the stream changes, to another one.
+    """Writes one camera's frames, in order, to a video, and to another one when the stream changes.
 
-    A stream changes with its parameter sets: MP4 has one of them, at its beginning. Frames that can't be decoded, and
-    those up to the next key frame, are left out; the one before them stands until then.
+    A stream changes with its parameter sets: MP4 has one of them, at its start. Frames that can't be decoded, and those
+    up to the next key frame, are left out; the frame before them stays on screen until then.
 
     Args:
         path: The first file.
-        opened: Closes the files; they are in their places only then.
+        opened: Closes the files, which only then get their final names.
     """
 
     def __init__(self, path: Path, opened: ExitStack) -> None:
-        self.videos: list[Video] = []  #: those that are complete
+        self.videos: list[Video] = []  #: completed videos
         self.left_out = 0
         self._path = path
         self._opened = opened
         self._file: _File | None = None
-        self._whole = False  # whether the frame before was copied
+        self._whole = False  # whether the previous frame was copied
         self._first_ns = 0
 
     def add(self, picture: Picture) -> None:
-        """Copy a frame, or leave it out.
+        """Copy a frame, or skip it.
 
         Raises:
-            TooManyChangesError: It would need more than :data:`MAX_FILES` files.
+            TooManyChangesError: The stream would need more than :data:`MAX_FILES` files.
             OSError: The file can't be written.
         """
         file = self._file_for(picture)
@@ -298,7 +297,7 @@ class StreamCopy:
             file.close()
 
     def _file_for(self, picture: Picture) -> _File | None:
-        """Return the file for a frame, or None for one that can't be decoded."""
+        """Return the file for a frame; None if the frame can't be decoded."""
         key = picture.record.key
         if not picture.can_be_decoded or not (key or self._whole):
             return None
@@ -330,19 +329,19 @@ class StreamCopy:
 
 @dataclass(frozen=True, slots=True)
 class _Template:
-    """What a key frame says of its stream."""
+    """The stream parameters of a key frame."""
 
-    stream: Any  # of PyAV
+    stream: Any  # a PyAV stream
     width: int
     height: int
     close: Callable[[], object]
 
 
 def _template(key: bytes) -> _Template | None:
-    """Let FFmpeg read a key frame's parameter sets; None where it can't."""
+    """Have FFmpeg read a key frame's parameter sets; None if it can't."""
     import av
 
-    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # a damaged size must not make it ask for gigabytes
+    limits: Any = [{"max_pixels": str(MAX_PIXELS)}]  # a damaged size must not make it allocate gigabytes
     try:
         container = av.open(BytesIO(key), format="h264", stream_options=limits)
     except (av.error.FFmpegError, ValueError):
@@ -355,7 +354,7 @@ def _template(key: bytes) -> _Template | None:
 
 
 class _File:
-    """One MP4 file that is written."""
+    """One MP4 file being written."""
 
     def __init__(
         self, path: Path, part: Path, first_ns: int, parameters: bytes, template: _Template, opened: ExitStack
@@ -367,7 +366,7 @@ class _File:
         self.parameters = parameters
         self.width, self.height = template.width, template.height
         self.frames = 0
-        # PyAV would open the file only with the first frame, and raise errors of its own kinds.
+        # PyAV would open the file only with the first frame, and raise its own kinds of errors.
         self._target = opened.enter_context(part.open("wb"))
         self._container: Any = opened.enter_context(av.open(self._target, "w", format="mp4"))
         self._stream = self._container.add_stream_from_template(template.stream)
@@ -377,7 +376,7 @@ class _File:
         self._shortened = 0
 
     def write(self, unit: bytes, captured_ns: int, *, key: bool) -> None:
-        """Append a frame; a time that is not later than the one before is taken for the next possible one."""
+        """Append a frame; replace a time not later than the previous one by the next possible time."""
         import av
 
         packet: Any = av.Packet(unit)
@@ -387,7 +386,7 @@ class _File:
             self._shortened += stamp - self._stamp - _LONGEST_STEP
             stamp = self._stamp + _LONGEST_STEP
         packet.pts = packet.dts = self._stamp = stamp
-        packet.duration = _USUAL_STEP  # of the last frame alone: others end with the next one
+        packet.duration = _USUAL_STEP  # only for the last frame: others end with the next one
         packet.time_base, packet.stream, packet.is_keyframe = TIME_BASE, self._stream, key
         self._container.mux(packet)
         self.frames += 1

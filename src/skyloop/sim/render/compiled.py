@@ -1,7 +1,7 @@
-"""Drawing by the ``kernels``, compiled by Numba where it is installed: the same pictures, several times faster.
+"""Draw with the ``kernels``, compiled by Numba if it is installed: the same pictures, several times faster.
 
-Importing Numba takes the better part of a second, and compiling some more; afterwards the machine code is in Numba's
-cache on the disk. Neither holds up a picture: both happen on a thread of their own.
+Importing Numba takes almost a second, and the first compilation some more; afterwards the machine code is in Numba's
+cache on disk. No picture waits for either: both happen on a separate thread.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _CONSTANTS: Final = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Kernels:
-    """The functions of ``kernels``; by default as they are, uncompiled."""
+    """The functions of ``kernels``; by default uncompiled."""
 
     prepare: Callable[..., int] = kernels.prepare
     draw: Callable[..., None] = kernels.draw
@@ -71,7 +71,7 @@ class CompiledPainter(Painter):
     ) -> None:
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
-        if self._fixed is None or self._fixed[0] is not quads.texture:  # the scene's, whatever has moved
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # fixed for a scene, despite motion
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
             origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
             self._fixed = quads.texture, weight, origin
@@ -91,7 +91,7 @@ class CompiledPainter(Painter):
         )
         edges, planes, box = np.empty((n, 4, 3)), np.empty((n, 3)), np.empty((n, 4), np.int64)
         table = np.empty((13, n + 1), np.float32)
-        # In one piece each: of another layout Numba would compile the function anew.
+        # Contiguous arrays: Numba would recompile the function for another layout.
         whole = [np.ascontiguousarray(part) for part in scene]
         count = self._do.prepare(*whole, _CONSTANTS, self._grid, self.pixel_area, edges, planes, box, table)
         raster, pixels = self.raster, picture.shape[0] * picture.shape[1]
@@ -124,10 +124,10 @@ class CompiledPainter(Painter):
 
 
 def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
-    """How many rows of the grid must be known for each row of the picture, and how many of the last ones are needed."""
+    """Return the number of grid rows needed for each row of the picture, and how many of the last ones to keep."""
     height, width = raster.rays.x.shape
     row = raster.lookup.reshape(height, width) // raster.grid.width
-    # For the samples below, and to know whether what is below those of the row differs.
+    # For the samples below, and to know whether the samples below a row differ from it.
     rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
     at_once = -(-kernels.BLOCK // width) + 1  # rows of the picture
     first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]
@@ -137,25 +137,25 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
 
 
 class Compiler:
-    """Compiles the kernels for this process, once, on a thread of its own.
+    """Compiles the kernels for this process, once, on a separate thread.
 
-    The end of the process doesn't wait for all of it, only for the function that is being compiled just then: LLVM must
-    not lose the ground under its feet.
+    The end of the process waits only for the function being compiled at that moment, not for all of them: LLVM must not
+    be torn down while it works.
 
     Args:
-        load: Returns them, compiled when they are called first. Raises ``ImportError`` where Numba is not installed.
+        load: Returns the kernels, which compile on their first call. Raises ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
-        self.kernels: Kernels | None = None  #: once they are compiled
-        self.problem = ""  #: why there are no kernels, once that is known
+        self.kernels: Kernels | None = None  #: None until compiled
+        self.problem = ""  #: why there are no kernels; empty until known
         self._load = load or load_kernels
         self._lock = threading.Lock()
         self._compiling = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def start(self) -> threading.Thread:
-        """Start the compiling unless it was; return its thread."""
+        """Start compiling unless it has started; return its thread."""
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
@@ -164,7 +164,7 @@ class Compiler:
             return self._thread
 
     def _hold(self, process: int) -> None:
-        """Begin no other function, for good; a fork has no such thread, and the lock as it was."""
+        """Block further compilation for good; after a fork neither the thread nor a usable lock remains."""
         if process == os.getpid():
             self._compiling.acquire()
 
@@ -174,8 +174,8 @@ class Compiler:
             _draw_once(Kernels(*(self._one_by_one(getattr(functions, name)) for name in KERNELS)))
             self.kernels = functions
         except ImportError as error:
-            self.problem = f"Numba is not there: {error}"
-        except Exception as error:  # noqa: BLE001  of a compiler anything; the other way of drawing needs none
+            self.problem = f"Numba is not installed: {error}"
+        except Exception as error:  # noqa: BLE001  a compiler may raise anything; drawing works without it
             self.problem = f"Numba can't compile here: {(str(error) or repr(error)).splitlines()[0]}"
             _log.warning("pictures are drawn without compiled code, which takes several times longer: %s", self.problem)
 
@@ -188,11 +188,11 @@ class Compiler:
 
 
 def load_kernels() -> Kernels:
-    """Return the kernels as Numba's functions, which it compiles, or loads from its cache, when they are called first.
+    """Return the kernels as Numba functions, which compile or load from the cache on their first call.
 
     Raises:
         ImportError: Numba is not installed.
-        RuntimeError: Its cache can't be written: without one each start would compile for seconds.
+        RuntimeError: Its cache is not writable: every start would spend seconds on compilation.
     """
     import numba
 
@@ -201,7 +201,7 @@ def load_kernels() -> Kernels:
 
 
 def _draw_once(functions: Kernels) -> None:
-    """Draw a tiny picture, because Numba compiles a function when it is called with types that are new to it."""
+    """Draw a tiny picture, because Numba compiles a function on its first call with new types."""
     textures, shapes = AtlasBuilder(), QuadBuilder()
     grey = textures.add("grey", lambda: np.full((8, 8, 3), 128, np.uint8))
     shapes.rectangle((-1, -1, 0), (2, 0, 0), (0, 2, 0), grey)

@@ -49,14 +49,14 @@ _TYRE: Rgb = (34, 34, 36)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Figure:
-    """A figure's parts: what is stiff, and limbs that swing about their upper ends.
+    """A figure's parts: the rigid body, and limbs that swing about their upper ends.
 
     Attributes:
-        body: What is stiff.
-        limbs: Of as many equal numbers of quads as there are joints, each with its joint as origin; None: no limbs.
-        joints: Where they hang, (limbs, 3).
-        swings: How far each swings ahead at the middle of a step, rad, (limbs,).
-        spots: Of the shadow: x, y, radius [m].
+        body: The rigid part.
+        limbs: As many equally large groups of quads as there are joints, each with its joint as origin; None: none.
+        joints: Positions of the joints, (limbs, 3).
+        swings: Forward swing of each limb in the middle of a step [rad], (limbs,).
+        spots: Circles of the shadow: x, y, radius [m].
     """
 
     body: Quads
@@ -66,7 +66,7 @@ class Figure:
     spots: tuple[Vec3, ...]
 
     def posed(self, position_m: Floats, rotation: Floats, walked_m: float) -> Quads:
-        """Return it at a place, after a way walked [m]: limbs first swing as the walk begins, and stop with it."""
+        """Return it at a position after a distance walked [m]; the swing starts and stops with the walk."""
         body = self.body.moved(position_m, rotation)
         if self.limbs is None:
             return body
@@ -83,7 +83,7 @@ class Figure:
         return self.posed(np.zeros(3), np.eye(3), 0.0)
 
     def shadows(self, position_m: Floats, rotation: Floats) -> list[Shadow]:
-        """Return its soft shadow on the ground it stands on."""
+        """Return its soft shadow on the ground below it."""
         return [Shadow(position_m + rotation @ (x, y, 0.0), radius, 0.5) for x, y, radius in self.spots]
 
 
@@ -166,7 +166,7 @@ def _car(atlas: AtlasBuilder, target: FigureTarget) -> Figure:
 def _cabin(
     shapes: QuadBuilder, low: Vec3, roof: Vec3, bottom: float, top: float, textures: tuple[Texture, Texture, Texture]
 ) -> None:
-    """A cabin with slanted sides. ``low``, ``roof``: x from, x to, ±y. Textures: of ends, of sides, of the roof."""
+    """Add a cabin with slanted sides. ``low``, ``roof``: x from, x to, ±y. Textures: of ends, of sides, of the roof."""
     (a0, a1, b), (c0, c1, d) = low, roof
     under = [np.array(p) for p in ((a0, -b, bottom), (a1, -b, bottom), (a1, b, bottom), (a0, b, bottom))]
     over = [np.array(p) for p in ((c0, -d, top), (c1, -d, top), (c1, d, top), (c0, d, top))]
@@ -185,7 +185,7 @@ def _pick(rng: np.random.Generator, colours: tuple[Rgb, ...]) -> Rgb:
 
 
 def _cloth(first: Rgb, second: Rgb, pattern: int) -> Image:
-    """Plain, stripes across, a broad band, or checks."""
+    """Draw cloth: plain, with stripes across, a broad band, or checks."""
     picture, other = draw_paint(first, 96, 64), draw_paint(second, 96, 64)
     rows, columns = np.arange(96)[:, None], np.arange(64)[None, :]
     masks: tuple[Callable[[], NDArray[np.bool_]], ...] = (
@@ -233,7 +233,7 @@ def _car_end(rgb: Rgb, *, front: bool) -> Image:
 
 
 def _glass(rgb: Rgb, *, panes: int) -> Image:
-    """Panes with the car's colour around them, and a bright streak."""
+    """Draw panes with the car's colour around them, and a bright streak."""
     picture = draw_paint(rgb, 64, 128)
     width = 128 // panes
     for pane in range(panes):

@@ -1,12 +1,12 @@
 """The planar renderer's work as loops over quads and pixels, for Numba to compile (``compiled``).
 
-They compute what ``visibility`` and ``shading`` compute, operation by operation in the same order and the
-same precision, so the picture is the same bit by bit; those modules explain the mathematics. They also run
-uncompiled, slowly, which is how they are tested where Numba is not installed. Each is one flat function, because a
-compiled one can't call one that is not. None holds the interpreter lock once compiled.
+They compute the same as ``visibility`` and ``shading``, operation by operation in the same order and precision, so the
+picture is identical bit by bit; those modules explain the mathematics. The loops also run uncompiled, slowly, for tests
+without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled, they do
+not hold the interpreter lock.
 
-Inner loops are short, write one array each, and stay in single precision: only such become vector instructions.
-Constants that other modules define are arguments: Numba's cache looks for changes in this file only.
+Inner loops are short, write one array each, and stay in single precision: others would not become vector instructions.
+Constants of other modules are arguments, because Numba's cache checks only this file for changes.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     Singles = NDArray[np.float32]
     Shorts = NDArray[np.int16]
 
-BLOCK = 512  # pixels worked on at a time: few enough for the working arrays to stay in the cache
-BAND = 16  # rows of the grid, likewise
-FEW = 8  # of them
-NUMBER = 0x7FFF  # the bits of a sample that are a number: the sign says that another one is near
-_ROUND = np.float32(3 << 22)  # added and taken away, it rounds a number up to 2^22 to a whole one, halves to even
+BLOCK = 512  # pixels per batch: few enough for the working arrays to stay in the cache
+BAND = 16  # rows of the grid per batch, for the same reason
+FEW = 8  # rows of the grid compared at a time
+NUMBER = 0x7FFF  # the bits of a sample's number; the sign marks a different sample nearby
+_ROUND = np.float32(3 << 22)  # adding and subtracting it rounds a number up to 2^22 to an integer, halves to even
 
 
 def prepare(
@@ -48,31 +48,31 @@ def prepare(
     box: NDArray[np.int64],
     table: Singles,
 ) -> int:
-    """Select the quads that may be seen, as ``visible_quads`` and ``sampling_table`` do.
+    """Select the quads that may be visible, like ``visible_quads`` and ``sampling_table``.
 
     Args:
-        vectors: As those after it, of ``Quads``.
+        vectors: See ``Quads``, as for the following ones.
         starts: See ``Quads``.
         two_sided: See ``Quads``.
         lit: See ``Quads``.
-        shown: Whether a quad is to be drawn at all, (n,).
-        weight: Of each quad's inverse depth, by its priority, (n,).
+        shown: Whether to draw a quad at all, (n,).
+        weight: Factor on each quad's inverse depth, by its priority, (n,).
         density: See ``Quads``.
         origin: x, y and span in the atlas of each quad's texture, (n, 3).
-        position: Of the camera.
+        position: The camera's position.
         rotation: World from optical axes.
         constants: Edge-on limit [m], ambient light, direct light, unit of light, factor of the footprint,
             direction to the light, unit.
         grid: width, height, fx, fy, cx, cy.
         pixel_area: 1/(fx fy) of the image.
-        edges: Is written: of each selected quad the planes through its edges: slopes on the grid along x and y, start,
+        edges: Output: planes through the edges of each selected quad: slopes on the grid along x and y, start,
             (n, 4, 3).
-        planes: Is written: its 1/z on the grid as slope along x, slope along y and start, (n, 3).
-        box: Is written: the grid's first row it may cover, the one after the last, and columns likewise, (n, 4).
-        table: Is written: see ``sampling_table``, (13, n + 1).
+        planes: Output: its 1/z on the grid as slope along x, slope along y and start, (n, 3).
+        box: Output: the first grid row it may cover, the one after the last, and columns likewise, (n, 4).
+        table: Output: see ``sampling_table``, (13, n + 1).
 
     Returns:
-        How many were selected.
+        The number of selected quads.
     """
     width, height, fx, fy, cx, cy = grid[0], grid[1], grid[2], grid[3], grid[4], grid[5]
     left, right = -(0.5 + cx) / fx, (width - 0.5 - cx) / fx
@@ -109,7 +109,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # two samples to spare for rounding: the edges decide
+        if ahead:  # with a margin of two samples for rounding: the edges decide
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx
@@ -180,50 +180,51 @@ def draw(
     picture: NDArray[np.uint8],
     packed: NDArray[np.int32],
 ) -> None:
-    """Draw a picture as ``PlainPainter`` does with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+    """Draw a picture like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
-    The nearest quad at each sample is found for a band of the grid, then the rows of the picture that need no more of
-    it are coloured, while the band is still in the cache.
+    For each band of the grid, find the nearest quad at each sample; then colour the picture rows that need no further
+    bands, while this one is still in the cache.
 
     Args:
+        count: The result of :func:`prepare`, which also wrote the next four.
         count: What :func:`prepare` returned, and it wrote the next four.
         edges: See :func:`prepare`.
         planes: See :func:`prepare`.
         box: See :func:`prepare`.
         table: See :func:`prepare`.
-        samples: Of each pixel, 1 or 4.
+        samples: Samples per pixel, 1 or 4.
         to_grid: See ``Raster``.
-        rows_for: How many rows of the grid must be known for each row of the picture, (height,).
+        rows_for: Number of grid rows needed for each row of the picture, (height,).
         ray_x: x of each pixel's ray (x, y, 1), (height, width).
         ray_y: y of it, (height, width).
         sample_x: x of the ray of each column of the grid.
         sample_y: y of the ray of each row of the grid.
-        nearest: Is used: 1/z at each sample of a band, (BAND, columns).
-        numbers: Is used, (BAND, columns).
-        seen: Is used: the table's column for each sample, 0 where there is nothing, and the sign bit where a sample may
-            be another one than the next ones to the right and below. Holds the last rows of the grid that were worked
-            on, as many as the picture needs at a time; a power of two. (rows, columns).
+        nearest: Work array: 1/z at each sample of a band, (BAND, columns).
+        numbers: Work array, (BAND, columns).
+        seen: Work array: the table's column for each sample, 0 for none, and the sign bit if a sample may differ from
+            its neighbours to the right and below. Holds the last processed rows of the grid, as many as the picture
+            needs at a time; a power of two. (rows, columns).
         pairs: The atlas: each texel and the next one, BGRA each, in one number.
         atlas_size: Its rows and columns.
         gap: Between two levels of a texture in the atlas [texels].
-        farthest: 1/z that a ray past a quad's horizon is taken to have [1/m].
-        boxes: Of each shadow: first row, row after the last, first column, column after the last, (s, 4).
+        farthest: 1/z assumed for a ray beyond a quad's horizon [1/m].
+        boxes: Box of each shadow: first row, row after the last, first column, column after the last, (s, 4).
         axes: World from optical.
         shadows: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it,
             (s, 7).
-        picture: Is written: BGR, (height, width, 3).
-        packed: The picture's memory as a number for each pixel but the last, which begin three bytes apart.
+        picture: Output: BGR, (height, width, 3).
+        packed: The picture's memory as one number per pixel except the last, at intervals of three bytes.
     """
     zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
     three, parts = np.float32(3.0), np.float32(32.0)  # a texel has 32 parts along each side
     most_u, most_v = np.float32(atlas_size[1] - 2), np.float32(atlas_size[0] - 2)
     between, far = np.float32(gap), np.float32(farthest)
     stride = np.int32(atlas_size[1])
-    next_row = np.uint64(atlas_size[1])  # unsigned: Numba counts no place from the end
+    next_row = np.uint64(atlas_size[1])  # unsigned: Numba then skips the check for negative indices
     scale_x, scale_y, start_x, start_y = to_grid[0], to_grid[1], to_grid[2], to_grid[3]
     height, width = ray_x.shape
     grid_rows, columns = len(sample_y), len(sample_x)
-    kept = len(seen) - 1  # the bits of a grid's row that are its row in ``seen``
+    kept = len(seen) - 1  # mask from a row of the grid to its row in ``seen``
     kept_, columns_ = np.int32(kept), np.int32(columns)
     seen_ = seen.reshape(-1)
     wide = float(columns)
@@ -237,7 +238,7 @@ def draw(
             crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
     differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
     none, sign = np.int16(0), np.int16(~NUMBER)
-    room = 5 * BLOCK  # each pixel, and four samples of it where they differ
+    room = 5 * BLOCK  # each pixel, and its four samples where they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -286,8 +287,8 @@ def draw(
                 for n in range(columns):
                     line[n] = shown[n]
             known = bottom
-            # A few rows at a time: the bits in which the numbers of a column differ, also in the row below, then those
-            # in which they differ from the next column's.
+            # A few rows at a time: first the bits that differ within a column, including the row below, then the bits
+            # that differ from the next column.
             last = bottom if bottom == grid_rows or samples == 1 else bottom - 1
             while compared < last:
                 end = min(compared + FEW, last)
@@ -307,7 +308,7 @@ def draw(
                     for n in range(columns):
                         line[n] |= near_by[n]
                 compared = end
-        # What each pixel shows, and those that show several quads.
+        # The quad at each pixel, and the pixels with several quads.
         xs, ys = flat_x[begin : begin + count_], flat_y[begin : begin + count_]
         for n in range(count_):
             at_x, at_y = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
@@ -334,14 +335,14 @@ def draw(
                     y_[total], y_[total + 1] = sample_y[row], sample_y[row]
                     y_[total + 2], y_[total + 3] = sample_y[row + 1], sample_y[row + 1]
                     total += 4
-        # What a texture's place is computed from: for pixels in a row that show one quad at once, then by samples.
+        # Coefficients of the texture coordinates: per run of pixels in a row with the same quad, then per sample.
         start = 0
         while start < count_:
             quad = number[start]
             end = start + 1
             while end < count_ and number[end] == quad:
                 end += 1
-            # A little beyond, so that there is no rest; the next ones overwrite it.
+            # Round up to a multiple, so that there is no remainder; the next run overwrites the excess.
             stop = min(start + (end - start + 31) // 32 * 32, count_)
             xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
             into = w_[start:stop]
@@ -399,7 +400,7 @@ def draw(
         for n in range(total):
             texel = np.uint64(spot[n])
             upper[n], lower[n] = pairs[texel], pairs[texel + next_row]
-        # Between four texels: blue and red at once, as far as sixteen bits for each hold them.
+        # Interpolate between four texels: blue and red together, as long as both fit into sixteen bits.
         for n in range(total):
             a, b, c, d = above_[2 * n], above_[2 * n + 1], below_[2 * n], below_[2 * n + 1]
             right, down, bright = part_u[n], part_v[n], light[n]
@@ -413,7 +414,7 @@ def draw(
             c_, d_ = np.int32(np.int32(c >> 8) & 0xFF), np.int32(np.int32(d >> 8) & 0xFF)
             green = np.int32(np.int32(a_ << 5) + np.int32(right * np.int32(b_ - a_)))
             green_under = np.int32(np.int32(c_ << 5) + np.int32(right * np.int32(d_ - c_)))
-            # Rounded to the nearest, halves up; with light, halves to even.
+            # Round to nearest, halves up; with light, halves to even.
             blue = np.int32(np.int32(np.int32(blue << 5) + np.int32(down * np.int32(blue_under - blue)) + 512) >> 10)
             green = np.int32(
                 np.int32(np.int32(green << 5) + np.int32(down * np.int32(green_under - green)) + 512) >> 10
@@ -437,7 +438,7 @@ def draw(
             height_, away_x, away_y, square = shadows[k, 0], shadows[k, 1], shadows[k, 2], shadows[k, 3]
             strength, thickness, more = shadows[k, 4], shadows[k, 5], shadows[k, 6]
             for row in range(max(first_row, boxes[k, 0]), min(last_row + 1, boxes[k, 1])):
-                at_row = row * width - begin  # where the row begins in the block, or would
+                at_row = row * width - begin  # start of the row in the block, possibly outside it
                 start = max(at_row + boxes[k, 2], 0)
                 stop = max(min(at_row + boxes[k, 3], count_), start)
                 xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
@@ -453,13 +454,13 @@ def draw(
                     rim = rim if off < thickness * depth[n] + more else zero
                     shade[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))
                 for n in range(len(out)):
-                    # The nearest to a 255th, by shifts.
+                    # Divide by 255, rounded to nearest, with shifts.
                     dark = np.int32(np.int32(shade[n] * np.int32(out[n] & 0xFF00FF)) + 0x800080)
                     green = np.int32(np.int32(shade[n] * np.int32(np.int32(out[n] >> 8) & 0xFF)) + 0x80)
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)
                     green = np.int32(np.int32(green + np.int32(green >> 8)) & 0xFF00)
                     out[n] = np.int32(dark | green)
-        # Each number's fourth byte is the next pixel's first, and written after it.
+        # Each number's fourth byte is the next pixel's first one, which is written after it.
         bytes_ = packed[begin : begin + count_]
         for n in range(len(bytes_)):
             bytes_[n] = colours[n]

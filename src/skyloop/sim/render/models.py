@@ -1,4 +1,4 @@
-"""The shapes of quadrotors, marker boards on their stands, platforms, and cards of markers. Each in its own axes."""
+"""The shapes of quadrotors, marker boards on their stands, platforms, and marker cards, each in its own axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import MARKER_DICTIONARIES, BoardTarget, FigureTarget, MarkerPattern, PlatformTarget, Rgb, Target
 
-# Hull colours, one drone after the other.
+# Hull colours, drone by drone.
 HULLS: tuple[Rgb, ...] = (
     (235, 96, 24),
     (34, 132, 214),
@@ -36,7 +36,7 @@ _POLE_M = 12.0  # the stand's pole goes through the floor, which hides the rest
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
-    """Add a marker's card around the origin, in face axes: x its right, y its up, z its normal."""
+    """Add a marker's card around the origin, in face axes: x right, y up, z along its normal."""
     drawn = draw_card(pattern)
     half = pattern.card_size_m / 2
     texture = atlas.add(("card", pattern), lambda: drawn.image)
@@ -47,7 +47,7 @@ def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, prio
 def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
     """Return a quadrotor in body axes: a hull with a nose, a crossed frame, four rotors.
 
-    The front rotors have the hull's colour, so that one can see where it is heading.
+    The front rotors have the hull's colour, to make the heading visible.
     """
     shapes = QuadBuilder()
     colour, dark = paint(atlas, hull), paint(atlas, _DARK)
@@ -72,7 +72,7 @@ def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
 
 
 def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """A spinning rotor: a blur of its colour, darker at the hub, with a bright rim."""
+    """Draw a spinning rotor: a blur of its colour, darker at the hub, with a bright rim."""
     size = 64
     y, x = np.mgrid[0:size, 0:size].astype(np.float32) - (size - 1) / 2
     r = np.hypot(x, y) / (size / 2)
@@ -84,7 +84,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def target(atlas: AtlasBuilder, target: Target) -> Quads:
-    """Return a target's shape without its stand: a figure as it stands still."""
+    """Return a target's shape without its stand; a figure stands at rest."""
     if isinstance(target, BoardTarget):
         return board(atlas, target)
     if isinstance(target, FigureTarget):
@@ -93,7 +93,7 @@ def target(atlas: AtlasBuilder, target: Target) -> Quads:
 
 
 def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
-    """Return a marker's card before a wooden board on a pole; origin at the card's centre, x along its normal."""
+    """Return a marker's card in front of a wooden board on a pole; origin at the card's centre, x along its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
     # face axes (right, up, normal) to (x ahead, y left, z up)
@@ -116,7 +116,7 @@ def stand(atlas: AtlasBuilder) -> Quads:
 
 
 def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
-    """Return a slab on a column with the marker on its top; origin in the middle of the top, x along its heading."""
+    """Return a slab on a column with the marker on its top; origin at the centre of the top, x along its heading."""
     x, y, z = (side / 2 for side in target.size_m)
     density = min(200.0, 160.0 / max(x, y))
     top = atlas.add(("slab", target.texture, x, y), lambda: draw_surface(target.texture, 2 * x, 2 * y, density))
@@ -132,7 +132,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 
 
-_CELL = 24  # texels a cell of the marker
+_CELL = 24  # texels per cell of the marker
 _PAPER = 235
 
 
@@ -142,7 +142,7 @@ class Card:
 
     Attributes:
         image: BGR.
-        uv: The part that the card shows: left, top, right, bottom in texels, with fractions.
+        uv: The visible part of the image: left, top, right, bottom in texels, with fractions.
     """
 
     image: NDArray[np.uint8]
@@ -152,7 +152,7 @@ class Card:
 def draw_card(pattern: MarkerPattern) -> Card:
     """Draw a marker with its margin.
 
-    The black square is ``pattern.size_m`` of the card's ``card_size_m`` to the texel's fraction.
+    The black square is ``pattern.size_m`` of the card's ``card_size_m``, to a fraction of a texel.
 
     Raises:
         UnknownNameError: OpenCV has no such dictionary.

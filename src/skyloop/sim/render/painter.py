@@ -1,6 +1,6 @@
-"""What draws a picture: where its lens puts the samples, and drawing with NumPy and OpenCV alone.
+"""Drawing of pictures: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
 
-That is for wherever nothing is compiled, and until it is.
+That painter serves without compiled code, and until compilation is done.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
 
 @dataclass(frozen=True, slots=True)
 class Raster:
-    """What is computed once for a lens: where its samples lie on a distortion-free grid.
+    """Precomputed values for a lens: the positions of its samples on a distortion-free grid.
 
-    A pixel has one sample, the one nearest to where its centre is seen, or four: those around it, which through a lens
-    without distortion are exactly those a quarter of a pixel to each side.
+    A pixel has one sample, the grid point nearest to its centre, or the four around its centre, which without
+    distortion are exactly a quarter of a pixel to each side.
 
     Attributes:
         grid: The grid.
-        samples: Of each pixel: 1 or 4.
-        lookup: Flat place on the grid of each pixel's first sample, (pixels,); the others are the next one, and those
-            below both.
-        to_grid: Scale of x and of y, and start of x and of y: a ray (x, y, 1) of ``rays`` times the scale and added to
-            the start is the column and row of its first sample, when the fraction is cut off. Computed in single
-            precision, like ``lookup``.
+        samples: Samples per pixel: 1 or 4.
+        lookup: Flat index on the grid of each pixel's first sample, (pixels,); the others are the next one, and the two
+            below these.
+        to_grid: Scale of x and of y, and start of x and of y: a ray (x, y, 1) of ``rays`` times the scale plus the
+            start is the column and row of its first sample, after truncation. Computed in single precision, like
+            ``lookup``.
         sample_x: x/z of each column of the grid.
         sample_y: y/z of each row of the grid.
-        rays: Of each pixel's centre.
+        rays: Rays of the pixels' centres.
     """
 
     grid: Grid
@@ -49,7 +49,7 @@ class Raster:
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Lay out one or four samples a pixel: a fifth of a second for 960×720 pixels with distortion, once.
+        """Compute one or four samples per pixel: once, 0.2 s for 960×720 pixels with distortion.
 
         Raises:
             UsageError: The model's distortion can't be inverted.
@@ -57,17 +57,17 @@ class Raster:
         return _raster(model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
 
 
-@lru_cache(maxsize=8)  # 8 MB for one of 960×720 pixels
+@lru_cache(maxsize=8)  # 8 MB each for 960×720 pixels
 def _raster(
     width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: Distortion, samples: int
 ) -> Raster:
     model = CameraModel("lens", width, height, 1.0, fx, fy, cx, cy, distortion)
     centre = _rays(model)
-    # From a pixel's centre to its first sample, and from there to its last, in samples.
+    # From a pixel's centre to its first sample, and from there to its last one, in samples.
     fine, first, more = (2, 0.5, 1) if samples > 1 else (1, 0.0, 0)
     scale = np.array([fine * fx, fine * fy])
     low = centre.min(axis=0) * scale
-    # Without distortion the grid's samples are exactly the pixels' own; otherwise there is one to spare.
+    # Without distortion the grid's samples are exactly the pixels' own; otherwise there is one extra.
     middle = np.ceil(1.0 - low) if model.distorted else first - low
     to_grid = np.concatenate([scale, middle + (0.5 - first)]).astype(np.float32)
     x, y = (np.ascontiguousarray(part.astype(np.float32).reshape(height, width)) for part in centre.T)
@@ -87,18 +87,18 @@ def _raster(
 
 
 def _rays(model: CameraModel) -> NDArray[np.float64]:
-    """x/z and y/z of the rays of all pixels' centres, (pixels, 2)."""
+    """Return x/z and y/z of the rays of all pixels' centres, (pixels, 2)."""
     x, y = np.meshgrid(np.arange(model.width, dtype=np.float64), np.arange(model.height, dtype=np.float64))
     return model.rays(np.column_stack([x.ravel(), y.ravel()]))
 
 
 class Painter(ABC):
-    """Draws through one lens. Holds buffers, so it is for one thread at a time.
+    """Draws through one lens. Reuses buffers, so use it from one thread at a time.
 
     Args:
-        raster: Of the lens.
+        raster: The lens's raster.
         model: The lens.
-        atlas: Textures of what is drawn.
+        atlas: Textures of the scene.
     """
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
@@ -113,11 +113,11 @@ class Painter(ABC):
         """Draw a picture.
 
         Args:
-            quads: Of the scene.
-            shown: Which of them are drawn at all, (n,).
-            shadows: What is darkened.
-            pose: Of the camera.
-            picture: Is written: BGR, (height, width, 3), in one piece.
+            quads: The scene's quads.
+            shown: Which of them to draw at all, (n,).
+            shadows: The shadows.
+            pose: The camera's pose.
+            picture: Output: BGR, (height, width, 3), contiguous.
         """
 
 
@@ -153,7 +153,7 @@ class PlainPainter(Painter):
             darken(picture, shadow, rays, self._inverse_depth)
 
     def _resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-        """Return the table's column of each pixel's first sample, (pixels,), and the pixels whose samples differ."""
+        """Return the table's column of each pixel's first sample, (pixels,), and the pixels with differing samples."""
         raster, numbers = self.raster, self._numbers
         for k, step in enumerate(self._steps):
             np.take(seen[step:], raster.lookup, out=numbers[k], mode="clip")
@@ -162,7 +162,7 @@ class PlainPainter(Painter):
     def _smooth(
         self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]
     ) -> None:
-        """Colour all samples of pixels whose samples see different quads, and average them."""
+        """Colour and average all samples of the pixels whose samples see different quads."""
         raster = self.raster
         places = (raster.lookup[pixels] + np.array(self._steps, dtype=np.int32)[:, None]).reshape(-1)
         row = places // raster.grid.width

@@ -1,13 +1,13 @@
-"""The renderer of simulated cameras: on one core, no display, no GPU, no system packages.
+"""The renderer of simulated cameras: on one core, without display, GPU or system packages.
 
-First it is found which quad each sample of the picture shows (``visibility``), then every pixel is coloured once
-(``shading``): hidden surfaces cost little. Where the samples of a pixel see different quads, all four are coloured and
-averaged, so that silhouettes are smooth. Through a lens with distortion the samples are chosen where the lens puts
-them; nothing is resampled, and textures stay sharp.
+The first step finds the quad at each sample of the picture (``visibility``), the second colours each pixel once
+(``shading``), so that hidden surfaces cost little. If the samples of a pixel see different quads, all four are coloured
+and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens; nothing is
+resampled, and textures stay sharp.
 
-:class:`PlainPainter` does that with NumPy and OpenCV; ``compiled`` does the same arithmetic in loops that Numba
-compiled, several times faster, once they are. The picture is the same, bit by bit, for the same scene, state, pose and
-model, whichever of them draws it.
+:class:`PlainPainter` does this with NumPy and OpenCV; ``compiled`` does the same arithmetic in loops compiled by Numba,
+several times faster, once they are ready. Both give the same picture, bit by bit, for the same scene, state, pose and
+model.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
 WORTH_COMPILING: Final = (
-    30  #: pictures that a renderer draws first: who wants fewer is done sooner without compiled code
+    30  #: pictures that a renderer draws first; for fewer, compilation would take longer than it saves
 )
 
 
 class Quality(Enum):
     """How a picture is sampled."""
 
-    FAST = "fast"  #: one sample a pixel: jagged edges, and behind a distorting lens up to half a pixel out of place
-    SMOOTH = "smooth"  #: four samples a pixel along edges: as good as BEST but for shimmer within textures
+    FAST = "fast"  #: one sample per pixel: jagged edges, and with distortion an error of up to half a pixel
+    SMOOTH = "smooth"  #: four samples per pixel along edges: as good as BEST except for shimmer within textures
     BEST = "best"  #: four samples for every pixel
 
 
 def use_one_core() -> None:
     """Restrict OpenCV, in this whole process, to the calling thread.
 
-    Images this small gain nothing from more, and its worker threads would take the cores that proxies and applications
-    need: a process that only simulates calls this once when it starts.
+    Images this small gain nothing from more threads, and OpenCV's workers would occupy the cores of proxies and
+    applications. A process that only simulates calls this once at its start.
     """
     cv2.setNumThreads(1)
 
@@ -54,7 +54,7 @@ def use_one_core() -> None:
 def dimmed(picture: Image, light: float) -> Image:
     """Multiply all values of an image by a factor of at least 0, in place, rounded, and return it.
 
-    By a table of 256 values, so that it is the same bit by bit on every machine.
+    A table of 256 values makes the result the same bit by bit on every machine.
     """
     table = np.clip(np.rint(np.arange(256) * light), 0, 255).astype(np.uint8)
     np.copyto(picture, cv2.LUT(picture, table))
@@ -62,15 +62,15 @@ def dimmed(picture: Image, light: float) -> Image:
 
 
 class PlanarRenderer:
-    """Renders what an ideal sensor behind a camera's lens sees: with distortion, without noise, blur or vignetting.
+    """Renders the image of an ideal sensor behind a camera's lens: with distortion, without noise, blur or vignetting.
 
-    Those are :class:`SensorEffects`. It holds buffers, so it is for one thread at a time;
-    several renderers may share a scene.
+    Those are added by :class:`SensorEffects`. Reuses buffers, so use it from one thread at a time; several renderers
+    can share a scene.
 
     Args:
-        scene: What is rendered.
-        quality: How it is sampled.
-        compiler: Of the faster way to draw; None: always draw the other way.
+        scene: The scene.
+        quality: Sampling quality.
+        compiler: For compiled drawing; None: always draw without it.
     """
 
     def __init__(
@@ -87,9 +87,9 @@ class PlanarRenderer:
         """Render an image.
 
         Args:
-            state: The poses of everything that moves.
-            pose: Of the camera.
-            model: Of the camera.
+            state: The poses of all moving objects.
+            pose: The camera's pose.
+            model: The camera's model.
             out: Where to write the image; None creates an array.
 
         Returns:
@@ -153,9 +153,9 @@ class PlanarRenderer:
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
-    """Compute what the first picture through a lens would wait for: 0.2 s for 960×720 pixels with distortion.
+    """Precompute the values for a lens that its first picture would wait for: 0.2 s for 960×720 pixels with distortion.
 
-    It is kept for all renderers of the process.
+    They are kept for all renderers of the process.
     """
     Raster.of(_doubled(model) if quality is Quality.BEST else model, _samples(quality))
 
@@ -177,14 +177,14 @@ def _doubled(model: CameraModel) -> CameraModel:
     return model.scaled(2.0)
 
 
-_SPARE = 61  # rows and pixels of noise beyond a picture's own, so that each frame cuts another part out
-_BLUR_FROM_PX = 0.8  # a shorter smear can't be distinguished from none
+_NOISE_MARGIN = 61  # rows and pixels of noise beyond the picture's size, so that each frame uses another part
+_BLUR_FROM_PX = 0.8  # a shorter blur is invisible
 
 
 class SensorEffects:
-    """The flaws of one camera's sensor: motion blur, exposure, vignetting, noise. To be used in one thread at a time.
+    """The flaws of one camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
 
-    What frame ``number`` gets depends on the seed and the number alone, not on which frames came before.
+    The flaws of frame ``number`` depend only on the seed and the number, not on earlier frames.
     """
 
     def __init__(self, model: CameraModel, seed: int = 0) -> None:
@@ -192,9 +192,9 @@ class SensorEffects:
         self._seed = seed
         rng = np.random.default_rng([seed, model.width, model.height])
         self._gain = _gain(model)
-        shape = (model.height + _SPARE, (model.width + _SPARE) * 3)
+        shape = (model.height + _NOISE_MARGIN, (model.width + _NOISE_MARGIN) * 3)
         noise = np.rint(rng.standard_normal(shape, dtype=np.float32) * np.float32(model.noise_sigma))
-        # Two pictures of bytes, added and taken away with saturation, cost a tenth of one with signs.
+        # Saturated addition and subtraction of two byte pictures costs a tenth of one signed addition.
         self._brighter = np.clip(noise, 0, 255).astype(np.uint8)
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
@@ -203,7 +203,7 @@ class SensorEffects:
 
         Args:
             picture: BGR, of the camera's size.
-            number: Of the frame.
+            number: The frame's number.
             body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
                 which blurs the image over the exposure; None for a drone that does not turn.
 
@@ -218,7 +218,7 @@ class SensorEffects:
         if self._gain is not None:
             cv2.multiply(picture, self._gain, dst=picture, scale=1.0 / 128.0)
         if model.noise_sigma > 0.0:
-            row, column = np.random.default_rng([self._seed, number]).integers(0, _SPARE, 2)
+            row, column = np.random.default_rng([self._seed, number]).integers(0, _NOISE_MARGIN, 2)
             part = slice(row, row + model.height), slice(3 * column, 3 * (column + model.width))
             flat = picture.reshape(model.height, model.width * 3)
             cv2.add(flat, self._brighter[part], dst=flat)
@@ -228,7 +228,7 @@ class SensorEffects:
     def _smear(self, picture: Image, body_rates_rad_s: NDArray[np.float64]) -> None:
         model = self._model
         turn = model.rotation_matrix.T @ body_rates_rad_s * model.exposure_s
-        # What is ahead moves against the turn: about y (down) to the left, about x (right) down; roll is left out.
+        # The scene moves against the turn: about y (down) to the left, about x (right) down; roll is ignored.
         dx, dy = -turn[1] * model.fx, turn[0] * model.fy
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
@@ -236,16 +236,16 @@ class SensorEffects:
         steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
         right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
         across, along = abs(right).max(), abs(down).max()
-        # No larger than it must be: OpenCV takes a large one's detour over frequencies, which is slow.
+        # As small as possible: for large kernels OpenCV switches to a slow method in the frequency domain.
         kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
         np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 
 def _gain(model: CameraModel) -> Image | None:
-    """Return exposure and vignetting in steps of 1/128; None if there is neither.
+    """Return exposure and vignetting in steps of 1/128; None without either.
 
-    Vignetting is cos⁴-like: with the square of the distance from the centre.
+    Vignetting is like cos⁴: it grows with the square of the distance from the centre.
     """
     if model.exposure_gain == 1.0 and model.vignetting == 0.0:
         return None

@@ -1,4 +1,4 @@
-"""Textured convex quadrilaterals as arrays, the shapes made of them, and the one image that holds all their textures.
+"""Textured convex quadrilaterals as arrays, the shapes made of them, and one image with all their textures.
 
 Each texture has its smaller versions (mip levels) beside it.
 """
@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.sim.render.base import cv2
 
 LEVELS = 7
-BORDER = 4  # pixels repeated around each level, so that interpolation at its rim meets no neighbour
+BORDER = 4  # pixels repeated around each level, so that interpolation at its rim stays within it
 GAP = 2 * BORDER
 _STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this, so that each level halves exactly
-_LIMIT = 32000  # cv2.remap takes source pictures of at most 32767 a side
+_LIMIT = 32000  # cv2.remap accepts source pictures of at most 32767 a side
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Atlas:
     """All textures in one image.
 
     Attributes:
-        image: BGRA (four channels are sampled twice as fast as three).
+        image: BGRA (OpenCV samples four channels twice as fast as three).
         x0: Where each texture's level 0 starts; float64, shape (number of textures,).
         y0: The same, vertically.
         span: Twice each texture's padded width.
@@ -54,7 +54,7 @@ class AtlasBuilder:
         self._images: list[NDArray[np.uint8]] = []
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
-        """Return the texture known as ``key``; if there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
+        """Return the texture for ``key``; if there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
             self._known[key] = Texture(len(self._images), image.shape[1], image.shape[0])
@@ -63,7 +63,7 @@ class AtlasBuilder:
 
     @property
     def images(self) -> list[NDArray[np.uint8]]:
-        """The textures collected so far, in the order of their numbers; BGR, shape (h, w, 3)."""
+        """Return the textures so far in the order of their numbers; BGR, shape (h, w, 3)."""
         return self._images
 
     def pack(self) -> Atlas:
@@ -111,23 +111,23 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # of a quad's vectors; then come the normal and the slopes of u and v
+_CORNERS = 4  # the first of a quad's vectors; the normal and the slopes of u and v follow
 
 
 @dataclass(frozen=True, slots=True)
 class Quads:
     """``n`` flat convex quadrilaterals; a triangle repeats a corner.
 
-    Texel u of a point X of the plane is ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from
+    Texel u of a point X in the plane is ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from
     the texture's top left edge.
     """
 
-    vectors: Floats  #: (n, 7, 3): corners, normal, slope of u, slope of v, in one piece to be moved at once
+    vectors: Floats  #: (n, 7, 3): corners, normal, slope of u, slope of v, in one array, to move them together
     starts: Floats  #: (n, 2) of u and of v [texel]
     texture: NDArray[np.intp]  #: (n,) number in the atlas
-    two_sided: NDArray[np.bool_]  #: (n,) seen from behind as well
-    priority: NDArray[np.intp]  #: (n,) of things in one plane the highest is seen
-    lit: NDArray[np.bool_]  #: (n,) brighter where it faces the light; the sky is not
+    two_sided: NDArray[np.bool_]  #: (n,) also visible from behind
+    priority: NDArray[np.intp]  #: (n,) in one plane the highest is visible
+    lit: NDArray[np.bool_]  #: (n,) brighter when facing the light; false for the sky
     density: Floats  #: (n,) [texel/m²]
 
     def __len__(self) -> int:
@@ -135,7 +135,7 @@ class Quads:
 
     @property
     def corners(self) -> Floats:
-        """Corners [m], (n, 4, 3), counter-clockwise seen from the front."""
+        """Corners [m], (n, 4, 3), counter-clockwise as seen from the front."""
         return self.vectors[:, :_CORNERS]
 
     @property
@@ -164,23 +164,23 @@ class Quads:
         return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
-        """These quads, and then the others."""
+        """Return these quads followed by the others."""
         return concatenate([self, other])
 
     def moved(self, position_m: Floats, rotation: Floats) -> Quads:
-        """The same quads after a rotation (3, 3) and a shift (3,)."""
+        """Return the same quads after a rotation (3, 3) and a shift (3,)."""
         return moved_each(self, position_m[None], rotation[None])
 
 
 def moved_each(many: Quads, positions_m: Floats, rotations: Floats) -> Quads:
-    """Quads of ``n`` equal bodies, one body after the other, each after a rotation (n, 3, 3) and a shift (n, 3)."""
+    """Return quads of ``n`` equal bodies, body by body, each after a rotation (n, 3, 3) and a shift (n, 3)."""
     vectors, starts = np.empty_like(many.vectors), np.empty_like(many.starts)
     move_each(many, positions_m, rotations, vectors, starts)
     return replace(many, vectors=vectors, starts=starts)
 
 
 def move_each(many: Quads, positions_m: Floats, rotations: Floats, vectors: Floats, starts: Floats) -> None:
-    """Write the vectors and starts of :func:`moved_each` into arrays of the same shape, which are in one piece."""
+    """Write the vectors and starts of :func:`moved_each` into contiguous arrays of the same shape."""
     bodies = len(positions_m)
     np.matmul(many.vectors.reshape(bodies, -1, 3), rotations.transpose(0, 2, 1), out=vectors.reshape(bodies, -1, 3))
     of_bodies = vectors.reshape(bodies, -1, _CORNERS + 3, 3)
@@ -190,12 +190,12 @@ def move_each(many: Quads, positions_m: Floats, rotations: Floats, vectors: Floa
 
 
 def concatenate(parts: list[Quads]) -> Quads:
-    """All quads of several batches, in order."""
+    """Return all quads of several batches, in order."""
     return Quads(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Quads)))
 
 
 class QuadBuilder:
-    """Collects quads one by one."""
+    """Collects single quads."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[Floats, Floats, Floats, Floats, float, float, int, bool, int, bool]] = []
@@ -212,17 +212,17 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a rectangle, as seen from its front.
+        """Add a rectangle, described as seen from its front.
 
         Args:
             lower_left: Its corner [m].
             right: The edge to the right [m].
             up: The edge upwards [m].
-            texture: What is on it.
-            two_sided: Whether it is seen from behind too.
-            priority: Of quads in one plane the one with the highest is seen.
-            lit: Whether it is brighter where it faces the light.
-            uv: The part of the texture on it (left, top, right, bottom in texels); None is the whole.
+            texture: Its texture.
+            two_sided: Whether it is also visible from behind.
+            priority: Of quads in one plane the one with the highest is visible.
+            lit: Whether it is brighter when facing the light.
+            uv: The visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
@@ -241,7 +241,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a quad (4, 3) cut from the textured rectangle that the corner and the two edges make."""
+        """Add a quad (4, 3) cut from the textured rectangle given by the corner and the two edges."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))
@@ -268,13 +268,13 @@ class QuadBuilder:
         sides: Texture | tuple[Texture, Texture],
         ends: Texture | None = None,
     ) -> None:
-        """Add an upright box, seen from outside.
+        """Add an upright box, visible from outside.
 
         Args:
             low: Its lowest corner [m].
             high: Its highest corner [m].
-            sides: Of the four sides; a pair is for those that face along x and those that face along y.
-            ends: Of top and bottom; None is as the sides that face along x.
+            sides: Texture of the four sides; a pair is for the sides facing along x and those facing along y.
+            ends: Texture of top and bottom; None uses the texture of the sides facing along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
@@ -288,7 +288,7 @@ class QuadBuilder:
         self.rectangle((x0, y1, z0), (dx, 0, 0), (0, -dy, 0), ends)
 
     def disc(self, centre: ArrayLike, radius_m: float, texture: Texture) -> None:
-        """Add a level regular octagon with the whole texture on the square around it, seen from both sides."""
+        """Add a level regular octagon with the whole texture on its enclosing square, visible from both sides."""
         middle = np.asarray(centre, dtype=np.float64)
         angle = np.pi / 8 + np.arange(8) * (np.pi / 4)
         rim = middle + radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(8)])
@@ -298,7 +298,7 @@ class QuadBuilder:
             self.polygon(rim[[a, b, c, d]], start, right, up, texture, two_sided=True)
 
     def build(self) -> Quads:
-        """Return what was collected."""
+        """Return the collected quads."""
         corners, normals, u_slope, v_slope, u_start, v_start, texture, two_sided, priority, lit = zip(
             *self._rows, strict=True
         )

@@ -1,4 +1,4 @@
-"""A world prepared for rendering: its textures in one atlas, its fixed parts as quads, and what moves as templates."""
+"""A world prepared for rendering: its textures in one atlas, fixed parts as quads, moving parts as templates."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FADES_AT_M = 4.0  # a drone this high above a surface leaves no visible shadow 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """Everything of a scene at one time. ``drone``: whose body a quad belongs to, -1 for none, (n,)."""
+    """All parts of a scene at one time. ``drone``: the drone whose body a quad belongs to, -1 for none, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]
@@ -32,10 +32,10 @@ class Posed:
 
 
 class Scene:
-    """What can be rendered of a world with a number of drones.
+    """The renderable parts of a world with a number of drones.
 
-    Building it draws all textures (some tenths of a second); after that it never changes, so renderers in several
-    threads may share it.
+    Building it draws all textures (some tenths of a second); after that it never changes, so renderers on several
+    threads can share it.
 
     Raises:
         UsageError: A texture, a marker dictionary or an id does not exist.
@@ -59,9 +59,9 @@ class Scene:
             for target, template in zip(world.targets, self._targets, strict=True)
             for part in ([template, self._stand] if isinstance(target, BoardTarget) else [template])
         ]
-        # Everything in the order of ``posed``, for what doesn't change when it moves.
+        # All parts in the order of ``posed``, for properties that motion does not change.
         self._everything = concatenate([self._static, *standing, *self._hulls])
-        #: Which target of the world a quad belongs to, -1 for none, (n,).
+        #: The target of the world that a quad belongs to, -1 for none, (n,).
         self.target_of = np.concatenate(
             [np.full(len(self._static), -1, np.intp)]
             + [
@@ -70,7 +70,7 @@ class Scene:
             ]
             + [np.full(len(hull), -1, np.intp) for hull in self._hulls]
         )
-        #: Which box of the world a quad belongs to, -1 for none, (n,).
+        #: The box of the world that a quad belongs to, -1 for none, (n,).
         self.box_of = np.full(len(self.target_of), -1, np.intp)
         sides = np.repeat(np.arange(len(world.solids())), SIDES)
         first = len(self._static) - len(world.panels) - len(world.markers) - len(sides)
@@ -80,7 +80,7 @@ class Scene:
         self._owner = np.concatenate(owners)
         self._swarm = concatenate(self._hulls) if self._hulls else None
         self.atlas = atlas.pack()
-        # Where shadows can fall: upright solids, as cosine and sine of the yaw, centre, half width and depth, and top.
+        # Surfaces that shadows can fall on: upright solids, as cosine and sine of the yaw, centre, half size, and top.
         self._tops = [
             (
                 math.cos(box.yaw_rad),
@@ -93,7 +93,7 @@ class Scene:
         ]
 
     def posed(self, state: SceneState) -> Posed:
-        """Place everything that moves as a state says.
+        """Place all moving parts according to a state.
 
         Raises:
             UsageError: The state has another number of drones or targets.
@@ -135,7 +135,7 @@ class Scene:
         return Posed(replace(self._everything, vectors=vectors, starts=starts), self._owner, tuple(shadows))
 
     def _drone_shadow(self, position_m: list[float]) -> Shadow | None:
-        """The soft spot on whatever surface is below a drone; None if it is too high above it."""
+        """Return the soft spot on the surface below a drone; None if the drone is too high above it."""
         x, y, z = position_m
         surface = 0.0
         for c, s, at_x, at_y, half_x, half_y, top in self._tops:
@@ -154,21 +154,21 @@ def _yaw(angle: float) -> NDArray[np.float64]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-_FINEST = 128.0  # texels per metre of a room's surfaces, where its size allows
-_LARGEST = 1280.0  # texels along a side of them
-_AFAR_M = 150.0  # how far the open ground goes
-_SKY_M = 400.0
+_FINEST = 128.0  # texels per metre of a room's surfaces, if its size allows
+_LARGEST = 1280.0  # texels along a side of such a surface
+_AFAR_M = 150.0  # extent of the open ground
+_SKY_M = 400.0  # half the side of the sky
 SIDES = 6  #: quads of a box; in ``static_quads`` the shell comes first, then boxes, panels, markers
-# Where shadows of standing things fall: away from the light of ``shading``, shortened, as in a room lit from all over.
+# Direction of solids' shadows: away from the light of ``shading``, shortened, as in a room lit from all around.
 _LEAN = np.array([-0.16, 0.20])
 
 
 def static_quads(world: World, atlas: AtlasBuilder) -> Quads:
-    """Return all of a world that never moves.
+    """Return all fixed parts of a world.
 
     Args:
         world: The world.
-        atlas: Gets the textures.
+        atlas: Receives the textures.
     """
     parts = [_shell(world, atlas, world.solids())]
     parts += [_box(box, atlas) for box in world.solids()]
@@ -192,7 +192,7 @@ def _surface(atlas: AtlasBuilder, name: str, width_m: float, height_m: float, de
 
 
 def _shell(world: World, atlas: AtlasBuilder, shadowing: tuple[Box, ...]) -> Quads:
-    """Floor, walls and ceiling; or ground and sky. ``shadowing``: whose shadows are painted on the floor."""
+    """Add floor, walls and ceiling, or ground and sky. ``shadowing``: boxes whose shadows are painted on the floor."""
     room = world.room
     x, y, z = room.size_m
     density = min(_FINEST, _LARGEST / max(x, y, z))
@@ -223,7 +223,7 @@ def _shaded(picture: NDArray[np.uint8], light: NDArray[np.float32]) -> NDArray[n
 
 
 def _corner_dark(height: int, width: int, per_m: float, sides: float, top: float, bottom: float) -> NDArray[np.float32]:
-    """Light where surfaces meet: it falls by these shares towards the sides, the top and the bottom."""
+    """Return the light near edges: reduced by these shares towards the sides, the top and the bottom."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / per_m
     y = (np.arange(height, dtype=np.float32) + 0.5) / per_m
     across = 1.0 - sides * (np.exp(-x / 0.35) + np.exp(-x[::-1] / 0.35))
@@ -255,7 +255,7 @@ def _ceiling(room: Room, density: float) -> NDArray[np.uint8]:
     per_m = density / 2
     picture = draw_surface(room.ceiling, room.size_m[0], room.size_m[1], per_m)
     height, width = picture.shape[:2]
-    bright = 1.16 if room.ceiling == "plaster" else 1.0  # what looks down gets light from the floor
+    bright = 1.16 if room.ceiling == "plaster" else 1.0  # the floor lights surfaces that face down
     lit = _shaded(picture, bright * _corner_dark(height, width, per_m, 0.18, 0.18, 0.18))
     for cx in np.arange(1, 2 * max(1, round(room.size_m[0] / 3)), 2) / (2 * max(1, round(room.size_m[0] / 3))):
         for cy in np.arange(1, 2 * max(1, round(room.size_m[1] / 3)), 2) / (2 * max(1, round(room.size_m[1] / 3))):
@@ -295,7 +295,7 @@ def _box(box: Box, atlas: AtlasBuilder) -> Quads:
 
 
 def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
-    """Ground around the room's floor, as far as one sees, and a sky."""
+    """Add the ground around the room's floor, as far as visible, and a sky."""
     x, y, far = room.size_m[0] / 2, room.size_m[1] / 2, _AFAR_M
     ground = _surface(atlas, room.floor, 2 * far, 2 * far, 512 / (2 * far))
     for low, high in (
@@ -305,7 +305,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
         ((x, -y), (far, y)),
     ):
         if high[0] <= low[0] or high[1] <= low[1]:
-            continue  # the floor reaches as far
+            continue  # the floor extends as far
         texels = ground.width / (2 * far)
         uv = ((low[0] + far) * texels, (far - high[1]) * texels, (high[0] + far) * texels, (far - low[1]) * texels)
         shapes.rectangle((*low, 0), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), ground, uv=uv)
@@ -322,7 +322,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
 
 
 def _sky() -> NDArray[np.uint8]:
-    """From haze at the horizon to blue above; the lowest quarter or so is below the horizon."""
+    """Draw a sky, from haze at the horizon to blue above; about the lowest quarter is below the horizon."""
     rise = np.clip(1.0 - np.arange(256, dtype=np.float32) / 197.0, 0.0, 1.0)[:, None, None]
     low, high = np.array([226.0, 214.0, 198.0]), np.array([206.0, 156.0, 104.0])
     return np.broadcast_to(low + (high - low) * np.sqrt(rise), (256, 64, 3)).astype(np.uint8)

@@ -1,7 +1,7 @@
 """The surfaces of a world, drawn by program: every name in :data:`skyloop.sim.world.TEXTURES`.
 
-Materials (parquet, brick …) keep their scale whatever the size of the surface; things (crate, door, window, posters)
-fill it once. All are repeatable: the same size and seed give the same pixels.
+Materials (parquet, brick …) keep their scale at any size of the surface; objects (crate, door, window, posters) fill it
+once. All are reproducible: the same size and seed give the same pixels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Picture = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A surface to be drawn on: its size in pixels, pixels per metre, and its own random generator."""
+    """A surface to draw on: its size in pixels, pixels per metre, and its own random generator."""
 
     height: int
     width: int
@@ -46,10 +46,10 @@ class Sheet:
 
 
 def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed: int = 0) -> NDArray[np.uint8]:
-    """Draw a surface of a size in metres at a number of texels per metre, BGR, seen upright.
+    """Draw a surface of a size in metres at a number of texels per metre, BGR, as seen upright.
 
     Raises:
-        UnknownNameError: There is no texture of that name.
+        UnknownNameError: No texture has this name.
     """
     if name not in _SURFACES and name not in PICTURES:
         raise UnknownNameError("texture", name, [*_SURFACES, *PICTURES])
@@ -79,7 +79,7 @@ def paint(atlas: AtlasBuilder, rgb: tuple[int, int, int]) -> Texture:
 
 
 def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple[NDArray[np.intp], Picture, Picture]:
-    """Planks or bricks in courses: the number of each pixel's piece, and its place (0 … 1) along and across it."""
+    """Lay planks or bricks in courses: return each pixel's piece, and its position (0 … 1) along and across it."""
     course = sheet.y_m / course_m
     course_number = np.floor(course).astype(np.intp)
     along = sheet.x_m / length_m + (course_number * shift).astype(np.float32)
@@ -88,13 +88,13 @@ def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple
 
 
 def _per_piece(piece: NDArray[np.intp], salt: int) -> Picture:
-    """A number within ±1 for each piece, the same all over it."""
+    """Return a number within ±1 for each piece, constant over the piece."""
     values = np.random.default_rng([salt, 7]).random(1009, dtype=np.float32) * np.float32(2.0) - np.float32(1.0)
     return np.asarray(values[piece % 1009])
 
 
 def _joints(sheet: Sheet, along: Picture, across: Picture, length_m: float, course_m: float, gap_m: float) -> Picture:
-    """1 in the joints between pieces, 0 within, with soft rims."""
+    """Return 1 in the joints between pieces, 0 within, with soft edges."""
     gap_m = max(gap_m, 0.8 / sheet.per_m)
     distance = np.minimum(np.minimum(along, 1 - along) * length_m, np.minimum(across, 1 - across) * course_m)
     return np.asarray(np.clip(1.5 - distance * np.float32(2.0 / gap_m), 0.0, 1.0), dtype=np.float32)
@@ -216,7 +216,7 @@ def _books(s: Sheet) -> Picture:
 
 
 def _book(s: Sheet, picture: Picture, x: int, bottom: int, room: int) -> int:
-    """Draws the back of one book, standing at a column; returns the column after it."""
+    """Draw the back of one book, standing at a column; return the column after it."""
     wide = max(2, s.px(s.rng.uniform(0.018, 0.055)))
     end = min(x + wide, s.width)
     if s.rng.random() < 0.08:  # a gap

@@ -1,9 +1,9 @@
-"""Which quad is seen at each sample of a picture: geometry without clipping, then a depth buffer.
+"""Find the quad visible at each sample of a picture: geometry without clipping, then a depth buffer.
 
 A ray r through the eye meets a convex polygon in front of the eye exactly if it lies on the inner side of every plane
-through the eye and an edge: (v_i × v_{i+1}) · r has the same sign for all edges. This holds for corners behind the eye
-too, so nothing is clipped and no wall is lost at a grazing angle. On one row of the picture each edge becomes a bound
-on x. Along the picture 1/z is linear: 1/z = (n · r) / (n · v_0).
+through the eye and an edge: (v_i × v_{i+1}) · r has the same sign for all edges. This also holds for corners behind the
+eye, so nothing is clipped and no wall is lost at a grazing angle. On one row of the picture each edge becomes a bound
+on x. Across the picture 1/z is linear: 1/z = (n · r) / (n · v_0).
 Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", Graphics Hardware 1997.
 """
 
@@ -20,9 +20,9 @@ from skyloop.sim.render.quads import Floats, Quads
 
 # How much nearer a picture on a wall counts than the wall behind it, per step of priority, as a share of the distance.
 PRIORITY_SHARE = 1e-3
-# A quad this nearly edge-on [m from its plane to the eye] covers nothing that could be seen.
+# A quad this nearly edge-on (distance of the eye from its plane [m]) covers nothing visible.
 EDGE_ON_M = 1e-5
-_BAND = 32768  # samples of a quad drawn at a time: few enough for the working arrays to stay in the cache
+_BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The quads that may be seen from a pose, and where on the grid. All arrays have a first axis of those ``m`` quads.
+    """The quads that may be visible from a pose, and their place on the grid. The first axis of all arrays is m long.
 
     ``index``: their numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
     ``height_m``: of the eye above the plane, signed, (m,). ``first``, ``end``: columns covered in each row,
@@ -55,7 +55,7 @@ class View:
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return a · b along the last axis of three, summed from the first on: no library's order, so the same bits."""
+    """Return a · b along the last axis of three, summed in order: independent of libraries, so the same bits."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
@@ -65,7 +65,7 @@ def turned(vectors: Floats, rotation: Floats) -> Floats:
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return the ``shown`` quads, (n,), that a pose can see through a grid, each on its own.
+    """Return the ``shown`` quads, (n,), that are separately visible from a pose through a grid.
 
     Occlusion is left to :class:`DepthBuffer`.
     """
@@ -92,7 +92,7 @@ def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid
 
 
 def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
-    """False for quads that lie wholly beyond one side of the view, or behind the eye; corners (m, 4, 3) optical."""
+    """Return False for quads entirely beyond one side of the view or behind the eye; corners (m, 4, 3) optical."""
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
     left, right = -(0.5 + grid.cx) / grid.fx, (grid.width - 0.5 - grid.cx) / grid.fx
     top, bottom = -(0.5 + grid.cy) / grid.fy, (grid.height - 0.5 - grid.cy) / grid.fy
@@ -102,7 +102,7 @@ def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """First and one-past-last column in each row, (m, height), of what lies inside edge planes, (m, 4, 3)."""
+    """Return the first and one-past-last column in each row, (m, height), inside of edge planes, (m, 4, 3)."""
     slope_x = edges[..., 0] / grid.fx
     slope_y = edges[..., 1] / grid.fy
     start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
@@ -121,7 +121,7 @@ class DepthBuffer:
     """Finds the nearest quad at each sample.
 
     Attributes:
-        seen: Its index in the view plus one, 0 where there is none; int32, shape (height, width). Overwritten by the
+        seen: Its index in the view plus one, 0 for none; int32, shape (height, width). Overwritten by the
             next :meth:`draw`.
     """
 
@@ -159,7 +159,7 @@ class DepthBuffer:
         along_y: NDArray[np.float32],
         box: tuple[int, int, int, int],
     ) -> None:
-        """Puts the part of one quad within a box where it is nearer than what was drawn before."""
+        """Draw the part of one quad within a box wherever it is nearer than earlier quads."""
         x0, y0, x1, y1 = box
         size = (y1 - y0) * (x1 - x0)
         shape = (y1 - y0, x1 - x0)

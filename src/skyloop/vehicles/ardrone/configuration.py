@@ -1,8 +1,8 @@
-"""The drone's configuration: keys written and acknowledged, all keys read back, and the set-up after each loss. Pure.
+"""Read and write the drone's configuration, and set the drone up again after each link loss. Pure.
 
-A key is written by ``CONFIG`` once the acknowledge bit of navdata is clear; the drone sets the bit when it accepted
-the command (which says nothing of the value), and ``CTRL 5`` clears it for the next. All keys are read by ``CTRL 4``,
-to which the drone answers on a TCP connection: :attr:`Configurator.wants_dump` asks for one.
+``CONFIG`` writes a key once the acknowledge bit of navdata is clear. The drone sets the bit when it has accepted the
+command, which says nothing about the value, and ``CTRL 5`` clears it for the next one. ``CTRL 4`` makes the drone send
+all keys over a TCP connection; :attr:`Configurator.wants_dump` requests that connection.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, Ctrl
 from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_value, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
 
-REPEAT_NS: Final = nanoseconds(0.15)  #: of a CONFIG without acknowledgement; two periods of the demo mode
-REPEAT_DUMP_NS: Final = nanoseconds(0.3)
-MAX_DUMP: Final = 1 << 18  #: bytes; real ones have about 5000
+REPEAT_NS: Final = nanoseconds(0.15)  #: between repeats of an unacknowledged CONFIG; two periods of the demo mode
+REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: between repeats of a request for the dump
+MAX_DUMP: Final = 1 << 18  #: bytes; real dumps have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
 _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A step that writes a key; the value is text."""
+    """A step that writes one key; the value is text."""
 
     key: str
     text: str
@@ -45,16 +45,16 @@ Step: TypeAlias = Write | Read
 
 @dataclass(eq=False)
 class Exchange:
-    """Steps in order, and what to call when they are done."""
+    """Steps in order, and a callback for the end."""
 
-    steps: Iterator[Step]  #: may be a generator: each step is asked for when the one before is done
-    deadline_ns: int  #: when all must be done
-    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with why it failed, or None
+    steps: Iterator[Step]  #: may be a generator: each step is fetched after the previous one has finished
+    deadline_ns: int  #: for all steps together
+    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with the failure, or None
 
 
 @dataclass(frozen=True, slots=True)
 class Ids:
-    """Whose settings are in force on a drone that keeps them apart (multi-configuration): eight hex digits each."""
+    """Ids of session, user and application on a drone with multi-configuration: eight hex digits each."""
 
     session: str
     profile: str
@@ -63,24 +63,24 @@ class Ids:
 
 class _Phase(Enum):
     IDLE = auto()
-    CLEARING = auto()  # the acknowledgement of something before, so that a new one is seen
+    CLEARING = auto()  # clear the previous acknowledgement, so that a new one is noticed
     ASKING = auto()
-    SETTLING = auto()  # acknowledged: until the bit is clear again
+    SETTLING = auto()  # acknowledged; wait until the bit is clear again
 
 
 class Configurator:
-    """Runs one exchange after the other."""
+    """Runs exchanges one at a time, in the order of submission."""
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}  #: as last read
-        self.ids: Ids | None = None  #: to be named before each CONFIG
-        self.wants_dump = 0  #: number of the dump for which a connection to the control port is needed; 0: none
-        self.trouble = ""  #: why no dump came lately
+        self.ids: Ids | None = None  #: sent before each CONFIG
+        self.wants_dump = 0  #: number of the dump that needs a connection to the control port; 0: none
+        self.trouble = ""  #: why the last dump failed
         self._queue: deque[Exchange] = deque()
         self._exchange: Exchange | None = None
         self._step: Step | None = None
         self._phase = _Phase.IDLE
-        self._acknowledged = False  # the bit as last received
+        self._acknowledged = False  # the last received bit
         self._asked_ns = 0
         self._dumps = 0
         self._dump: bytearray | None = None  # None: not connected
@@ -91,13 +91,13 @@ class Configurator:
         return self._exchange is not None or bool(self._queue)
 
     def submit(self, exchange: Exchange) -> None:
-        """Run an exchange after those that are waiting already."""
+        """Queue an exchange."""
         self._queue.append(exchange)
         if self._exchange is None:
             self._next_exchange()
 
     def abandon(self, reason: str) -> None:
-        """Fail all exchanges, each with this reason, and forget what was read: the drone is away."""
+        """Fail every exchange with this reason and forget the configuration, as after a link loss."""
         self.values = {}
         exchanges = ([self._exchange] if self._exchange is not None else []) + list(self._queue)
         self._queue.clear()
@@ -106,10 +106,10 @@ class Configurator:
         for exchange in exchanges:
             exchange.done(reason)
 
-    # What is received ---------------------------------------------------------------------------------------------
+    # Receiving ----------------------------------------------------------------------------------------------------
 
     def on_acknowledge(self, acknowledged: bool) -> bool:
-        """Handle the acknowledge bit of the newest navdata; return whether there is something to send at once."""
+        """Handle the acknowledge bit of the newest navdata; return whether a command is due at once."""
         self._acknowledged = acknowledged
         if self._phase is _Phase.CLEARING and not acknowledged:
             self._begin_asking()
@@ -122,17 +122,17 @@ class Configurator:
         return True
 
     def dump_opened(self) -> None:
-        """Handle that the control port is connected."""
+        """Handle the open connection to the control port."""
         self._dump, self._asked_ns = bytearray(), 0
 
     def dump_received(self, data: bytes) -> bool:
-        """Handle bytes of the control port; return whether the connection is not needed any longer."""
+        """Handle bytes from the control port; return whether the connection can be closed."""
         if self._dump is None or not isinstance(self._step, Read):
             return True
         self._dump += data
         if END_OF_DUMP not in self._dump:
             if len(self._dump) > MAX_DUMP:
-                self.dump_failed(f"{len(self._dump)} bytes came over the control port, and no end")
+                self.dump_failed(f"{len(self._dump)} bytes came over the control port without an end mark")
                 return True
             return False
         self.values = parse_dump(bytes(self._dump))
@@ -141,11 +141,11 @@ class Configurator:
         return True
 
     def dump_failed(self, reason: str) -> None:
-        """Handle that the control port refused or closed early. It is tried again until the exchange's deadline."""
+        """Handle a control port that refused or closed early; retried until the exchange's deadline."""
         self._dump = None
         self.trouble = reason
 
-    # What is sent ----------------------------------------------------------------------------------------------
+    # Sending ---------------------------------------------------------------------------------------------------
 
     def messages(self, now_ns: int) -> list[AtMessage]:
         """Return the commands to send now."""
@@ -228,7 +228,7 @@ class Configurator:
 
 # Set-up --------------------------------------------------------------------------------------------------------------
 
-_NEW_MOTHER_BOARD: Final = 32  #: of the AR.Drone 2; the AR.Drone 1 has 17 and less
+_NEW_MOTHER_BOARD: Final = 32  #: the AR.Drone 2 has at least this version, the AR.Drone 1 at most 17
 _ID_KEYS: Final = {
     "session": "custom:session_id",
     "profile": "custom:profile_id",
@@ -237,7 +237,7 @@ _ID_KEYS: Final = {
 
 
 def version_of(configuration: Mapping[str, str]) -> int | None:
-    """Tell an AR.Drone 1 from a 2 by the firmware or mother board in its configuration; None if it has neither."""
+    """Tell an AR.Drone 1 from a 2 by the firmware or mother board in its configuration; None if both are missing."""
     major = configuration.get("general:num_version_soft", "").partition(".")[0]
     if major.isdecimal() and int(major) >= 1:
         return 1 if int(major) == 1 else 2
@@ -248,7 +248,7 @@ def version_of(configuration: Mapping[str, str]) -> int | None:
 
 
 def own_ids(session: int) -> Ids:
-    """Return Skyloop's ids. Settings of application and user persist; those of a session end with its number."""
+    """Return Skyloop's ids. Settings of application and user persist; those of a session end with it."""
     return Ids(
         session=f"{session & 0xFFFFFFFF:08x}",
         profile=f"{crc32(b'skyloop user'):08x}",
@@ -257,7 +257,7 @@ def own_ids(session: int) -> Ids:
 
 
 def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
-    """Return the ids that the drone's configuration names; None where it keeps nobody's settings apart."""
+    """Return the ids that the drone's configuration names; None for a drone without multi-configuration."""
     if not all(key in configuration for key in _ID_KEYS.values()):
         return None
     return Ids(**{name: configuration[key] for name, key in _ID_KEYS.items()})
@@ -266,15 +266,15 @@ def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
 class Setup:
     """The steps that set up one drone.
 
-    ``version`` is known when they are done, unless the drone does not report it. ``refused_ids`` says afterwards that
-    the drone accepted no settings of our own.
+    ``version`` is known once the steps are done, unless the drone does not report it. ``refused_ids`` is then True if
+    the drone did not accept settings of our own.
 
     Args:
-        options: Of the vehicle's address.
+        options: Options of the vehicle's address.
         configurator: Runs the steps.
         ids: Ours.
-        remembered: Keys that an application wrote before the drone went away; they are written again where the drone
-            forgot them.
+        remembered: Keys that an application wrote before the link was lost. Those that the drone has forgotten are
+            written again.
     """
 
     def __init__(
@@ -288,7 +288,7 @@ class Setup:
         self._remembered = remembered
 
     def steps(self, state: State) -> Iterator[Step]:
-        """Yield the steps, by the state bits as first received; each must be done before the next is asked for."""
+        """Yield the steps for the first received state bits; each must be done before the next one is fetched."""
         options, configurator = self._options, self._configurator
         in_demo = bool(state & State.DEMO)
         if state & State.BOOTSTRAP or in_demo is options.full:

@@ -1,4 +1,4 @@
-"""The driver of ``ardrone://``: what the proxy calls, put together from the link, the video and the parameters."""
+"""The driver of ``ardrone://``, which joins link, video and parameters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ ACTIONS: Final = frozenset({"idle", "takeoff", "hover", "land", "attitude", "eme
 
 
 class ArdroneDriver(Driver):
-    """A Parrot AR.Drone, 1 or 2. ``docs/ardrone.md`` has its options, parameters, events and telemetry."""
+    """A Parrot AR.Drone 1 or 2. See ``docs/ardrone.md`` for options, parameters, events and telemetry."""
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -47,9 +47,9 @@ class ArdroneDriver(Driver):
         self._camera = "front"
 
     def capabilities(self) -> Capabilities:
-        """Return what the drone can do.
+        """Return the drone's capabilities.
 
-        Its cameras are those of an AR.Drone 2 unless the address says that it is a 1.
+        Cameras are those of an AR.Drone 2 unless the address says version 1.
         """
         version = self.options.version
         return Capabilities(
@@ -63,7 +63,7 @@ class ArdroneDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.video:
-            make_decoder(self.options.version or 2)  # raises if something is not installed
+            make_decoder(self.options.version or 2)  # raises if a decoder's library is not installed
         ids = own_ids(secrets.randbits(32))
         session = ArdroneSession(self.options, ids, monotonic_ns(), extra=self._video_telemetry)
         self._session = session
@@ -79,7 +79,7 @@ class ArdroneDriver(Driver):
         self._session = self._link = self._video = self._commands = None
 
     def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
-        """Run the session's callbacks. On the link's thread."""
+        """Run the session's callbacks. Runs on the link's thread."""
         deliver(sink, pending)
         session = self._session
         if session is not None and session.ready:
@@ -97,7 +97,7 @@ class ArdroneDriver(Driver):
         return self._link.command(action)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return what the drone's state and its configuration say about a flight."""
+        """Return preflight findings from the drone's state and configuration."""
         link = self._link
         if link is None:
             raise DriverError(f"{self.uri} is not open")
@@ -108,7 +108,7 @@ class ArdroneDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the commands that are no actions and, once it was read, the drone's configuration."""
+        """Return the commands that are not actions and, once it has been read, the drone's configuration."""
         if self._link is None or self._commands is None:
             return []
         with self._link.lock:
@@ -117,7 +117,7 @@ class ArdroneDriver(Driver):
         return known + [entry.parameter for entry in self._entries().values()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a key, which is acknowledged and read back, or give a command. Takes up to 0.9 s."""
+        """Write a key, with acknowledgement and read-back, or send a command. Takes up to 0.9 s."""
         link, commands = self._link, self._commands
         if link is None or commands is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
@@ -127,7 +127,7 @@ class ArdroneDriver(Driver):
             return commands.write(known[name], value)
         entries = self._entries()
         if not entries:
-            raise ParameterError("the drone's configuration was not read yet", code=Refusal.VEHICLE_LINK_LOST)
+            raise ParameterError("the drone's configuration has not been read yet", code=Refusal.VEHICLE_LINK_LOST)
         return self._configure(link, *written(entries, name, value))
 
     def _configure(self, link: ArdroneLink, entry: Entry, text: str) -> Value:
@@ -179,7 +179,7 @@ class ArdroneDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the intrinsics of the camera that is shown; the address gives those of the front camera."""
+        """Return the active camera's intrinsics; those in the address belong to the front camera."""
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:

@@ -17,7 +17,7 @@ from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Read,
 from skyloop.vehicles.ardrone.protocol import REPEATS, START_NAVDATA, ArdroneSession
 from skyloop.vehicles.ardrone.wire.at import AtMessage
 
-WRITE_S: Final = 0.9  #: a key is written, acknowledged and read back within this, or it failed
+WRITE_S: Final = 0.9  #: limit for writing a key, its acknowledgement and the read-back
 
 
 class ArdroneLink(VehicleLink[ArdroneSession]):
@@ -34,12 +34,12 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     # From the proxy's threads ----------------------------------------------------------------------------------
 
     def send(self, message: AtMessage, times: int = REPEATS) -> None:
-        """Send a command without acknowledgement at this many ticks. Any thread."""
+        """Send a command without acknowledgement in this many ticks. Any thread."""
         with self.lock:
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
+        """Write a key and read it back; return the failure, or None. Takes up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
@@ -87,7 +87,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     def _serve_dump(self) -> None:
         with self.lock:
             self._dump.serve(self.session.configurator)
-            self.session.due_ns = 0  # to go on at once
+            self.session.due_ns = 0  # continue at once
 
 
 def _connected(address: str, port: int) -> socket.socket:
@@ -102,7 +102,7 @@ def _connected(address: str, port: int) -> socket.socket:
 
 
 def _discard(port: socket.socket) -> None:
-    """Empty the AT port: nothing is expected there but errors of the host, which the navdata socket gets as well."""
+    """Empty the AT port. It receives only errors of the host, and the navdata socket gets those as well."""
     with suppress(OSError):
         while port.recv(MAX_DATAGRAM):
             pass
@@ -110,16 +110,16 @@ def _discard(port: socket.socket) -> None:
 
 # The control port ----------------------------------------------------------------------------------------------------
 
-RETRY_NS: Final = nanoseconds(0.25)
+RETRY_NS: Final = nanoseconds(0.25)  #: between attempts to connect to the control port
 _CHUNK: Final = 1 << 16
 
 
 class DumpClient:
-    """Connects when the configurator wants a dump, feeds it, and closes the connection when it is whole."""
+    """Fetches the dump that the configurator wants, over a separate connection to the control port."""
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
         """Store the arguments. No I/O."""
-        self.address = ""  #: of the drone, once it is known
+        self.address = ""  #: the drone's address; empty until known
         self._port = port
         self._selector = selector
         self._ready = ready
@@ -129,7 +129,7 @@ class DumpClient:
         self._tried_ns = -RETRY_NS
 
     def follow(self, configurator: Configurator, now_ns: int) -> None:
-        """Connect or close, as the configurator wants. Called at every step."""
+        """Connect or close, as the configurator wants. Called in every step of the link."""
         if configurator.wants_dump != self._number:
             self.close()
             self._number, self._tried_ns = configurator.wants_dump, -RETRY_NS
@@ -138,7 +138,7 @@ class DumpClient:
             self._connect(configurator)
 
     def serve(self, configurator: Configurator) -> None:
-        """Handle a connection that is ready: it is made, failed, or has data."""
+        """Handle a connection that is ready: established, failed, or with data to read."""
         connection = self._connection
         if connection is None:
             return
@@ -158,7 +158,7 @@ class DumpClient:
             self.close()
 
     def close(self) -> None:
-        """Close the connection, if there is one."""
+        """Close the connection if it is open."""
         if self._connection is not None:
             self._selector.unregister(self._connection)
             self._connection.close()
@@ -170,7 +170,7 @@ class DumpClient:
         connection.setblocking(False)
         try:
             code = connection.connect_ex((self.address, self._port))
-        except OSError as error:  # no address to speak of
+        except OSError as error:  # no usable address
             connection.close()
             configurator.dump_failed(self._with_port(error.strerror or str(error)))
             return

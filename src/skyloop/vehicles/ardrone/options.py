@@ -1,4 +1,4 @@
-"""Options of an ``ardrone://`` address. Pure. ``docs/ardrone.md`` has them as a table."""
+"""Options of an ``ardrone://`` address. Pure. ``docs/ardrone.md`` lists them."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class ArdroneOptions:
 
     host: str
     ports: Ports = navdata.STANDARD
-    version: int | None = None  #: of the drone; None: as its configuration says
-    full: bool = False  #: navdata of 200 Hz with all options instead of the demo mode
-    navdata_options: int | None = None  #: one bit for each tag; None: as the drone is configured
-    rate_hz: float = 50.0  #: of feedback, at most
+    version: int | None = None  #: the drone's version; None: from its configuration
+    full: bool = False  #: navdata at 200 Hz with all options instead of the demo mode
+    navdata_options: int | None = None  #: one bit per tag; None: as configured in the drone
+    rate_hz: float = 50.0  #: highest rate of feedback
     video: bool = True
-    ids: bool = True  #: settings of our own on an AR.Drone 2 (multi-configuration)
+    ids: bool = True  #: own settings on an AR.Drone 2 (multi-configuration)
 
 
 def options_of(uri: VehicleUri) -> ArdroneOptions:
@@ -78,9 +78,9 @@ def _one_of(uri: VehicleUri, name: str, usual: str, meanings: dict[str, _Meaning
 
 
 def _mask(uri: VehicleUri) -> int | None:
-    """Return ``navdata_options``: names of options, or a number with a bit for each tag.
+    """Return ``navdata_options``: names of options, or a number with one bit per tag.
 
-    The demo option is always in it.
+    The demo option is always included.
     """
     given = uri.options.get("navdata_options")
     if given is None:

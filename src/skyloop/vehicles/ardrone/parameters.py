@@ -1,4 +1,4 @@
-"""The drone's keys and commands as parameters, by their own names and by those that all drivers share in SI. Pure."""
+"""The drone's keys and commands as parameters, under their own names and the names all drivers share in SI. Pure."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TYPES: Final[dict[type, ParameterType]] = {
     tuple: ParameterType.VECTOR,
     str: ParameterType.TEXT,
 }
-#: Keys that the driver itself writes, or that have a parameter of their own which checks the drone's state.
+#: Keys that the driver writes itself, or that have a parameter that checks the drone's state first.
 _OURS: Final = {
     "general:navdata_demo": "the option navdata of the address decides",
     "general:navdata_options": "the option navdata_options of the address decides",
@@ -52,7 +52,7 @@ _OURS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Common:
-    """A name that all drivers share, and the key behind it; the key's number divided by ``divisor`` is SI."""
+    """A name shared by all drivers and the key behind it; the key's number divided by ``divisor`` is SI."""
 
     name: str
     key: str
@@ -93,13 +93,13 @@ class Entry:
     key: str
     like: bool | int | float | str | tuple[float, ...]  #: a value of the key's type
     divisor: float = 1.0
-    names: tuple[str, ...] = ()  #: of the key's values from 0 on, where the parameter has names for them
+    names: tuple[str, ...] = ()  #: of the key's values from 0 on, if the parameter names them
 
     def to_text(self, value: Value) -> str:
-        """Return a value as the drone takes it.
+        """Return a value in the drone's notation.
 
         Raises:
-            ParameterError: It is of another type, not finite, or none of the names.
+            ParameterError: Wrong type, not finite, or none of the names.
         """
         if self.names:
             if value not in self.names:
@@ -115,16 +115,16 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """Return a value that the drone reported.
+        """Return the value for the drone's text.
 
         Raises:
-            DecodeError: It is not of the key's type.
+            DecodeError: The text does not fit the key's type.
         """
         value = parse_value(text, self.like)
         if self.names:
             number = int(str(value))
             if not 0 <= number < len(self.names):
-                raise DecodeError(f"{text!r} is no number of {', '.join(self.names)}")
+                raise DecodeError(f"{text!r} is not the number of one of {', '.join(self.names)}")
             return self.names[number]
         if self.divisor != 1.0 and isinstance(value, int | float):
             return value / self.divisor
@@ -136,7 +136,7 @@ def _wrong(parameter: Parameter, what: str) -> ParameterError:
 
 
 def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entry]:
-    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only."""
+    """Return all parameters of a configuration by name. Unknown keys become read-only texts."""
     found: dict[str, Entry] = {}
     for name, text in values.items():
         entry = _own_entry(name, text, version)
@@ -151,7 +151,7 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
 
 
 def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value; raises for a name or a value that does not fit."""
+    """Return the entry and the key's text for a new value; raise for a wrong name or value."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -161,7 +161,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, reported: str) -> bool:
-    """Return whether the drone reports what was written, apart from its way of writing numbers."""
+    """Return whether the drone reports the written value, whatever its number format."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:
@@ -174,7 +174,7 @@ def taken(entry: Entry, wanted: str, reported: str) -> bool:
 
 
 def active_camera(values: Mapping[str, str]) -> str:
-    """Return which camera the video shows according to the configuration; ``front`` if it does not say."""
+    """Return which camera the video shows according to the configuration; ``front`` by default."""
     try:
         channel = int(values.get(CHANNEL_KEY, "0"))
     except ValueError:
@@ -192,7 +192,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
         return None
     key = KEYS.get(name)
     if key is None:
-        return _text_entry(parameter_name, name, text, "a key that Skyloop does not know")
+        return _text_entry(parameter_name, name, text, "a key unknown to Skyloop")
     try:
         value = parse_value(text, key.default)
     except DecodeError:
@@ -216,7 +216,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
 
 
 def _choices(name: str, version: int | None) -> tuple[int, ...]:
-    """Return a key's values where the versions of the drone differ."""
+    """Return the values of a key whose choices depend on the drone's version."""
     if name == CHANNEL_KEY:
         return tuple(range(len(_CHANNELS[version or 2])))
     if name == "video:video_codec":
@@ -269,7 +269,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen a range that the present value lies outside of: this drone's own is wider than the documented one."""
+    """Widen a range that excludes the present value: this drone's range is larger than the documented one."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))
@@ -283,9 +283,9 @@ def _widened(parameter: Parameter) -> Parameter:
     )
 
 
-# Commands that are no action -----------------------------------------------------------------------------------------
+# Commands that are not actions ---------------------------------------------------------------------------------------
 
-#: Sends a command at a number of ticks.
+#: Sends a command in a number of ticks.
 Send = Callable[[AtMessage, int], None]
 
 _REPEATS: Final = 3
@@ -298,7 +298,7 @@ def _switch(name: str, description: str) -> Parameter:
 
 
 def _once(parameter: Parameter) -> Parameter:
-    """Mark a parameter whose writing makes the drone do something once."""
+    """Mark a parameter that triggers one action of the drone each time it is written."""
     return msgspec.structs.replace(parameter, momentary=True)
 
 
@@ -347,7 +347,7 @@ def _flight_animations(version: int | None) -> Parameter:
 
 
 class Commands:
-    """Commands that are no actions, as parameters, with their values."""
+    """Commands that are not actions, as parameters with their values."""
 
     def __init__(self, setpoints: SetpointController, send: Send) -> None:
         self._setpoints = setpoints
@@ -355,18 +355,18 @@ class Commands:
         self._values: dict[str, Value] = {}
 
     def parameters(self, version: int | None) -> list[Parameter]:
-        """Return the parameters that this version of the drone has."""
+        """Return the parameters of this version of the drone."""
         known = [_LEDS, _LEDS_FREQUENCY, _LEDS_DURATION, _TRIM, _flight_animations(version)]
         if version != 1:
             known += [_CALIBRATE, _ABSOLUTE, _HEADING]
         return [self._present(parameter) for parameter in known]
 
     def write(self, parameter: Parameter, value: Value) -> Value:
-        """Give a command, and return the value that is shown from now on.
+        """Send a command and return the parameter's new value.
 
         Raises:
-            ParameterError: The value does not fit, or the drone is not on the ground or in the air as the command
-                needs.
+            ParameterError: The value does not fit, or the command needs a drone on the ground (or in the air) and it
+                is not.
         """
         value = checked_value(parameter, value)
         name = parameter.name
@@ -404,7 +404,7 @@ class Commands:
 
     def _fly(self, name: str) -> None:
         number = next(at for at, (known, _) in enumerate(FLIGHT_ANIMATIONS) if known == name)
-        # Sent once: a repeat would fly it again.
+        # Sent once: a repeat would fly the animation again.
         self._give(("ANIM", (number, FLIGHT_ANIMATIONS[number][1])), on_ground=False, times=1)
 
     def _give(self, message: AtMessage, *, on_ground: bool, times: int = _REPEATS) -> None:

@@ -1,4 +1,4 @@
-"""Decodes the frames of a PaVE stream, live or from a file, with PyAV; to be imported only where video is wanted."""
+"""Decode the frames of a PaVE stream, live or from a file, with PyAV. Import this module only where video is needed."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 __all__ = ["PaveDecoder", "av"]
 
 _DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
-# FFmpeg refuses an MPEG-4 frame now and then that is padded by a single bit, unless the sequence's end follows.
+# FFmpeg occasionally refuses an MPEG-4 frame that is padded by a single bit, unless the sequence's end follows.
 _ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
 
 
 class PaveDecoder:
-    """Decodes frames of a PaVE stream, one in and at most one picture out, without delay.
+    """Decodes frames of a PaVE stream: one frame in, at most one picture out, without delay.
 
-    Gives nothing before the first key frame (a stream torn open, or the stale frame that the drone sends first), and
-    after damage or a gap in the frames' numbers nothing up to the next key frame: those pictures would be smeared.
-    ``waited`` counts frames left out for that, ``damaged`` those that could not be decoded.
+    Returns nothing before the first key frame (a torn stream, or the stale frame that the drone sends first). After
+    damage or a gap in the frame numbers it returns nothing until the next key frame, because those pictures would be
+    smeared. ``waited`` counts frames dropped for these reasons, ``damaged`` those that could not be decoded.
 
-    PaVE and H.264 have no checksum: a flipped bit that makes another valid stream passes. A stream over TCP has one.
+    PaVE and H.264 have no checksum, so a flipped bit that makes another valid stream goes unnoticed. TCP has one.
     """
 
     def __init__(self) -> None:
@@ -40,14 +40,14 @@ class PaveDecoder:
         self._codec: int | None = None
         self._context: VideoCodecContext | None = None
         self._needs_key = True
-        self._number = 0  # of the frame before
+        self._number = 0  # number of the previous frame
 
     def restart(self) -> None:
-        """Wait for a key frame: what comes next does not continue what came before."""
+        """Wait for a key frame, as the stream is interrupted."""
         self._needs_key = True
 
     def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
-        """Return the picture of a frame, or None. Never raises, whatever a frame holds."""
+        """Return the picture of a frame, or None. Never raises for any content."""
         follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
         self._needs_key = self._needs_key or frame.after_damage or not follows
         self._number = frame.number
@@ -70,7 +70,7 @@ class PaveDecoder:
         return images[-1]
 
     def _start(self, codec: int) -> None:
-        """Make a fresh decoder: what an old one remembers of the pictures before the damage must not show."""
+        """Make a new decoder: an old one would show remains of pictures from before the damage."""
         self._codec, self._context = codec, None
         name = _DECODERS.get(codec)
         if name is None:
@@ -79,5 +79,5 @@ class PaveDecoder:
 
 
 def _fits(image: av.VideoFrame, frame: PaveFrame) -> bool:
-    """Return whether an H.264 picture has the size that its header says. Real drones' MPEG-4 is not known."""
+    """Return whether an H.264 picture has the size in its header. Not checked for MPEG-4: real drones' is unknown."""
     return frame.codec != Codec.MPEG4_AVC or (image.width, image.height) == (frame.width, frame.height)

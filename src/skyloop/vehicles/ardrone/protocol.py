@@ -1,4 +1,4 @@
-"""The protocol of one drone, from the first datagram on: navdata in, AT commands out. No socket, no clock."""
+"""The protocol of one drone from the first datagram on: navdata in, AT commands out. No socket, no clock."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
 from skyloop.vehicles.ardrone.wire.options import Demo
 
-#: So many datagrams begin at sequence 1 after a restart: the first may be lost, and only a 1 resets the drone's count.
+#: Datagrams that begin at sequence 1 after a restart. One may be lost, and only a 1 resets the drone's count.
 FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes only what is newer than the last, and takes a 1 as a new beginning."""
+    """Numbers the commands. The drone executes only commands newer than the last one, and a 1 restarts its count."""
 
     def __init__(self) -> None:
         self._sequence = 0
         self._fresh = FRESH_DATAGRAMS
 
     def restart(self) -> None:
-        """Begin at 1 again: the drone was away or lost us."""
+        """Begin at 1 again, after a link loss in either direction."""
         self._fresh = FRESH_DATAGRAMS
 
     def datagram(self, messages: Iterable[AtMessage]) -> bytes:
@@ -54,25 +54,25 @@ class Sequencer:
         return b"".join(lines)
 
 
-TICK_NS: Final = nanoseconds(0.03)  #: between AT commands, as the drone's guide asks for
+TICK_NS: Final = nanoseconds(0.03)  #: between AT commands, as the drone's guide recommends
 HURRY_NS: Final = nanoseconds(
     0.01
-)  #: least time between a datagram and a new set-point that does not wait for its tick
+)  #: minimum time between a datagram and a new set-point that does not wait for its tick
 DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
-LOST_NS: Final = nanoseconds(1.0)
+LOST_NS: Final = nanoseconds(1.0)  #: of silence
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
-START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none come
-SETUP_NS: Final = nanoseconds(6.0)  #: to set the drone up, before it is tried again
+START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none arrive
+SETUP_NS: Final = nanoseconds(6.0)  #: limit for the drone's set-up, which is then retried
 SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after it the link is DEGRADED, and the drone may fly without set-up
-DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit that stays for so long means that our commands are ignored
-REPEATS: Final = 3  #: of a command that has no acknowledgement
+DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone ignores our commands
+REPEATS: Final = 3  #: of a command without acknowledgement
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
 
 _WATCHDOG: Final[AtMessage] = ("COMWDG", ())
 
 
 class ArdroneSession(VehicleSession):
-    """The protocol of one opened driver with its drone. Not thread-safe."""
+    """The protocol between one opened driver and its drone. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -86,12 +86,12 @@ class ArdroneSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.version = options.version  #: None until the drone's configuration was read
+        self.version = options.version  #: None until the drone's configuration has been read
         self.setpoints = SetpointController()
         self.configurator = Configurator()
         self.reception = Reception()
         self.ready = False  #: whether the drone is set up and its configuration known
-        self.remembered: dict[str, str] = {}  #: keys that were written, and how the drone writes them
+        self.remembered: dict[str, str] = {}  #: written keys, with the values in the drone's notation
         self._ids = ids
         self._extra = extra
         self._sequencer = Sequencer()
@@ -100,19 +100,19 @@ class ArdroneSession(VehicleSession):
         self._health = Health()
         self._setup_ns: int | None = None
         self._setups_failed = 0
-        self._state = self._earlier = State(0)  # of the newest datagram, and of the one before
+        self._state = self._earlier = State(0)  # state bits of the newest datagram and the previous one
         self._sent_ns = 0
         self._started_ns = 0
         self._published_ns = 0
         self._deaf_since_ns: int | None = None
-        self._once: list[list[AtMessage]] = []  # more to send at each of the next ticks
+        self._once: list[list[AtMessage]] = []  # extra commands for each of the next ticks
         self._place = f"{options.host}, UDP port {options.ports.navdata}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for navdata from {self._place}")
 
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and have it sent soon; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it soon; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)
@@ -124,14 +124,14 @@ class ArdroneSession(VehicleSession):
         return applied
 
     def send(self, message: AtMessage, times: int = REPEATS) -> None:
-        """Send a command that has no acknowledgement, at this many ticks."""
+        """Send a command without acknowledgement in this many ticks."""
         while len(self._once) < times:
             self._once.append([])
         for at in range(times):
             self._once[at].append(message)
 
     def submit(self, exchange: Exchange) -> None:
-        """Run an exchange of the configuration."""
+        """Queue an exchange of the configuration."""
         self.configurator.submit(exchange)
         self.due_ns = 0
 
@@ -142,18 +142,18 @@ class ArdroneSession(VehicleSession):
         return self.setpoints.forget_landing()
 
     def close(self) -> None:
-        """End the session: exchanges that are not done fail."""
+        """End the session and fail unfinished exchanges."""
         self.configurator.abandon("the driver was closed")
 
     @property
     def state(self) -> State | None:
-        """The newest bits of the drone's state; None before any came."""
+        """The newest state bits of the drone; None before the first."""
         return None if self._received_ns is None else self._state
 
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_navdata(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram of the navdata port, whatever it holds. Never raises."""
+        """Handle a datagram from the navdata port. Never raises for any content."""
         navdata = self.reception.receive(datagram, now_ns)
         if navdata is None:
             return
@@ -175,9 +175,9 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even if it was silent for less time than we would detect.
+        """Detect that the drone restarted or lost us, even in a silence too short to count as a lost link.
 
-        What it forgot meanwhile is not known. Two datagrams in a row have to say so.
+        The drone may have forgotten its set-up meanwhile. Two datagrams in a row must show it.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state
@@ -203,7 +203,7 @@ class ArdroneSession(VehicleSession):
     # Time ------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
-        """Return the datagram for the AT port that is due now, empty if nothing is to be sent."""
+        """Return the datagram that is due on the AT port; empty if there is none."""
         self._check_silence(now_ns)
         self.due_ns, self._sent_ns = now_ns + TICK_NS, now_ns
         messages: list[AtMessage] = []
@@ -218,7 +218,7 @@ class ArdroneSession(VehicleSession):
         return self._sequencer.datagram(messages)
 
     def wants_start(self, now_ns: int) -> bool:
-        """Return whether to ask for navdata now, because none come. True once in :data:`START_NS`."""
+        """Return whether to request navdata now because none arrive. True once per :data:`START_NS`."""
         silent_ns = now_ns - (self._received_ns if self._received_ns is not None else 0)
         if silent_ns < DEGRADED_NS or now_ns - self._started_ns < START_NS:
             return False
@@ -229,7 +229,7 @@ class ArdroneSession(VehicleSession):
         super()._check_silence(now_ns)
         if not self.ready and self._setup_ns is not None and now_ns - self._setup_ns >= SETUP_PATIENCE_NS:
             why = self.configurator.trouble or "the drone does not acknowledge"
-            self._set_link_state(LinkState.DEGRADED, f"the drone's configuration is not known: {why}")
+            self._set_link_state(LinkState.DEGRADED, f"the drone's configuration is unknown: {why}")
 
     def _describe_silence(self, since: str, why: str) -> str:
         return f"no navdata{since} from {self._place}{why}"
@@ -240,9 +240,9 @@ class ArdroneSession(VehicleSession):
         return "switch the AR.Drone on and join its Wi-Fi network, ardrone…; or correct the host in the address"
 
     def _check_deafness(self, now_ns: int) -> None:
-        """Restart the sequence if the watchdog bit stays.
+        """Restart the sequence if the watchdog bit stays set.
 
-        The drone clears the bit when it accepts commands; if it does not, its count may be past ours.
+        The drone clears the bit when it accepts commands. If it does not, its count may be ahead of ours.
         """
         if self._deaf_since_ns is None:
             self._deaf_since_ns = now_ns
@@ -250,7 +250,7 @@ class ArdroneSession(VehicleSession):
             self._deaf_since_ns = now_ns
             self._sequencer.restart()
 
-    # Losing and finding ----------------------------------------------------------------------------------------
+    # Link loss and recovery ------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, _now_ns: int) -> None:
         self._received_ns = self._setup_ns = None
@@ -272,7 +272,7 @@ class ArdroneSession(VehicleSession):
     def _submit_setup(self, now_ns: int) -> None:
         failed = self._setups_failed
         options = replace(self.options, ids=False) if failed > 1 else self.options
-        # A drone that kept our ids ignores what does not name them, and one that lost them what does: take turns.
+        # A drone that kept our ids ignores commands without them; one that lost them ignores commands with them.
         self.configurator.ids = self._ids if failed % 2 else None
         setup = Setup(options, self.configurator, self._ids, self.remembered)
         done = partial(self._setup_done, setup)
@@ -281,7 +281,7 @@ class ArdroneSession(VehicleSession):
 
     def _setup_done(self, setup: Setup, failure: str | None) -> None:
         if self._setup_ns is None or self._received_ns is None:
-            return  # it was lost meanwhile
+            return  # lost meanwhile
         if failure is not None:
             self._setups_failed += 1
             self.configurator.trouble = failure
@@ -300,5 +300,5 @@ class ArdroneSession(VehicleSession):
         self._set_link_state(LinkState.UP)
 
     def read_limits(self) -> None:
-        """Take the limits of set-points from the configuration that was read."""
+        """Set the limits of set-points from the configuration."""
         self.setpoints.limits = limits_of(self.configurator.values)

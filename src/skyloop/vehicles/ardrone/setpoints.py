@@ -1,11 +1,10 @@
-"""Set-points to ``REF`` and ``PCMD``: what is sent to the drone at each tick. Pure.
+"""Turn set-points into ``REF`` and ``PCMD``, tick by tick. Pure.
 
-``REF`` has take-off, landing and emergency as bits that must be repeated until navdata shows the new state. The
-emergency bit toggles when it is set after it was clear. It is set once for what is asked for, and repeated as packets
-get lost, until navdata shows the change; again only after navdata that the drone made later showed no effect, as one
-toggle too many would undo the first. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb
-(positive up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured
-with.
+``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
+emergency bit toggles the emergency on each change from clear to set. As packets get lost, it stays set for a request
+until navdata shows the change. It is toggled again only when navdata that the drone made later still shows no effect,
+because one toggle too many would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
+climb (positive up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits configured in the drone.
 """
 
 from __future__ import annotations
@@ -37,13 +36,13 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.configuration import parse_value
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 
-HEADING_ACCURACY: Final = 0.1  #: of the reference that goes with ``PCMD_MAG``, as share of half a turn
+HEADING_ACCURACY: Final = 0.1  #: of the reference sent with ``PCMD_MAG``, as a share of half a turn
 _KEYS: Final = ("control:euler_angle_max", "control:control_vz_max", "control:control_yaw")
 
 
 @dataclass(frozen=True, slots=True)
 class StickLimits:
-    """What a stick value of 1 means."""
+    """Attitude and rates at a stick value of 1."""
 
     tilt_rad: float
     climb_m_s: float
@@ -61,7 +60,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the limits in force from the drone's configuration; None if it lacks one or one is not positive."""
+    """Return the limits in force in the drone's configuration; None if one is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):
@@ -72,7 +71,7 @@ def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
 
 
 def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
-    """Return the stick values for an attitude, and the attitude that they ask for, within the drone's limits."""
+    """Return the stick values for an attitude, and the attitude they stand for within the drone's limits."""
     stick = Stick(
         roll=_share(action.roll, limits.tilt_rad),
         pitch=_share(-action.pitch, limits.tilt_rad),
@@ -91,41 +90,41 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
 def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
     """Return ``PCMD`` for these stick values; None: hover.
 
-    With a reference it is ``PCMD_MAG``: forward and right are then those of somebody who looks along that heading (0
-    magnetic north, positive counter-clockwise), wherever the drone's nose points.
+    With a reference, return ``PCMD_MAG``: forward and right then refer to that heading (0 magnetic north, positive
+    counter-clockwise) and not to the drone's nose.
     """
     if stick is None:
         return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))
     values = (stick.roll, stick.pitch, stick.climb, stick.yaw)
     if reference_rad is None:
         return ("PCMD", (int(Pcmd.PROGRESSIVE), *values))
-    heading = -reference_rad / math.pi + 0.0  # without a negative zero
+    heading = -reference_rad / math.pi + 0.0  # avoids a negative zero
     return ("PCMD_MAG", (int(Pcmd.PROGRESSIVE | Pcmd.ABSOLUTE), *values, heading, HEADING_ACCURACY))
 
 
 def _share(value: float, limit: float) -> float:
-    return clamped(value / limit, 1.0) + 0.0  # without a negative zero
+    return clamped(value / limit, 1.0) + 0.0  # avoids a negative zero
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
-RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what rises is no other program's flight
-#: So long after the emergency bit changed, by the clocks of both ends, navdata show what that did.
+RISES_NS: Final = nanoseconds(3.0)  #: for this long after we sent a take-off, a rise is ours and not another program's
+#: Navdata shows the effect of the emergency bit within this time, by the clocks of both ends.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
-#: A landing is completed below this: navdata are up to 0.25 s old, and what stands by now rises by the take-off bit.
+#: Below this height, finish a landing: navdata is up to 0.25 s old, and the take-off bit would restart a landed drone.
 BREAK_OFF_M: Final = 0.5
-#: What a landing that goes on shows.
+#: Control states during a landing that continues.
 _LANDING_ON: Final = (ControlState.LANDING, ControlState.LANDED, None)
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the newest navdata say of the flight."""
+    """The newest navdata's view of the flight."""
 
     state: State
     control: ControlState | None = None
-    altitude_m: float | None = None  #: above what is below; None: not known
+    altitude_m: float | None = None  #: above the surface below; None: unknown
 
     @property
     def flying(self) -> bool:
@@ -139,19 +138,19 @@ class Condition:
 
     @property
     def touches_down(self) -> bool:
-        """Whether a landing is at its end, or may be."""
+        """Whether a landing has ended or may be about to."""
         low = self.altitude_m is None or self.altitude_m < BREAK_OFF_M
         return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
-#: After so long without navdata a drone may stand that flew: it lands by itself where it hears nothing for 2 s.
+#: After this silence a flying drone may have landed: it lands after 2 s without commands.
 SILENT_NS: Final = nanoseconds(0.25)
 
 
 class Decision(Enum):
-    """What is wanted of take-off and landing."""
+    """The wish for take-off or landing."""
 
-    STAY = auto()  #: as it is: in the air if it flies
+    STAY = auto()  #: in the air if it flies, on the ground otherwise
     TAKE_OFF = auto()
     LAND = auto()
 
@@ -163,33 +162,33 @@ class SetpointController:
     """
 
     def __init__(self) -> None:
-        self.condition: Condition | None = None  #: None while nothing is received from the drone
-        self.limits: StickLimits | None = None  #: None until they were read
+        self.condition: Condition | None = None  #: None while the drone is silent
+        self.limits: StickLimits | None = None  #: None until read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
         self._decision = Decision.STAY
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
-        self._rises_until_ns = 0  # a take-off was sent, and may show until then
-        self._releasing = False  # a reset was asked for, and does not show
-        self._emergency = False  # whether the newest navdata showed one, even if it is lost since
-        self._bit = False  # whether the emergency bit was sent last
-        self._bit_due = False  # it is to be set, whatever navdata show
-        self._changed_ns = 0  # when it changed, was asked for, or an emergency was over
-        self._passed_ns = 0  # of the drone's time since then, up to the newest navdata
+        self._rises_until_ns = 0  # a take-off that we sent may show until then
+        self._releasing = False  # a reset is requested and not yet visible in navdata
+        self._emergency = False  # in the newest navdata, even after a link loss
+        self._bit = False  # the emergency bit as last sent
+        self._bit_due = False  # set the bit next, whatever navdata shows
+        self._changed_ns = 0  # last change of or request for the bit, or end of an emergency
+        self._passed_ns = 0  # drone time from then to the newest navdata
         self._received_ns = 0
-        self._late_ns = 0  # so old are navdata that waited, and come in a row after a gap
+        self._late_ns = 0  # age of delayed navdata that arrives in a burst after a gap
         self._warned_blind = False
-        self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
+        self._steering = False  # we started or took this flight; otherwise another program may fly it
         self._events: list[VehicleEvent] = []
 
     @property
     def intent(self) -> tuple[object, ...]:
-        """Changes when something else is to be sent."""
+        """A value that changes when the commands to send change."""
         return self._decision, self._stick, self.stop.active, self._releasing
 
-    # What is decided -------------------------------------------------------------------------------------------
+    # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
         """Accept an action.
@@ -199,12 +198,12 @@ class SetpointController:
             now_ns: The present time.
 
         Returns:
-            What is applied: an attitude within the drone's limits, or hover while the limits are not known or an
+            The applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
             emergency stop is in force.
 
         Raises:
-            DriverError: A take-off while nothing is received or in emergency, a reset while nothing is received, or an
-                action that the drone does not have.
+            DriverError: A take-off without data from the drone or in emergency, a reset without data from the drone,
+                or an action that the drone does not have.
         """
         if isinstance(action, Idle):
             return action
@@ -224,7 +223,7 @@ class SetpointController:
         elif isinstance(action, Hover):
             self._remain(None)
         else:
-            raise DriverError(f"the AR.Drone takes no {action.name}")
+            raise DriverError(f"the AR.Drone does not support {action.name}")
         return action
 
     def _stop_motors(self, now_ns: int) -> None:
@@ -239,7 +238,7 @@ class SetpointController:
         self._decision, self._steering = Decision.STAY, False
 
     def forget_landing(self) -> bool:
-        """Land no longer; return whether it was to."""
+        """Cancel a pending landing; return whether there was one."""
         if not self._landing_is_ours or self._decision is not Decision.LAND:
             return False
         self._decision, self._steering = Decision.STAY, False
@@ -247,7 +246,7 @@ class SetpointController:
 
     def _release_motors(self, now_ns: int) -> None:
         if self.condition is None:
-            raise DriverError("no data from the drone: whether there is an emergency to reset is not known")
+            raise DriverError("no data from the drone: cannot tell whether there is an emergency to reset")
         self.stop.reset()
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
         if self.condition.emergency and not self._releasing:
@@ -284,35 +283,35 @@ class SetpointController:
             self._decision = Decision.STAY
         self._stick = stick
 
-    # What is received ---------------------------------------------------------------------------------------------
+    # Receiving ----------------------------------------------------------------------------------------------------
 
     def on_condition(self, condition: Condition, now_ns: int, passed_ns: int | None = None) -> None:
         """Handle the newest navdata.
 
         Args:
-            condition: What they say.
+            condition: Their content.
             now_ns: The present time.
-            passed_ns: The drone's own time since the navdata before; None: as much as here. What was on its way for
-                long, and comes at once, is no news.
+            passed_ns: The drone's own time since the previous navdata; None: the same as here. It tells delayed
+                navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
         self._passed_ns += passed_ns
-        in_a_row = 2 * gap_ns < passed_ns  # else nothing waits any more
+        in_a_row = 2 * gap_ns < passed_ns  # a burst of delayed navdata; otherwise the backlog is empty
         if gap_ns >= SILENT_NS and self._received_ns:
             self._late_ns = gap_ns - passed_ns
         elif self._late_ns:
             self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
         found = self.condition is None and gap_ns >= SILENT_NS
         if found or (self._emergency and not condition.emergency):
-            self._changed_ns, self._passed_ns = now_ns, 0  # navdata have to go on saying so: these may be old
+            self._changed_ns, self._passed_ns = now_ns, 0  # wait for more navdata that agrees: this may be old
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the next one may be the drone's own
+            self._landing_is_ours = False  # the drone may start the next one
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)
@@ -326,14 +325,14 @@ class SetpointController:
             self._landing_is_ours = False
 
     def lost(self) -> None:
-        """Forget the drone's condition, a take-off that is under way and the sticks: nothing is received any more."""
+        """Forget the condition, a take-off under way and the sticks, as the drone is silent."""
         self.condition = self._stick = None
         self._warned_blind = False
         self._releasing = False
         if self._decision is Decision.TAKE_OFF:
             self._decision = Decision.STAY
 
-    # What is sent ----------------------------------------------------------------------------------------------
+    # Sending ---------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
@@ -341,10 +340,10 @@ class SetpointController:
         return events
 
     def messages(self, now_ns: int) -> list[AtMessage]:
-        """Return the commands of this tick: ``PCMD``, and ``REF`` unless nothing is wanted of take-off and landing.
+        """Return the commands of this tick: ``PCMD``, and ``REF`` if a take-off, landing or emergency needs it.
 
-        While another program flies the drone: only the watchdog's answer. While it is not heard and nobody flies it
-        from here: nothing, as it may be another program's, and must land by itself where nobody flies it.
+        While another program flies the drone, return only the watchdog's answer. While the drone is silent and we do
+        not fly it, return nothing: another program may fly it, and without a pilot it must land.
         """
         bits = self._emergency_bits(now_ns)
         if bits is None and not self._steering and (self.condition is None or self.condition.flying):
@@ -355,12 +354,12 @@ class SetpointController:
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
     def _ask_bit(self, now_ns: int) -> None:
-        self._bit_due = not self._bit  # where it is set already, an effect is waited for
+        self._bit_due = not self._bit  # if already set, wait for its effect
         self._on_bit(now_ns)
 
     def _on_bit(self, now_ns: int) -> None:
         self._changed_ns = now_ns
-        self._passed_ns = self._received_ns - now_ns  # so old are the newest navdata, or what is on its way after them
+        self._passed_ns = self._received_ns - now_ns  # minus the age of the newest navdata; more may be under way
 
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)
@@ -371,7 +370,7 @@ class SetpointController:
         if not wanted:
             self._bit = self._bit_due = False
         elif before and without_effect:
-            self._bit, self._bit_due = False, True  # cleared for one tick, for the next edge
+            self._bit, self._bit_due = False, True  # clear for one tick to make another edge
         elif self._bit_due or without_effect:
             self._bit, self._bit_due = True, False
         if self._bit is not before:
@@ -393,9 +392,9 @@ class SetpointController:
         if self._decision is Decision.LAND:
             return Ref(0)
         if self.condition is None:
-            return None  # it goes on with whatever it does
+            return None  # leave the drone as it is
         if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
-            return None  # as one that stands would take off
+            return None  # it may have landed, and would take off again
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         lands = by_itself or (self._landing_is_ours and self.condition.touches_down)
         return Ref.TAKEOFF if self.condition.flying and not lands else Ref(0)

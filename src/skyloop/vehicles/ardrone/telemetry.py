@@ -1,8 +1,8 @@
-"""Navdata to feedback: order and time of datagrams, units, axes and signs, and what the state bits say. Pure.
+"""Convert navdata to feedback: order and time of datagrams, units, axes and signs, state bits. Pure.
 
-The drone's body axes are x forward, y right, z down: a positive ``theta`` is nose up, a positive ``phi`` right side
-down, a positive ``psi`` clockwise seen from above, ``vy`` is to the right. That accelerometers and gyros follow the
-same axes was checked on a datagram of a real AR.Drone 2 that stood tilted.
+The drone's body axes are x forward, y right, z down: positive ``theta`` is nose up, positive ``phi`` right side down,
+positive ``psi`` clockwise seen from above, and ``vy`` points right. A datagram of a real AR.Drone 2 that stood tilted
+confirmed the same axes for accelerometers and gyros.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from skyloop.vehicles.ardrone.wire.configuration import NO_CEILING_MM
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, State, decode
 from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, PhysMeasures, RawMeasures, Time, VisionDetect
 
-# Datagrams as they come ----------------------------------------------------------------------------------------------
+# Reception -----------------------------------------------------------------------------------------------------------
 
-#: Between two datagrams, as the drone makes them: few of them, as before its set-up, or all.
+#: Period of the drone's datagrams, with few options (as before its set-up) or with all.
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
-RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a new count, and not a late datagram
+RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a restart and not a late datagram
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
 
 
 class Reception:
-    """Decodes navdata and keeps those that are whole and newer than the last.
+    """Decodes navdata and keeps datagrams that are whole and newer than the last.
 
-    ``counts`` has ``received``, ``damaged`` (no navdata, or a wrong checksum), ``late`` (repeated or out of order),
+    ``counts`` has ``received``, ``damaged`` (not navdata, or a wrong checksum), ``late`` (repeated or out of order),
     ``missed`` (gaps in the sequence), ``restarts`` of the sequence and ``unknown`` options.
     """
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "missed", "restarts", "unknown"), 0))
-        self.passed_ns = 0  #: the drone's own time between the two newest that were accepted, by their numbers
+        self.passed_ns = 0  #: drone time between the two newest accepted datagrams, from their numbers
         self._sequence = 0
         self._accepted_ns = 0
         self._watch = RestartWatch()
 
     def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
-        """Return the content of a datagram, or None if it is damaged or late. Never raises."""
+        """Return the content of a datagram; None if it is damaged or late. Never raises."""
         try:
             navdata = decode(datagram)
         except DecodeError:
@@ -64,11 +64,11 @@ class Reception:
         return navdata
 
     def expect_restart(self) -> None:
-        """Accept whatever comes next as the first: the drone was silent or lost us."""
+        """Accept any sequence number next: the drone was silent or lost us."""
         self._accepted_ns = 0
 
     def telemetry(self) -> dict[str, Value]:
-        """Return the counts under their names in feedback's ``native``."""
+        """Return the counts under their names in ``Feedback.native``."""
         return {f"navdata.{name}": count for name, count in self.counts.items()}
 
     def _is_new(self, sequence: int, now_ns: int) -> bool:
@@ -89,8 +89,8 @@ class Reception:
 class DroneClock:
     """Maps a datagram to the time of its state, on this host's clock.
 
-    Without the option ``time`` that is when the datagram arrived; with it, its stamps are mapped by the smallest delay
-    seen lately. Times never run backwards.
+    Without the option ``time`` that is the datagram's arrival; with it, the drone's stamps minus the smallest recent
+    delay. Times never run backwards.
     """
 
     def __init__(self) -> None:
@@ -100,7 +100,7 @@ class DroneClock:
         self._captured_ns = 0
 
     def captured_ns(self, navdata: Navdata, arrived_ns: int) -> int:
-        """Return when the drone was in the state of a datagram that arrived at ``arrived_ns``."""
+        """Return the capture time of the state in a datagram that arrived at ``arrived_ns``."""
         time = navdata.get(Time)
         captured_ns = arrived_ns if time is None else self._live.captured_ns(self._unwrapped(time.time), arrived_ns)
         self._captured_ns = max(self._captured_ns, captured_ns)
@@ -118,7 +118,7 @@ class DroneClock:
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_WINDOW_NS: Final = nanoseconds(0.3)
+CLIMB_WINDOW_NS: Final = nanoseconds(0.3)  #: over which the slope of the altitude is measured
 Vector = tuple[float, float, float]
 
 _FLIGHT_STATES: Final = {
@@ -132,7 +132,7 @@ _FLIGHT_STATES: Final = {
 
 
 def control_state(demo: Demo) -> ControlState | None:
-    """Return what the drone's control does; None for a number that no known firmware sends."""
+    """Return the state of the drone's control; None for a number that no known firmware sends."""
     try:
         return ControlState(demo.ctrl_state >> 16)
     except ValueError:
@@ -140,7 +140,7 @@ def control_state(demo: Demo) -> ControlState | None:
 
 
 def flight_state(state: State, control: ControlState | None) -> FlightState:
-    """Return the flight state from the state bits and the control's state."""
+    """Return the flight state for the state bits and the control state."""
     if state & State.EMERGENCY:
         return FlightState.EMERGENCY
     resting = FlightState.FLYING if state & State.FLYING else FlightState.LANDED
@@ -148,10 +148,7 @@ def flight_state(state: State, control: ControlState | None) -> FlightState:
 
 
 class ClimbMeter:
-    """Measures climb [m/s] as the slope of the altitude over the last 0.3 s.
-
-    The firmware leaves ``demo.vz`` at zero.
-    """
+    """Measures climb [m/s] as the slope of altitude over the last 0.3 s, as the firmware leaves ``demo.vz`` at zero."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, float]] = deque()
@@ -163,7 +160,7 @@ class ClimbMeter:
         while len(samples) > 2 and at_ns - samples[1][0] >= CLIMB_WINDOW_NS:
             samples.popleft()
         begun_ns, begun_m = samples[0]
-        if at_ns - begun_ns > 4 * CLIMB_WINDOW_NS:  # after a gap the slope is not that of now
+        if at_ns - begun_ns > 4 * CLIMB_WINDOW_NS:  # the slope across a gap is out of date
             samples.popleft()
             return None
         return (altitude_m - begun_m) / seconds(at_ns - begun_ns) if at_ns > begun_ns else None
@@ -174,7 +171,7 @@ def feedback_of(
 ) -> Feedback:
     """Return the drone's state in SI units and our axes.
 
-    What the drone does not report, or reports as an impossible number, is None; so is its velocity without a climb.
+    Values that the drone omits or reports as impossible numbers are None; so is the velocity without a climb.
     """
     measured, raw = navdata.get(PhysMeasures), navdata.get(RawMeasures)
     yaw = _angle(demo.psi)
@@ -200,7 +197,7 @@ def _angle(millidegrees: float) -> float | None:
 
 
 def _flipped(forward_right_down: tuple[float, ...], factor: float) -> Vector | None:
-    """Turn axes forward, right, down into forward, left, up."""
+    """Convert from forward, right, down to forward, left, up."""
     x, y, z = forward_right_down
     return _vector(x * factor, -y * factor, -z * factor)
 
@@ -218,18 +215,18 @@ def _name(kind: type[Any]) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
 
 
-#: Of each option the names of its fields.
+#: Field names of each option.
 _FIELDS: Final = {kind: tuple(f"{_name(kind)}.{field}" for field in kind._fields) for kind in LAYOUTS}
-#: Tags by the options' names, as ``navdata_options`` of an address takes them.
+#: Tags by option name, as used in ``navdata_options`` of an address.
 OPTION_TAGS: Final = {_name(kind): layout.tag for kind, layout in LAYOUTS.items()}
-#: Fields of the demo option that are useful: the drone's matrices are deprecated, and most tags empty.
+#: Useful fields of the demo option: the drone's matrices are deprecated, and most tags empty.
 _DEMO_FIELDS: Final = len(Demo._fields) - 6
 
 
 def native_of(navdata: Navdata, *, everything: bool) -> dict[str, Value]:
-    """Return all options of a datagram as telemetry; numbers that are not finite are left out.
+    """Return all options of a datagram as telemetry, without numbers that are not finite.
 
-    Unless ``everything`` is wanted, so are the deprecated matrices of the demo option and an empty list of tags.
+    Unless ``everything`` is True, omit the deprecated matrices of the demo option and an empty list of tags.
     """
     native: dict[str, Value] = {"state": int(navdata.state), "sequence": navdata.sequence}
     for kind, option in navdata.options.items():
@@ -251,7 +248,7 @@ def _finite(value: Any) -> bool:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-#: Bit, its name in events' data, what it means while it is set.
+#: Bit, its name in the events' data, and its meaning while set.
 _CONDITIONS: Final = (
     (State.COMMUNICATION_LOST, "communication_lost", "the drone reports that it lost its link to us", Severity.WARNING),
     (State.BATTERY_LOW, "battery_low", "the drone's battery is low", Severity.WARNING),
@@ -264,7 +261,7 @@ _CONDITIONS: Final = (
     (State.MAGNETOMETER_UNCALIBRATED, "magnetometer", "the drone's magnetometer needs calibration", Severity.INFO),
     (State.TIMER_ELAPSED, "timer", "the drone's timer elapsed", Severity.WARNING),
 )
-#: Why the motors were cut, as far as there is a bit for it.
+#: Reasons for cut motors that have a bit.
 _REASONS: Final = (
     (State.USER_EMERGENCY, "user"),
     (State.ANGLES_OUT_OF_RANGE, "angles"),
@@ -278,7 +275,7 @@ _REASONS: Final = (
 
 
 def emergency_reason(state: State) -> str:
-    """Return why the motors are cut: names joined by commas, or ``unknown``."""
+    """Return the reasons for the cut motors as names joined by commas, or ``unknown``."""
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 
@@ -289,7 +286,7 @@ class Health:
         self._reported = State(0)
 
     def changes(self, state: State) -> list[VehicleEvent]:
-        """Return what changed since the last call."""
+        """Return events for the changes since the last call."""
         before, self._reported = self._reported, state
         changed = before ^ state
         found = []
@@ -316,12 +313,12 @@ def _emergency(state: State) -> VehicleEvent:
     return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})
 
 
-#: Bits that speak against a flight: what is examined, what it means, what to do, and whether it keeps the drone down.
+#: Preflight findings: bit, topic, meaning, remedy, and whether it prevents a take-off.
 _BITS: Final = (
     (State.MOTORS_PROBLEM, "motors", "a motor does not answer: it won't take off", "turn each rotor by hand", True),
     (State.SOFTWARE_FAULT, "firmware", "the drone reports a fault: it may not fly", "switch it off and on", True),
     (State.ANGLES_OUT_OF_RANGE, "angles", "it is tilted too far: it won't take off", "put it level", True),
-    (State.ULTRASOUND_DEAF, "height", "its ultrasound is deaf: it does not know its height", "clean the sensor", True),
+    (State.ULTRASOUND_DEAF, "height", "its ultrasound is deaf: its height is unknown", "clean the sensor", True),
     (
         State.MAGNETOMETER_UNCALIBRATED,
         "compass",
@@ -334,14 +331,14 @@ _BITS: Final = (
 
 
 def diagnose(state: State | None, values: Mapping[str, str]) -> list[Diagnostic]:
-    """Return what is found in the newest bits and in the configuration, which is empty before it was read."""
+    """Return findings from the newest bits and from the configuration, which is empty until read."""
     found = [
         Diagnostic(what, False, detail, advice, severe)
         for bit, what, detail, advice, severe in _BITS
         if state is not None and state & bit
     ]
     if not values:
-        return [*found, Diagnostic("configuration", False, "it was not read yet: its limits are not known", "wait")]
+        return [*found, Diagnostic("configuration", False, "not read yet: its limits are unknown", "wait")]
     ceiling_mm = _number(values.get("control:altitude_max"))
     if ceiling_mm is not None:
         high = ceiling_mm >= NO_CEILING_MM

@@ -1,10 +1,10 @@
 """The drone's video port: streams, frames and their times, decoders, and cameras.
 
-An AR.Drone 2 sends PaVE over TCP, an AR.Drone 1 a picture a datagram over UDP while somebody keeps asking for them.
-Stamps of a PaVE header are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h`` of the AR.Drone SDK
-2.0.1). Which moment of the picture they name is written nowhere; it is taken for the capture. Intrinsics of the
-AR.Drone 2 are calibrations of one such drone as published with ardrone_autonomy (branch of TUM), for pictures of
-640×360; another drone's differ by some per cent. Nothing is known of the AR.Drone 1's.
+An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each picture as one UDP datagram as long as a client keeps
+requesting them. Stamps in a PaVE header are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h`` of
+the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. Intrinsics of the
+AR.Drone 2 are those of one drone, published with ardrone_autonomy (branch of TUM) for pictures of 640×360; other drones
+differ by some per cent. For the AR.Drone 1 none are known.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone shows one at a time. Intrinsics in the address are the front camera's."""
+    """Return both cameras; the drone shows one at a time. Intrinsics in the address are the front camera's."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -67,17 +67,17 @@ _WRAP: Final = 1 << 32
 class DroneStamps:
     """Capture times of one connection's frames.
 
-    Follows a drift of the drone's clock and the wrap of its stamps. Stamps that go back (a drone that was restarted)
-    void what was learned.
+    Follows the drift of the drone's clock and the wrap of its stamps. Stamps that go back (a restarted drone) reset
+    the estimate.
     """
 
     def __init__(self) -> None:
         self._clock = LiveClock()
-        self._stamp_ms = 0  # of the frame before, as the drone wrote it
+        self._stamp_ms = 0  # stamp of the previous frame, as sent
         self._time_ms = 0  # the same without wraps
 
     def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
-        """Return when a picture was captured, by the stamp of its PaVE header: never later than it arrived."""
+        """Return the capture time for the stamp of a PaVE header, never later than the arrival."""
         step_ms = (stamp_ms - self._stamp_ms + _WRAP // 2) % _WRAP - _WRAP // 2
         self._stamp_ms = stamp_ms
         self._time_ms += step_ms
@@ -90,8 +90,8 @@ class DroneStamps:
 class PaveAssembly:
     """Assembles the frames of one connection.
 
-    The first frame may be one that is seconds old (seen in a capture of a real drone). So it is returned with the
-    second one, and only if their numbers follow one another.
+    The first frame may be seconds old (seen in a capture of a real drone). It is therefore held back until the second
+    one, and returned only if their numbers are consecutive.
     """
 
     def __init__(self, connection: int) -> None:
@@ -99,21 +99,21 @@ class PaveAssembly:
         self._parser = PaveParser()
         self._stamps = DroneStamps()
         self._stale = 0
-        self._first: tuple[int, Coded] | None = None  # and its number, until the second one came
+        self._first: tuple[int, Coded] | None = None  # with its number, until the second one arrives
         self._greeted = False
 
     @property
     def broken(self) -> int:
-        """Frames that were begun and not finished, or stale."""
+        """Incomplete or stale frames."""
         return self._parser.broken_frames + self._stale
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that belong to no whole frame."""
+        """Bytes outside of complete frames."""
         return self._parser.skipped_bytes
 
     def feed(self, data: bytes, now_ns: int) -> list[Coded]:
-        """Return the frames that these bytes complete. Never raises, whatever the bytes are."""
+        """Return the frames that these bytes complete. Never raises for any content."""
         return [coded for frame in self._parser.feed(data) for coded in self._greet(frame, self._coded(frame, now_ns))]
 
     def end(self) -> None:
@@ -139,11 +139,11 @@ class PaveAssembly:
         return [coded]
 
 
-CONNECT_S: Final = 1.0
-POLL_S: Final = 0.1
-SILENT_S: Final = 3.0  #: without a whole frame for so long, a connection is given up
-KEEP_ALIVE_S: Final = 0.5
-WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it up
+CONNECT_S: Final = 1.0  #: limit for a connection
+POLL_S: Final = 0.1  #: longest wait in one read
+SILENT_S: Final = 3.0  #: limit without a whole frame, after which the connection is closed
+KEEP_ALIVE_S: Final = 0.5  #: between requests to an AR.Drone 1
+WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
 
 
@@ -168,7 +168,7 @@ class PaveStream:
         return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
-        """Return the frames that arrived, after :data:`POLL_S` at most."""
+        """Return the frames that arrived, within :data:`POLL_S`."""
         try:
             data = self._socket.recv(_CHUNK)
         except TimeoutError:
@@ -188,7 +188,7 @@ class PaveStream:
 
 
 class DatagramStream:
-    """The video of an AR.Drone 1: one picture in a datagram over UDP, while somebody keeps asking for them."""
+    """The video of an AR.Drone 1: one picture per UDP datagram, as long as the client keeps requesting them."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self.broken = 0
@@ -199,7 +199,7 @@ class DatagramStream:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.settimeout(POLL_S)
-            self._socket.connect((host, port))  # what others send is not taken then
+            self._socket.connect((host, port))  # drops datagrams from other senders
             self._socket.send(WAKE)
         except OSError:
             self._socket.close()
@@ -207,9 +207,9 @@ class DatagramStream:
         self._woken_ns = self._received_ns
 
     def read(self) -> list[Coded]:
-        """Return the picture that arrived, after :data:`POLL_S` at most.
+        """Return the picture that arrived, within :data:`POLL_S`.
 
-        A picture has no stamp: it counts as captured when it arrived.
+        A picture has no stamp: its arrival is its capture time.
         """
         try:
             data = self._socket.recv(_CHUNK)
@@ -231,7 +231,7 @@ class DatagramStream:
 
 
 def open_stream(version: int, host: str, port: int, connection: int, clock: Clock) -> Stream:
-    """Connect to the drone's video. An AR.Drone 1's absence shows only when reading."""
+    """Connect to the drone's video. A missing AR.Drone 1 is noticed only when reading."""
     return (PaveStream if version == 2 else DatagramStream)(host, port, connection, clock)
 
 
@@ -242,8 +242,8 @@ def _give_up_if_silent(silent_ns: int) -> None:
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: a number further back than this is not a late picture but a drone that was restarted,
-OLD_RUN: Final = 4  #: and so are this many pictures in a row that are older than the newest
+REORDERED: Final = 64  #: a number further back than this means a restarted drone, not a late picture;
+OLD_RUN: Final = 4  #: so do this many consecutive pictures older than the newest
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
@@ -275,10 +275,10 @@ class PaveVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes MPEG-4 and H.264."""
         frame = coded.data
         if not isinstance(frame, PaveFrame):
-            raise TypeError("a frame of an AR.Drone 2 is wanted")
+            raise TypeError("expected a frame of an AR.Drone 2")
         if frame.codec not in _DECODED:
             raise UnsupportedError(
-                f"the drone sends video in codec {_codec_name(frame.codec)}, which is not decoded here: "
+                f"the drone sends video in codec {_codec_name(frame.codec)}, which is not supported: "
                 "set video:video_codec to H.264 (129)"
             )
         image = self._decoder.decode(frame)
@@ -288,13 +288,13 @@ class PaveVideo:
 
 
 class UvlcVideo:
-    """Decodes an AR.Drone 1's video, and leaves out pictures that come after a newer one."""
+    """Decodes an AR.Drone 1's video and drops pictures that arrive after a newer one."""
 
     def __init__(self) -> None:
         self.waited = 0
         self.damaged = 0
         self._decoder = UvlcDecoder()
-        self._number: int | None = None  # of the newest picture
+        self._number: int | None = None  # number of the newest picture
         self._old_run = 0
 
     def restart(self) -> None:
@@ -306,10 +306,10 @@ class UvlcVideo:
         """See :class:`skyloop.drivers.live_video.Decoder`. Decodes UVLC, not P264."""
         packet = coded.data
         if not isinstance(packet, bytes):
-            raise TypeError("a datagram of an AR.Drone 1 is wanted")
+            raise TypeError("expected a datagram of an AR.Drone 1")
         if is_p264(packet):
             raise UnsupportedError(
-                "the drone sends video in P264, which is not decoded here: set video:video_codec to UVLC (32)"
+                "the drone sends video in P264, which is not supported: set video:video_codec to UVLC (32)"
             )
         try:
             picture = self._decoder.decode(packet)
@@ -324,12 +324,12 @@ class UvlcVideo:
         return Decoded(picture.number, picture.pixels) if show else None
 
     def _is_old(self, picture: UvlcPicture) -> bool:
-        """Return whether it came after a newer one, or a second time."""
+        """Return whether a picture is older than the newest one, or a repetition."""
         return self._number is not None and 0 <= (self._number - picture.number) % (1 << 32) < REORDERED
 
 
 def make_decoder(version: int) -> Decoder:
-    """Return the decoder for a version of the drone; raises if what it needs is not installed."""
+    """Return the decoder for a version of the drone; raise if its library is not installed."""
     return PaveVideo() if version == 2 else UvlcVideo()
 
 
@@ -344,9 +344,9 @@ def _codec_name(codec: int) -> str:
 
 
 class EncodedStream:
-    """Hands H.264 on while somebody wants it; see :class:`StreamRelay`. Used by the thread that reads.
+    """Relays H.264 while a recorder subscribes; see :class:`StreamRelay`. Used by the reading thread.
 
-    A frame came over TCP, so it is whole, and need not be decoded to know that.
+    Frames arrive over TCP, so they are whole; no decoding is needed to check that.
     """
 
     def __init__(
@@ -357,7 +357,7 @@ class EncodedStream:
         self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
     def take(self, coded: Coded) -> None:
-        """Hand on a frame that arrived whole, if it is H.264, wanted, and decodable after the last one."""
+        """Relay a whole frame if it is H.264, requested, and decodable after the last one."""
         frame = coded.data
         if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC:
             self._relay.restart()

@@ -1,7 +1,7 @@
-"""Firmware of real drones, emulated over a simulated vehicle well enough for other people's programs.
+"""Firmware of real drones, emulated over a simulated vehicle well enough for third-party programs.
 
-A package ``emulator`` for each kind of vehicle has what is switched on and off, with its thread, ports and settings;
-beside it ``telemetry``, the logic (``logic``, ``board``, or ``autopilot`` where there are two of a kind), and how it
-flies (``flight``, ``manoeuvres``). Here is what they share: the thread and its ports (``datagrams``), what flies
-(``flight``), and the camera's pictures on their way out (``video``).
+Each kind of vehicle has a package ``emulator`` with the firmware that is switched on and off, its thread, ports and
+settings. Beside it are ``telemetry``, the logic (``logic``, ``board``, or ``autopilot`` if there are two of a kind),
+and its flight (``flight``, ``manoeuvres``). This package holds the shared parts: the thread and its ports
+(``datagrams``), the flying body (``flight``), and the encoding of camera pictures (``video``).
 """

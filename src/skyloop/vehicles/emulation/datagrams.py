@@ -1,6 +1,6 @@
-"""The emulated firmware's thread and ports: a UDP port, with faults each way, and a TCP port for one client at a time.
+"""The emulated firmware's thread and ports: a UDP port with faults each way, and a TCP port for one client at a time.
 
-The thread waits for sockets, for times and for work that other threads hand it.
+The thread waits for sockets, for due times and for work from other threads.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _log = logging.getLogger(__name__)
 
 
 class Loop:
-    """Calls back on one thread.
+    """Runs callbacks on one thread.
 
-    Everything but :meth:`post`, :meth:`start` and :meth:`stop` belongs to that thread, or to before its start. What a
-    callback raises is logged, and the loop goes on.
+    Everything but :meth:`post`, :meth:`start` and :meth:`stop` belongs to that thread, or to the time before its start.
+    Exceptions in callbacks are logged, and the loop continues.
     """
 
     def __init__(self, name: str) -> None:
@@ -49,7 +49,7 @@ class Loop:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread. When this returns no callback runs any more. Must not be called by one."""
+        """Stop the thread. No callback runs after it returns. Must not be called by a callback."""
         self._stopping = True
         self._wake()
         if self._thread.is_alive():
@@ -59,18 +59,18 @@ class Loop:
         self._wakened.close()
 
     def post(self, call: Callable[[], None]) -> None:
-        """Have a function called on the loop's thread. From any thread."""
+        """Call a function on the loop's thread. From any thread."""
         self._posted.append(call)
         self._wake()
 
     def at(self, due_ns: int, call: Callable[[], None]) -> None:
-        """Have a function called at a time of the monotonic clock [ns]."""
+        """Call a function at a time of the monotonic clock [ns]."""
         heapq.heappush(self._timers, (due_ns, next(self._order), call))
 
     def watch(
         self, sock: socket.socket, readable: Callable[[], None], writable: Callable[[], None] | None = None
     ) -> None:
-        """Have functions called when a socket has something to read, or room to write, from now on."""
+        """Call functions from now on when a socket has something to read, or room to write."""
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if writable else 0)
         try:
             self._selector.modify(sock, events, (readable, writable))
@@ -101,11 +101,11 @@ class Loop:
     def _call(self, call: Callable[[], None]) -> None:
         try:
             call()
-        except Exception:  # noqa: BLE001  a drone that dies of one datagram helps nobody
-            _log.exception("the emulated firmware met an error and continues")
+        except Exception:  # noqa: BLE001  one bad datagram must not end the drone
+            _log.exception("the emulated firmware raised an error and continues")
 
     def _wake(self) -> None:
-        with suppress(OSError):  # full: it is awake already
+        with suppress(OSError):  # full: already awake
             self._waker.send(b"\0")
 
     def _empty(self) -> None:
@@ -116,12 +116,12 @@ class Loop:
 Address = tuple[str, int]
 
 MAX_DATAGRAM: Final = 65_507
-_MOST_AT_ONCE: Final = 64  # read before others have their turn
+_MOST_AT_ONCE: Final = 64  # datagrams read before other callbacks run
 _SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
 
 
 class DatagramPort:
-    """Answers every sender, at the port that the datagram came from. Used on the loop's thread."""
+    """Answers every sender, at the port that its datagram came from. Used on the loop's thread."""
 
     def __init__(
         self,
@@ -146,11 +146,11 @@ class DatagramPort:
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The real port; a free one was chosen for 0."""
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram. It is lost where there is no room or nobody, as datagrams are."""
+        """Send a datagram. It is lost without room or recipient, as usual for UDP."""
         for each in self._outward.packets(datagram):
             self._later(partial(self._send, each, to))
 
@@ -163,7 +163,7 @@ class DatagramPort:
         for _ in range(_MOST_AT_ONCE):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
-            except OSError:  # nothing more, or an answer that could not be delivered
+            except OSError:  # no more datagrams, or an answer that could not be delivered
                 return
             for each, address in self._inward.items((datagram, sender)):
                 self._later(partial(self._on_datagram, each, address))
@@ -180,9 +180,9 @@ class DatagramPort:
 
 
 def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
-    """Return a non-blocking socket that is bound; raises LinkError, with what to do about it, where that can't be.
+    """Return a non-blocking bound socket; raises LinkError with a remedy if that fails.
 
-    A TCP port may be bound again while connections of an earlier firmware are still winding down; a UDP port may not be
+    A TCP port may be bound again while connections of an earlier firmware are still closing. A UDP port must not be
     shared, or two firmwares would steal each other's datagrams.
     """
     made = socket.socket(socket.AF_INET, kind)
@@ -196,7 +196,7 @@ def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
         protocol = "TCP" if kind is socket.SOCK_STREAM else "UDP"
         raise LinkError(
             f"the drone's {name} port, {protocol} {bind[1]} on {bind[0]}, can't be opened ({error.strerror}): "
-            "end what uses it, or take other ports"
+            "stop the program that uses it, or choose other ports"
         ) from error
     return made
 
@@ -205,7 +205,7 @@ _BUFFER: Final = 1 << 16
 
 
 class ByteServer:
-    """Takes the next client when the last one is gone: until then it waits in the kernel, connected and unanswered.
+    """Serves one client after another: while one is connected, the next waits in the kernel, connected and unanswered.
 
     Used on the loop's thread.
     """
@@ -229,11 +229,11 @@ class ByteServer:
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The real port; a free one was chosen for 0."""
         return int(self._server.getsockname()[1])
 
     def send(self, data: bytes) -> None:
-        """Send to the client, if there is one; what does not fit is lost, as on a serial line."""
+        """Send to the client, if there is one; bytes that do not fit are lost, as on a serial line."""
         if self._client is None:
             return
         try:
@@ -253,7 +253,7 @@ class ByteServer:
             self._client.close()
 
     def drop(self) -> None:
-        """End the client's connection."""
+        """Close the client's connection."""
         if self._client is not None:
             self._loop.forget(self._client)
             self._client.close()

@@ -1,4 +1,4 @@
-"""Base classes of every emulator: firmware that can be switched on and off, and its state while it is on."""
+"""Base classes of the emulators: firmware that can be switched on and off, and its state while it is on."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _log = logging.getLogger(__name__)
 
 
 class Closable(Protocol):
-    """A port, or another place that pictures go to."""
+    """A port, or another recipient of pictures."""
 
     def close(self) -> None: ...
 
 
 class RunningEmulator(ABC):
-    """Firmware that is on from its making until :meth:`stop`. A constructor that fails half-way calls that too.
+    """Firmware that is on from its construction to :meth:`stop`. A constructor that fails half-way calls that too.
 
-    What a kind of firmware adds belongs to the loop's thread. The host's threads only leave their reports and pictures,
-    and read what is replaced as a whole.
+    Additions of subclasses belong to the loop's thread. The host's threads only store their reports and pictures, and
+    read values that are replaced as a whole.
 
     Args:
         host: The simulated world.
-        drone: Its number in it.
-        loop: Name of the loop's thread; or a loop that several share, which whoever made it starts after them and stops
-            before them.
+        drone: Its number in that world.
+        loop: Name of the loop's thread; or a shared loop, which its maker starts after the firmware and stops before
+            it.
     """
 
     def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:
@@ -50,7 +50,7 @@ class RunningEmulator(ABC):
         self._posted = False
 
     def stop(self) -> None:
-        """Switch it off. When this returns the ports are free."""
+        """Switch it off. The ports are free when it returns."""
         self._host.detach(self._drone, self)
         if self._video is not None:
             self._video.stop()
@@ -61,51 +61,51 @@ class RunningEmulator(ABC):
 
     @abstractmethod
     def _tick(self, report: Report) -> None:
-        """Handle a new report. On the loop's thread."""
+        """Handle a new report. Runs on the loop's thread."""
 
     def _handle_report(self) -> None:
         self._posted = False
         if self._report is not None:
             self._tick(self._report)
 
-    # Called by the host, on its threads --------------------------------------------------------------------------
+    # Called by the host on its threads ---------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Keep what the drone believes now for the loop's thread; a report that was not handled yet is replaced."""
+        """Store the drone's newest estimate for the loop's thread, in place of one that is still unhandled."""
         self._report = report
         if not self._posted:
             self._posted = True
             self._loop.post(self._handle_report)
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Log a collision or the like; what comes of it shows in what the drone sends."""
+        """Log an event such as a collision; its effect shows in the drone's own data."""
         _log.info("drone %d: %s", occurrence.drone, occurrence.text)
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many pictures a second of this camera would be sent: all or none."""
+        """Return the frame rate for this camera: the full one, or 0."""
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Encode a picture that is due: BGR, uint8, shape (height, width, 3), which must not change any more."""
+        """Encode a due picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
         if self._video is not None:
             self._video.show(model.name, pixels, captured_ns)
 
     def failed(self, error: Exception) -> None:
         """Log an error of the simulation or the renderer.
 
-        Without reports nothing is sent, as from a drone that is dead.
+        Without reports the firmware sends nothing, like a dead drone.
         """
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 
-LONGEST_DELAY_S: Final = 10.0
+LONGEST_DELAY_S: Final = 10.0  #: of datagrams
 NO_FAULTS: Final = Faults()
 
 R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone of a host's world; a context manager that is on within its block."""
+    """The firmware of one drone in a host's world; a context manager that is on within its block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host
@@ -113,15 +113,15 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch it on: everything is reset, but at the ports that it had before."""
+        """Switch it on. Everything is reset, except its ports."""
         if self._running is not None:
             raise UsageError("this firmware is started already")
         self._running = self._switched_on()
 
     def stop(self) -> None:
-        """Switch it off, in the middle of whatever it does. Does nothing if it is not started.
+        """Switch it off, in the middle of any activity. Does nothing if it is off.
 
-        The vehicle goes on with its last command. When this returns the ports are free again.
+        The vehicle keeps following its last command. The ports are free when this returns.
         """
         running, self._running = self._running, None
         if running is not None:

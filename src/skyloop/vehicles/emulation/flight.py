@@ -1,6 +1,6 @@
-"""The body that flies, one drone of a simulation, and the loops below an autopilot's modes over it. Pure.
+"""The flying body, one drone of a simulation, and the control loops below an autopilot's modes. Pure.
 
-The loops fly positions, world velocities and headings.
+The loops control positions, world velocities and headings.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Vehicle(Protocol):
         """Height of its world [m]."""
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the body; return what was applied, :class:`skyloop.messages.Idle` where it was ignored."""
+        """Command the body; return the applied action, :class:`skyloop.messages.Idle` if it was ignored."""
 
     def set_limits(self, limits: Limits) -> None: ...
 
@@ -43,7 +43,7 @@ class SimulatedVehicle:
 
     @property
     def state(self) -> FlightState:
-        """Flight state, as it is."""
+        """True flight state."""
         return self._simulation.state(self._drone)
 
     @property
@@ -52,7 +52,7 @@ class SimulatedVehicle:
         return self._simulation.world.room.size_m[2]
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the body, and return what was applied."""
+        """Command the body, and return the applied action."""
         return self._simulation.command(self._drone, action)
 
     def set_limits(self, limits: Limits) -> None:
@@ -60,15 +60,15 @@ class SimulatedVehicle:
         self._simulation.set_limits(self._drone, limits)
 
 
-LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
+LIFT_M: Final = 0.3  #: height of the simulated vehicle's own take-off, before these loops take over
 LIMITS: Final = Limits(
     tilt_rad=0.52, climb_m_s=2.5, yaw_rate_rad_s=2.5, altitude_m=100.0, speed_m_s=8.0, takeoff_altitude_m=LIFT_M
 )
-PLACE_GAIN_PER_S: Final = 0.9
-YAW_GAIN_PER_S: Final = 2.0
-YAW_RATE_RAD_S: Final = 1.5
-GO_M_S: Final = 3.0
-SINK_M_S: Final = 1.5
+PLACE_GAIN_PER_S: Final = 0.9  #: speed per distance to a position
+YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per heading error
+YAW_RATE_RAD_S: Final = 1.5  #: limit while turning to a heading
+GO_M_S: Final = 3.0  #: usual horizontal speed towards a position
+SINK_M_S: Final = 1.5  #: usual climb and descent towards a position
 HEADROOM_M: Final = 1.0  #: kept below the ceiling
 _CLIMB_LAG_S: Final = 0.33  #: of the simulated vehicle's climb loop
 _AIRBORNE: Final = (FlightState.HOVERING, FlightState.FLYING)
@@ -89,23 +89,23 @@ USUAL: Final = Speeds()
 class FlightControl:
     """Flies a simulated vehicle by position, velocity, attitude or thrust.
 
-    World axes are east, north, up from where the vehicle stood when it was made; yaw is counter-clockwise from east.
-    What it does must be asked for at every tick.
+    World axes are east, north, up from the vehicle's position at construction; yaw is counter-clockwise from east.
+    Call one of its commands in every tick.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
         self.vehicle = vehicle
         self.place: Vec3 = (0.0, 0.0, 0.0)
-        self.velocity: Vec3 = (0.0, 0.0, 0.0)  #: east, north, up
+        self.velocity: Vec3 = (0.0, 0.0, 0.0)  #: east, north, up [m/s]
         self.yaw = 0.0
         self._home: tuple[float, float] | None = None
-        self._sinking = 0.0  # climb rate under a collective thrust
+        self._sinking = 0.0  # climb rate under a collective thrust [m/s]
         self._time_s = 0.0
         self._step_s = 0.0
         vehicle.set_limits(LIMITS)
 
     def update(self, report: Report) -> None:
-        """Handle what the vehicle believes now."""
+        """Handle the vehicle's newest estimate."""
         believed, (east, north, _) = report.believed, report.truth.position_m
         if self._home is None:
             self._home = east, north
@@ -122,7 +122,7 @@ class FlightControl:
 
     @property
     def highest_m(self) -> float:
-        """The greatest height that it reaches: a climb to more would never end."""
+        """The greatest height it can reach; a climb beyond it would never end."""
         return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
 
     @property
@@ -140,7 +140,7 @@ class FlightControl:
         """Whether the vehicle is on the ground, or its motors are cut."""
         return self.vehicle.state in (FlightState.LANDED, FlightState.EMERGENCY)
 
-    # What it does; each must be asked for again at every tick ----------------------------------------------------
+    # Commands; call one in every tick ----------------------------------------------------------------------------
 
     def lift_off(self) -> None:
         """Take off from the ground, or out of a landing."""
@@ -148,7 +148,7 @@ class FlightControl:
             self.vehicle.command(Takeoff())
 
     def hold(self) -> None:
-        """Stay where it is."""
+        """Hold the position."""
         self._fly(Hover())
 
     def land(self) -> None:
@@ -157,11 +157,11 @@ class FlightControl:
             self.vehicle.command(Land())
 
     def cut(self) -> None:
-        """Stop the motors, wherever it is."""
+        """Stop the motors, even in the air."""
         self.vehicle.command(EmergencyStop())
 
     def lie(self) -> None:
-        """Let it start again after :meth:`cut`, once it lies on the ground."""
+        """Allow another start after :meth:`cut`, once it lies on the ground."""
         if self.vehicle.state is FlightState.EMERGENCY:
             self.vehicle.command(ResetEmergency())
 
@@ -175,7 +175,7 @@ class FlightControl:
         self._fly(VelocityAction(forward, left, up, yaw_rate))
 
     def go(self, place: Vec3, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
-        """Fly towards a position, east, north, up from the origin [m], slower as it comes near."""
+        """Fly towards a position, east, north, up from the origin [m], and slow down near it."""
         east, north, up = (PLACE_GAIN_PER_S * (to - at) for to, at in zip(place, self.place, strict=True))
         speed = math.hypot(east, north)
         share = min(1.0, speeds.across / speed) if speed > 0 else 1.0
@@ -187,14 +187,14 @@ class FlightControl:
         self._fly(Attitude(roll, pitch, climb, yaw_rate))
 
     def lean_by_thrust(self, roll: float, pitch: float, thrust: float, yaw_rate: float) -> None:
-        """Fly an attitude with a collective thrust, as a share of the weight."""
+        """Fly an attitude with a collective thrust, given as a share of the weight."""
         upward = GRAVITY_M_S2 * (thrust * math.cos(roll) * math.cos(pitch) - 1.0)
         self._sinking += upward * self._step_s
         self._sinking = max(self.velocity[2] - 1.0, min(self.velocity[2] + 1.0, self._sinking))
         self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
 
     def level_thrust(self) -> None:
-        """Begin a thrust set-point with the present climb rate."""
+        """Start a thrust set-point from the present climb rate."""
         self._sinking = self.velocity[2]
 
     def yaw_rate_to(self, yaw: float) -> float:
@@ -203,7 +203,7 @@ class FlightControl:
 
     def _fly(self, action: AnyAction) -> None:
         if not action.finite:
-            action = Hover()  # numbers that are not finite move nothing
+            action = Hover()  # ignore numbers that are not finite
         if self.vehicle.state is FlightState.LANDING:
             self.lift_off()  # the vehicle's way out of its landing
         if self.airborne:

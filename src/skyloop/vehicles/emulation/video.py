@@ -1,6 +1,6 @@
-"""A drone's video: the newest picture is encoded on a thread of its own, and given to the port.
+"""A drone's video: a separate thread encodes the newest picture and passes it to the port.
 
-PyAV, which encodes, is imported when the first encoder is made.
+The first encoder imports PyAV.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ _log = logging.getLogger(__name__)
 
 
 class VideoSettings(Protocol):
-    """Which cameras are to be sent."""
+    """The cameras to send."""
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The camera that is shown, and then the one inset into its pictures, if any."""
+        """The main camera, and then the one inset into its pictures, if any."""
 
     @property
     def inset(self) -> tuple[int, int]:
@@ -39,7 +39,7 @@ class VideoSettings(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class OneCamera:
-    """Pictures of one camera alone."""
+    """Pictures of a single camera."""
 
     camera: str
     fps: float
@@ -62,7 +62,7 @@ S_contra = TypeVar("S_contra", bound=VideoSettings, contravariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """All that is sent of one picture, with its header."""
+    """The data of one picture, with its header."""
 
     data: bytes
     starts: bool  #: a decoder can begin here
@@ -70,7 +70,7 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class VideoStatus:
-    """What was sent so far."""
+    """Counters of the sent video."""
 
     pictures: int = 0
     bytes_last: int = 0
@@ -81,17 +81,17 @@ NOTHING_SENT: Final = VideoStatus()
 
 
 class Packer(Protocol[S_contra]):
-    """Encodes pictures, one after the other. Not thread-safe."""
+    """Encodes pictures in order. Not thread-safe."""
 
     def pack(self, picture: NDArray[np.uint8], settings: S_contra, captured_ns: int, /) -> Piece | None: ...
 
 
 class VideoEncoding(Generic[S]):
-    """Encodes on a thread of its own. A picture that comes meanwhile waits, and is replaced by a newer one.
+    """Encodes on a separate thread. A picture that arrives meanwhile waits until a newer one replaces it.
 
     Args:
-        packer: Encodes; used on the thread.
-        settings: Returns what is to be sent. Called on any thread.
+        packer: The encoder; used on the thread.
+        settings: Returns the cameras to send. Called on any thread.
         send: Called on the thread with each encoded picture.
     """
 
@@ -120,11 +120,11 @@ class VideoEncoding(Generic[S]):
             self._thread.join()
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera is to be sent."""
+        """Return whether to send this camera."""
         return camera in self._settings().cameras
 
     def show(self, camera: str, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Hand over a picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
+        """Pass on a picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
         shown = self._settings().cameras
         if camera not in shown:
             return
@@ -175,7 +175,7 @@ def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple
     return made
 
 
-GROUP: Final = 15  #: pictures from one key frame to the next
+GROUP: Final = 15  #: pictures between key frames
 
 _SPS, _PPS, _IDR, _SLICE = 7, 8, 5, 1  # types of NAL units
 _START_CODE: Final = b"\0\0\0\1"
@@ -185,7 +185,7 @@ _X264: Final = {"preset": "ultrafast", "tune": "zerolatency"}
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Format of a stream, as the header of its frames has it."""
+    """Format of a stream, as in the header of its frames."""
 
     codec: Literal["h264", "mpeg4"]
     width: int
@@ -195,7 +195,7 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A picture's payload. A key picture begins with parameters of these sizes, start codes included."""
+    """A picture's payload. A key picture begins with parameter sets of these sizes, start codes included."""
 
     payload: bytes
     key: bool
@@ -209,10 +209,10 @@ class Encoder:
     Args:
         form: Codec and size.
         fps: Pictures a second.
-        bitrate_kbps: On average.
-        group: Pictures from one key frame to the next.
-        profile: Of H.264.
-        buffer_s: No more than the bitrate over so long is sent at once; None: single pictures may have any size.
+        bitrate_kbps: Average bitrate.
+        group: Pictures between key frames.
+        profile: H.264 profile.
+        buffer_s: The burst limit, in seconds of the bitrate; None: single pictures may have any size.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -252,7 +252,7 @@ class Encoder:
         self._count = 0
 
     def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
-        """Encode a picture: BGR, uint8, shape (height, width, 3), of any size. None: the encoder gave nothing."""
+        """Encode a picture: BGR, uint8, shape (height, width, 3), of any size. None: the encoder returned nothing."""
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
@@ -270,7 +270,7 @@ class Encoder:
 
 
 def as_the_drone_does(stream: bytes) -> Encoded:
-    """Return an access unit in Annex B form with parameters and slices alone, each after a start code of four bytes."""
+    """Return an access unit in Annex B form reduced to parameters and slices, each after a 4-byte start code."""
     units = [unit for unit in _ANY_START_CODE.split(stream) if unit]
     kept = [(unit[0] & 31, _START_CODE + unit) for unit in units if unit[0] & 31 in (_SPS, _PPS, _IDR, _SLICE)]
     return Encoded(
@@ -282,7 +282,7 @@ def as_the_drone_does(stream: bytes) -> Encoded:
 
 
 def require_encoder(what: str = "the video of an emulated AR.Drone 2") -> None:
-    """Check that PyAV is installed; ``what`` needs it, for the error."""
+    """Check that PyAV is installed; the error says that ``what`` needs it."""
     try:
         import av  # noqa: F401
     except ImportError as error:

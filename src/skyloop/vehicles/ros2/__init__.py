@@ -1,1 +1,1 @@
-"""Driver of ``ros2://``: any robot of ROS 2 with images and ``cmd_vel`` is a vehicle. ``docs/ros.md``."""
+"""Driver of ``ros2://``: any ROS 2 robot with images and ``cmd_vel`` as a vehicle. ``docs/ros.md``."""

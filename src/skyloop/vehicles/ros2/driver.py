@@ -1,4 +1,4 @@
-"""The driver of ``ros2://``: what the proxy calls, and the robot's topics and services, by rclpy."""
+"""The driver of ``ros2://`` and, through rclpy, the robot's topics and services."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.s
 
 
 class Ros2Driver(Driver):
-    """Any robot of ROS 2 with an image and ``cmd_vel``. ``docs/ros.md`` has its options.
+    """Any ROS 2 robot with an image and ``cmd_vel``. See ``docs/ros.md`` for its options.
 
-    It takes velocities; take-off and landing only where the address names the robot's services for them. What it lacks
-    the proxy makes of velocities, where the robot's odometry says how high it is.
+    It supports velocities, and take-off and landing only if the address names the robot's services for them. The proxy
+    builds the missing actions from velocities if the robot's odometry reports its height.
     """
 
     def __init__(self, uri: VehicleUri) -> None:
@@ -32,7 +32,7 @@ class Ros2Driver(Driver):
         self._link: RobotLink | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return what the robot can do, by the topics and services that the address names."""
+        """Return the robot's capabilities for the topics and services named in the address."""
         return self.options.capabilities()
 
     def _open(self, sink: Sink) -> None:
@@ -62,9 +62,9 @@ PURPOSE: Final = "a robot of ROS 2"
 
 
 class RobotLink:
-    """A node that subscribes to what a robot publishes, and publishes its ``cmd_vel``.
+    """A node that subscribes to a robot's topics and publishes its ``cmd_vel``.
 
-    Images are subscribed to while somebody wants them, or where nothing else would show that the robot is there.
+    It subscribes to images only while an application wants them, or if no other topic shows that the robot is there.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:
@@ -110,7 +110,7 @@ class RobotLink:
         self.session.close()
         self._context.close()
 
-    # What the session commands ---------------------------------------------------------------------------------------
+    # Called by the session -------------------------------------------------------------------------------------------
 
     def send(self, velocity: Velocity) -> None:
         """Publish a velocity in body axes."""
@@ -128,16 +128,16 @@ class RobotLink:
         self._twists.publish(message)
 
     def missing(self) -> str:
-        """Return a service that the address names and nobody offers; empty: there is none."""
+        """Return a service that is named in the address and not offered by any node; empty if there is none."""
         return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
-        """Call a ``std_srvs/Trigger``, without waiting for the answer; raises DriverError where nobody offers it."""
+        """Call a ``std_srvs/Trigger`` without waiting for the answer; raises DriverError if no node offers it."""
         from std_srvs.srv import Trigger
 
         client = self._clients[service]
         if not client.service_is_ready():
-            raise DriverError(f"nobody offers the service {service}: is the robot's node running?")
+            raise DriverError(f"no node offers the service {service}: is the robot's node running?")
 
         def done(future: Any) -> None:
             error = future.exception()

@@ -12,7 +12,7 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding
 from skyloop.vehicles.ros2.node import MOST_DOMAIN
 
-#: Topics and services, by the option that names them; without a slash in front they are below the namespace.
+#: Topics and services by the option that names them; names without a leading slash are below the namespace.
 TOPICS: Final = {"image": "image_raw", "cmd_vel": "cmd_vel", "odom": "odom", "battery": "battery_state"}
 SERVICES: Final = ("takeoff", "land")
 _OTHERS: Final = (
@@ -31,7 +31,7 @@ _OTHERS: Final = (
 KNOWN: Final = {*TOPICS, *SERVICES, *_OTHERS}
 _NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)
 Rotation = tuple[float, float, float, float, float, float, float, float, float]
-#: How a camera may be mounted: its optical axes (x right, y down, z forward) in those of the body, row by row.
+#: Possible camera mounts: the camera's optical axes (x right, y down, z forward) in body axes, row by row.
 MOUNTS: Final[dict[str, Rotation | None]] = {
     "ahead": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
     "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
@@ -41,9 +41,9 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Where a robot's topics and services are, as whole names; empty: it has none."""
+    """Full names of a robot's topics and services; empty: it lacks them."""
 
-    namespace: str  #: with a slash in front
+    namespace: str  #: with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
     info: str  #: ``sensor_msgs/CameraInfo``
     cmd_vel: str  #: ``geometry_msgs/Twist``, or ``TwistStamped`` if ``stamped``
@@ -52,18 +52,18 @@ class Options:
     takeoff: str  #: ``std_srvs/Trigger``
     land: str  #: ``std_srvs/Trigger``
     camera: str  #: name of the camera
-    mount: str  #: how it is mounted, of :data:`MOUNTS`
-    width: int  #: of its images [px]
+    mount: str  #: a name in :data:`MOUNTS`
+    width: int  #: image width [px]
     height: int  #: [px]
-    fps: float  #: of its images [1/s]
+    fps: float  #: frame rate [1/s]
     compressed: bool  #: whether its images are JPEG
-    stamped: bool  #: whether velocities carry a stamp
-    ground: bool  #: whether it stays on the ground: then take-off and landing begin and end the drive
+    stamped: bool  #: whether velocities have a stamp
+    ground: bool  #: whether it is a ground vehicle: take-off and landing then begin and end the drive
     timeout_s: float  #: silence after which the link is lost [s]
-    domain: int | None  #: of DDS; None: from ``ROS_DOMAIN_ID``
+    domain: int | None  #: DDS domain; None: from ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
-        """Return what the robot can do, by the topics and services that it is said to have."""
+        """Return the robot's capabilities for its topics and services."""
         actions: set[str] = set()
         if self.cmd_vel:
             actions = {"idle", "velocity"}
@@ -82,8 +82,8 @@ class Options:
             vehicle="ros2",
             actions=frozenset(actions),
             cameras=(camera,) if self.image else (),
-            why_not="" if actions else "the address gives it no cmd_vel",
-            description=f"a robot of ROS 2 below {self.namespace}" + (", on the ground" if self.ground else ""),
+            why_not="" if actions else "the address names no cmd_vel",
+            description=f"a ROS 2 robot below {self.namespace}" + (", a ground vehicle" if self.ground else ""),
         )
 
 
@@ -92,7 +92,7 @@ def options_of(uri: VehicleUri) -> Options:
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):
-        raise UsageError(f"{uri}: {uri.place!r} is no namespace of ROS 2: letters, digits and _, no digit first")
+        raise UsageError(f"{uri}: {uri.place!r} is not a namespace of ROS 2: letters, digits and _, no digit first")
 
     def name(option: str, default: str = "") -> str:
         given = uri.options.get(option, default)
@@ -102,7 +102,7 @@ def options_of(uri: VehicleUri) -> Options:
 
     topics = {option: name(option, default) for option, default in TOPICS.items()}
     if not topics["image"] and not topics["odom"]:
-        raise UsageError(f"{uri}: without image and odom nothing would come from the robot: give one of them")
+        raise UsageError(f"{uri}: without image and odom the robot would send no data: name at least one")
     ground = uri.flag("ground")
     services = {option: name(option) for option in SERVICES}
     for option, service in services.items():

@@ -1,6 +1,6 @@
-"""A robot as a vehicle: from its messages to the proxy's sink, and from actions to velocities and services.
+"""A robot as a vehicle: messages become samples for the proxy's sink, actions become velocities and service calls.
 
-Nothing here needs rclpy: messages are any objects with their fields, and the robot's services are a function.
+This module does not need rclpy: messages are any objects with their fields, and services are called by a function.
 """
 
 from __future__ import annotations
@@ -39,43 +39,43 @@ from skyloop.vehicles.ros2.wire import (
     skew_of,
 )
 
-PERIOD_S: Final = 0.05  #: a velocity is repeated so often, as robots stop when none comes
-AIRBORNE_M: Final = 0.1  #: a robot that flies is off the ground above this height of its odometry
-SERVICES_S: Final = 5.0  #: as long as the robot's services may take to be found
-ANSWER_S: Final = 30.0  #: as long as a service may take
-BLIND_NS: Final = nanoseconds(0.2)  #: a velocity is repeated for so long while odometry is missing
+PERIOD_S: Final = 0.05  #: between repeats of a velocity, as robots stop without one
+AIRBORNE_M: Final = 0.1  #: height of the odometry above which a robot counts as flying
+SERVICES_S: Final = 5.0  #: limit for the discovery of the robot's services
+ANSWER_S: Final = 30.0  #: limit for a service's answer
+BLIND_NS: Final = nanoseconds(0.2)  #: how long a velocity is repeated while odometry is missing
 _FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
 
 
 class Robot(Protocol):
-    """What the session commands."""
+    """The session's access to the robot."""
 
     def send(self, velocity: Velocity) -> None:
         """Publish a velocity."""
 
     def missing(self) -> str:
-        """Return a service that the address names and nobody offers; empty: there is none."""
+        """Return a service that is named in the address and not offered by any node; empty if there is none."""
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
         """Call a ``std_srvs/Trigger``; ``answered`` gets success and message, on any thread.
 
         Raises:
-            DriverError: Nobody offers it.
+            DriverError: No node offers it.
         """
 
 
 @dataclass
 class _Pending:
-    """A take-off or landing that the robot was asked for."""
+    """A requested take-off or landing."""
 
     state: FlightState
     since_ns: int
 
 
 class RobotSession:
-    """One opened driver's session: actions from any thread, all else from the node's own.
+    """One opened driver's session: actions from any thread, everything else on the node's own thread.
 
-    The sink is called with the lock free, as the proxy may hold its own while it commands.
+    The sink is called without the lock, as the proxy may hold its own lock while it commands.
     """
 
     def __init__(self, options: Options, sink: Sink, robot: Robot, clock: Clock, system_clock: Clock) -> None:
@@ -86,22 +86,22 @@ class RobotSession:
         self._system_clock = system_clock
         self._lock = threading.RLock()
         self._clocks = {topic: CaptureClock() for topic in ("odom", "image")}
-        self._fields: dict[str, Any] = {}  # of the newest odometry
+        self._fields: dict[str, Any] = {}  # fields of the newest odometry
         self._battery: dict[str, Any] = {}
         self._intrinsics: Intrinsics | None = None
-        self._captured_ns = 0  # of the newest feedback
+        self._captured_ns = 0  # capture time of the newest feedback
         self._received_ns: int | None = None
         self._odometry_ns: int | None = None
-        self._measures_height = False  # its odometry was seen above the ground: a planar one never is
+        self._measures_height = False  # its odometry was above the ground once, which a planar one never is
         self._fed_ns = 0
         self._opened_ns = clock()
         self._link: LinkState | None = None
         self._velocity: Velocity | None = None  # in force
-        self._commanded_ns = 0  # when it was commanded
+        self._commanded_ns = 0  # time of the velocity's command
         self._pending: _Pending | None = None
-        self._up: bool | None = False if options.ground else None  # by the robot's services, or the drive's begin
-        self._refused = ""  # why the robot refused the newest take-off
-        self._complained: set[str] = set()
+        self._up: bool | None = False if options.ground else None  # by the services; on the ground: driving
+        self._refused = ""  # the reason for a refused take-off
+        self._warned: set[str] = set()
 
     # From the robot --------------------------------------------------------------------------------------------------
 
@@ -125,13 +125,13 @@ class RobotSession:
             self._intrinsics = intrinsics_of(message)
         except DecodeError as error:
             self._intrinsics = None
-            self._complain(f"the camera's intrinsics can't be used: {error}")
+            self._warn_once(f"the camera's intrinsics can't be used: {error}")
         skew = skew_of(message)
         if skew and self._intrinsics is not None:
-            self._complain(f"the camera's pixels have a skew of {skew:g} px, which is left out: calibrate without it")
+            self._warn_once(f"the camera's pixels have a skew of {skew:g} px, which is ignored: calibrate without it")
 
     def on_image(self, message: Any) -> None:
-        """Publish a frame, decoded as far as it needs to be."""
+        """Publish a frame, decoded only as far as necessary."""
         now_ns = self._received()
         stamp_ns = nanoseconds_of(message.header.stamp)
         captured_ns = self._clocks["image"].captured_ns(stamp_ns, now_ns, self._system_clock())
@@ -146,10 +146,10 @@ class RobotSession:
                 pixels, encoding = pixels_of(message)
                 size = (int(message.width), int(message.height))
         except DecodeError as error:
-            self._complain(f"an image can't be read: {error}")
+            self._warn_once(f"an image can't be decoded: {error}")
             return
         if size != (width, height):
-            self._complain(f"images are {size[0]}×{size[1]}: write width={size[0]}&height={size[1]} into the address")
+            self._warn_once(f"images are {size[0]}×{size[1]}: write width={size[0]}&height={size[1]} into the address")
             return
         self._sink.frame(
             camera, pixels, captured_ns, width=width, height=height, encoding=encoding, intrinsics=self._intrinsics
@@ -158,15 +158,16 @@ class RobotSession:
     # To the robot ----------------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
-        """Accept an action that the capabilities name.
+        """Accept an action from the capabilities.
 
         Args:
             action: The action.
-            new: Whether somebody newly asked for it; a repeated take-off or landing calls no service once more.
+            new: Whether an application just requested it; a repeated take-off or landing does not call the service
+                again.
 
         Raises:
-            DriverError: The robot does not offer the service, is not heard and is to take off, or it is a repeat of a
-                take-off that the robot refused.
+            DriverError: The robot does not offer the service, sends no data for a take-off, or refused this take-off
+                before.
         """
         with self._lock:
             if isinstance(action, Velocity):
@@ -184,7 +185,7 @@ class RobotSession:
         return action
 
     def tick(self) -> None:
-        """Repeat the velocity in force, and watch the link: to be called every :data:`PERIOD_S`."""
+        """Repeat the velocity in force and check the link; call it every :data:`PERIOD_S`."""
         now_ns = self._clock()
         blind = self._is_blind(now_ns)
         silent_s = self._silent_s(now_ns)
@@ -193,7 +194,7 @@ class RobotSession:
             if blind:
                 self._fields = {}
             if (blind or lost) and self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
-                self._velocity = Velocity()  # nothing shows where it goes
+                self._velocity = Velocity()  # without odometry its motion is unknown
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
@@ -204,10 +205,10 @@ class RobotSession:
         if blind and self._odometry_ns is not None:
             self._lose(LinkState.DEGRADED, seconds(now_ns - self._odometry_ns), self._options.odom)
         if not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
-            self._publish(self._received_ns, now_ns)  # no odometry tells how the robot is: its images show that it is
+            self._publish(self._received_ns, now_ns)  # without odometry, images at least show that the robot is there
 
     def close(self) -> None:
-        """Stop what moves: a robot must not go on with an old velocity."""
+        """Stop the motion: a robot must not continue with an old velocity."""
         with self._lock:
             if self._velocity is not None:
                 self._velocity = None
@@ -223,7 +224,7 @@ class RobotSession:
         if self._pending is not None:
             return self._pending.state
         altitude_m = self._fields.get("altitude_m")
-        told = self._up is not None and not self._measures_height  # by its services, where the odometry may be planar
+        told = self._up is not None and not self._measures_height  # by its services, if the odometry may be planar
         up = self._up if self._options.ground or altitude_m is None or told else altitude_m > AIRBORNE_M
         if up is None:
             return FlightState.UNKNOWN
@@ -238,20 +239,20 @@ class RobotSession:
             self._up = up
             self._robot.send(Velocity())
             return
-        if up and not new:  # a take-off that was asked for once is called once, whatever became of it
+        if up and not new:  # call a requested take-off only once, whatever its outcome
             if self._refused:
                 raise DriverError(self._refused)
             return
         if up and self._silent_s(self._clock()) > self._options.timeout_s:
-            raise DriverError("no data from the robot: a take-off would begin when it is back")
+            raise DriverError("no data from the robot: a take-off would start once data returns")
         under_way = self._pending is not None and self._pending.state is state
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
         if self._up:
-            there = up  # by the services; a take-off that succeeded may not show yet
+            there = up  # by the services; a successful take-off may not show yet
         if (under_way or there) and not new:
             return
         if not (up or self._up) and self._state is FlightState.LANDED and (self._measures_height or self._up is False):
-            return  # it stands on the ground
+            return  # on the ground
         pending = _Pending(state, self._clock())
 
         def answered(success: bool, text: str) -> None:
@@ -270,37 +271,37 @@ class RobotSession:
 
         self._refused = ""
         if not up:
-            self._velocity = Velocity()  # it stops if nobody offers the service
+            self._velocity = Velocity()  # stops it if no node offers the service
         self._robot.call(service, answered)
         self._velocity, self._pending = None, pending
 
     def _fail_pending(self) -> None:
-        """Forget what is pending, and stop after a landing: without a watchdog it flies on with its last velocity."""
+        """Drop the pending action, and stop after a landing: a robot without watchdog would keep its last velocity."""
         if self._pending is not None and self._pending.state is FlightState.LANDING and self._velocity is None:
             self._velocity = Velocity()
         self._pending = None
 
     def _received(self) -> int:
-        """Note that something came, and return the time."""
+        """Record the arrival of a message and return the time."""
         self._received_ns = now_ns = self._clock()
         if self._link is not LinkState.UP and not self._is_blind(now_ns):
             self._find(now_ns)
         return now_ns
 
     def _is_blind(self, now_ns: int) -> bool:
-        """Return whether the odometry has ended, whatever else still comes."""
+        """Return whether the odometry has stopped, even if other messages still arrive."""
         return self._odometry_ns is not None and seconds(now_ns - self._odometry_ns) > self._options.timeout_s
 
     def _find(self, now_ns: int) -> None:
-        """Report that the robot is there, once its services are found too, or that they are not."""
+        """Report that the robot is there, once its services are also found or missing for too long."""
         missing = self._robot.missing()
         if not missing:
             self._link = LinkState.UP
             self._sink.link(LinkState.UP)
         elif self._link is not LinkState.DEGRADED and seconds(now_ns - self._opened_ns) > SERVICES_S:
             self._link = LinkState.DEGRADED
-            remedy = "start the node that does, or correct its name in the address"
-            self._sink.link(LinkState.DEGRADED, f"nobody offers the service {missing}", remedy)
+            remedy = "start its node, or correct its name in the address"
+            self._sink.link(LinkState.DEGRADED, f"no node offers the service {missing}", remedy)
 
     def _lose(self, state: LinkState, silent_s: float, *topics: str) -> None:
         if self._link is state:
@@ -310,7 +311,7 @@ class RobotSession:
         domain = "ROS_DOMAIN_ID" if options.domain is None else f"domain={options.domain}"
         self._sink.link(
             state,
-            f"nothing came on {' and '.join(filter(None, topics))} for {silent_s:.1f} s",
+            f"no messages on {' and '.join(filter(None, topics))} for {silent_s:.1f} s",
             f"start the robot's nodes, and compare the topics' names and {domain} with theirs",
         )
 
@@ -320,36 +321,36 @@ class RobotSession:
             feedback = Feedback(captured_ns=self._captured_ns, state=self._state, **self._fields, **self._battery)
         self._sink.feedback(feedback)
 
-    def _complain(self, text: str) -> None:
-        """Emit what is wrong, once."""
-        if text not in self._complained and len(self._complained) < 8:
-            self._complained.add(text)
+    def _warn_once(self, text: str) -> None:
+        """Emit a warning, once for each text."""
+        if text not in self._warned and len(self._warned) < 8:
+            self._warned.add(text)
             self._sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="image")
 
 
 def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
-    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), and its width and height."""
+    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), with its width and height."""
     import numpy as np
 
     from skyloop.messages.frame import image_size
 
     data = np.frombuffer(message.data, np.uint8)
     if bytes(data[:2]) != b"\xff\xd8":
-        raise DecodeError(f"compressed images of format {message.format!r} are not read, only JPEG")
+        raise DecodeError(f"compressed images of format {message.format!r} are not supported, only JPEG")
     size = image_size(data.tobytes())
     if size is None:
-        raise DecodeError("this JPEG does not say how large it is")
+        raise DecodeError("this JPEG does not contain its size")
     return data, size
 
 
-PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older, or in the future, is of another clock
+PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: an older stamp, or one in the future, is from another clock
 
 
 class CaptureClock:
     """Maps the stamps of one topic to this host's monotonic clock.
 
-    A stamp that is a little older than the system's clock is of that clock. Others are of another: a simulation's, or
-    one that is not set; then the smallest delay that was seen lately is taken for none. Times never run backwards.
+    A stamp slightly older than the system's clock belongs to that clock. Other stamps come from a simulation or from a
+    clock that is not set; for these the smallest recent delay counts as zero. Times never run backwards.
     """
 
     def __init__(self) -> None:
@@ -357,7 +358,7 @@ class CaptureClock:
         self._newest_ns = 0
 
     def captured_ns(self, stamp_ns: int, arrived_ns: int, system_ns: int) -> int:
-        """Return when a message was captured, by its stamp (0: none) and its arrival on both of this host's clocks."""
+        """Return a message's capture time, from its stamp (0: none) and its arrival on both of this host's clocks."""
         age_ns = system_ns - stamp_ns
         if stamp_ns == 0:
             captured_ns = arrived_ns
@@ -370,9 +371,9 @@ class CaptureClock:
 
 
 def state_of(odometry: Any, *, ground: bool) -> dict[str, Any]:
-    """Return the fields of a feedback that a ``nav_msgs/Odometry`` holds; what is not finite is left out.
+    """Return the feedback fields in a ``nav_msgs/Odometry``, without values that are not finite.
 
-    Its pose is in world axes, its twist in those of the body; a robot that stays on the ground has no height.
+    Its pose is in world axes, its twist in body axes; a ground vehicle has no height.
     """
     found: dict[str, Any] = {}
     turn, place = odometry.pose.pose.orientation, odometry.pose.pose.position
@@ -395,10 +396,10 @@ def state_of(odometry: Any, *, ground: bool) -> dict[str, Any]:
 
 
 def battery_of(message: Any) -> dict[str, float | None]:
-    """Return the fields of a feedback that a ``sensor_msgs/BatteryState`` holds."""
+    """Return the feedback fields in a ``sensor_msgs/BatteryState``."""
     charge, voltage = _finite(message.percentage), _finite(message.voltage)
     if charge is not None and not 0.0 <= charge <= 1.0:
-        charge = charge / 100.0 if 1.0 < charge <= 100.0 else None  # some tell percent
+        charge = charge / 100.0 if 1.0 < charge <= 100.0 else None  # some report per cent
     return {"battery": charge, "battery_v": voltage}
 
 

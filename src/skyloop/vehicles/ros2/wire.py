@@ -1,13 +1,13 @@
-"""Numbers of ROS 2's messages from those of Skyloop, and back. Pure.
+"""Convert numbers of ROS 2's messages from those of Skyloop, and back. Pure.
 
 Axes are the same on both sides (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical
-axes x right, y down, z forward. What differs: Skyloop's velocity is in the body's *levelled* axes, that of a twist in
-those of the body; angles are quaternions; and what is not known is a covariance of -1, or NaN.
+axes x right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's in body
+axes; angles are quaternions; and unknown values are a covariance of -1, or NaN.
 
-A ``tf2_msgs/msg/TFMessage`` is made as bytes: there is no package of it to install without a distribution of ROS 2.
-They are OMG's Common Data Representation, version 1, little-endian, as DDS carries it: four bytes that say so,
-then the fields in order, each number aligned to its size, counted from behind those four bytes; a text is its length
-with the closing zero, the text, and the zero.
+A ``tf2_msgs/msg/TFMessage`` is built as bytes, as its package can only be installed with a distribution of ROS 2. The
+bytes are OMG's Common Data Representation, version 1, little-endian, as in DDS: a header of four bytes, then the fields
+in order, each number aligned to its size, counted from the end of the header. A text is its length with the closing
+zero, the text, and the zero.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler
 
 Quaternion = tuple[float, float, float, float]  #: x, y, z, w
 
-NOT_KNOWN: Final = -1.0  #: in the first place of a covariance: that measurement is not there (sensor_msgs/Imu)
-#: The variance that is told where nobody has measured one: of "about right", not of "exact" [m², (m/s)², rad² …].
+NOT_KNOWN: Final = -1.0  #: first number of a covariance without measurement (sensor_msgs/Imu)
+#: Variance reported for values without a measured one: "about right", not "exact" [m², (m/s)², rad² …].
 VARIANCE: Final = 0.01
 
-#: Names of pixels, as in ``sensor_msgs/image_encodings.hpp``: bytes of a pixel, and of which order they are.
+#: Pixel formats, as in ``sensor_msgs/image_encodings.hpp``: bytes per pixel and their order.
 _PIXELS: Final[dict[str, tuple[int, tuple[int, ...] | None, Encoding]]] = {
     "bgr8": (3, None, Encoding.BGR8),
     "8UC3": (3, None, Encoding.BGR8),
@@ -60,8 +60,8 @@ def nanoseconds_of(stamp: Any) -> int:
 class ClockMap:
     """Maps times of a proxy's monotonic clock to ROS time.
 
-    The difference of the clocks is kept until it is off by more than ``tolerance_s``, so that the intervals of stamps
-    are those of the captures; then one of them was set, or ROS time is that of a simulation.
+    The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that stamps have the
+    intervals of the captures. A larger error means that a clock was set, or that ROS time is a simulation's.
 
     Args:
         tolerance_s: [s]
@@ -72,7 +72,7 @@ class ClockMap:
         self._offset_ns: int | None = None
 
     def to_ros(self, captured_ns: int, now_ns: int, ros_now_ns: int) -> int | None:
-        """Return the time of a capture as ROS time [ns]; None while that is not known, or had not begun."""
+        """Return the time of a capture as ROS time [ns]; None if unknown or before zero."""
         if ros_now_ns <= 0:
             return None
         offset_ns = ros_now_ns - now_ns
@@ -86,7 +86,7 @@ class ClockMap:
 
 
 def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
-    """Return the matrix of a quaternion, shape (3, 3); None for one that is none: not finite, or all but zero."""
+    """Return the matrix of a quaternion, shape (3, 3); None if it is not finite or all but zero."""
     length = math.sqrt(sum(each * each for each in quaternion))
     if not (math.isfinite(length) and length > 1e-6):
         return None
@@ -101,7 +101,7 @@ def rotation_of(quaternion: Quaternion) -> NDArray[np.float64] | None:
 
 
 def euler_of(quaternion: Quaternion) -> tuple[float, float, float] | None:
-    """Return roll, pitch and yaw of a quaternion [rad]; None for one that is none."""
+    """Return roll, pitch and yaw of a quaternion [rad]; None if it is invalid."""
     rotation = rotation_of(quaternion)
     return None if rotation is None else euler_from_rotation(rotation)
 
@@ -142,11 +142,11 @@ def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix, row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` in its first place.
+    """Return a covariance matrix, row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` as its first number.
 
     Args:
-        size: Of its side.
-        known: Whether what it belongs to was measured.
+        size: Number of rows.
+        known: Whether its quantity was measured.
         variance: [square of the unit]
     """
     found = [0.0] * (size * size)
@@ -161,7 +161,7 @@ def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> 
 
 
 class CameraModel(NamedTuple):
-    """What a ``sensor_msgs/CameraInfo`` holds, row by row; without intrinsics all is zero, as ROS has it."""
+    """Content of a ``sensor_msgs/CameraInfo``, row by row; without intrinsics all zero, as usual in ROS."""
 
     model: str
     d: list[float]
@@ -171,7 +171,7 @@ class CameraModel(NamedTuple):
 
 
 def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
-    """Return what a ``sensor_msgs/CameraInfo`` says of a camera's intrinsics."""
+    """Return the content of a ``sensor_msgs/CameraInfo`` for a camera's intrinsics."""
     if intrinsics is None:
         return CameraModel("", [], [0.0] * 9, [0.0] * 9, [0.0] * 12)
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
@@ -191,14 +191,14 @@ def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
     )
 
 
-#: How many coefficients OpenCV's pinhole distortions have: fewer are filled up with zeros, which mean the same.
+#: Possible numbers of coefficients in OpenCV's pinhole distortions; missing ones are zero.
 _LENGTHS: Final = (0, 4, 5, 8, 12, 14)
 _FISHEYES: Final = ("equidistant", "fisheye")
 _PINHOLES: Final = ("", "plumb_bob", "rational_polynomial", "thin_prism", "pinhole")
 
 
 def intrinsics_of(info: Any) -> Intrinsics | None:
-    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for a camera that is not calibrated."""
+    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for an uncalibrated camera."""
     k = [float(each) for each in info.k]
     d = [float(each) for each in info.d]
     if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0):
@@ -208,25 +208,23 @@ def intrinsics_of(info: Any) -> Intrinsics | None:
         del d[-1]
     if d and not fisheye and info.distortion_model not in _PINHOLES:
         known = ", ".join((*_PINHOLES[1:], *_FISHEYES))
-        raise DecodeError(f"a lens of the model {info.distortion_model!r} is not known, only {known}")
+        raise DecodeError(f"lens model {info.distortion_model!r} is not supported, only {known}")
     most = 4 if fisheye else _LENGTHS[-1]
     if len(d) > most:
-        raise DecodeError(
-            f"a lens of the model {info.distortion_model!r} has {most} coefficients at most, got {len(d)}"
-        )
+        raise DecodeError(f"lens model {info.distortion_model!r} has at most {most} coefficients, got {len(d)}")
     wanted = (4 if d else 0) if fisheye else next(length for length in _LENGTHS if length >= len(d))
     d += [0.0] * (wanted - len(d))
     return Intrinsics(k[0], k[4], k[2], k[5], tuple(d), "fisheye" if fisheye else "pinhole")
 
 
 def skew_of(info: Any) -> float:
-    """Return the skew of a ``sensor_msgs/CameraInfo`` [px]: :class:`Intrinsics` has none."""
+    """Return the skew of a ``sensor_msgs/CameraInfo`` [px], which :class:`Intrinsics` does not have."""
     skew = float(info.k[1])
     return skew if math.isfinite(skew) else 0.0
 
 
-#: Encodings that OpenCV converts to BGR: rows and bytes of a row for a height and width in pixels, and its name for it.
-#: Of a Bayer pattern ROS names the first two pixels of a row, OpenCV the second and third of the second row.
+#: Encodings that OpenCV converts to BGR: rows and bytes per row for a height and width in pixels, and OpenCV's name.
+#: ROS names a Bayer pattern by the first two pixels of a row, OpenCV by the second and third of the second row.
 _CONVERTED: Final[dict[str, tuple[float, int, str]]] = {
     "yuv422": (1, 2, "YUV2BGR_UYVY"),
     "uyvy": (1, 2, "YUV2BGR_UYVY"),
@@ -245,12 +243,12 @@ ENCODINGS: Final = (*_PIXELS, _WIDE, *_CONVERTED)
 
 
 def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
-    """Return the pixels of a ``sensor_msgs/Image``: C-contiguous uint8, without padding, and how they are to be read.
+    """Return the pixels of a ``sensor_msgs/Image`` as C-contiguous uint8 without padding, and their encoding.
 
-    Of 16 bits the upper eight are taken.
+    16-bit values lose their lower eight bits.
 
     Raises:
-        DecodeError: Its encoding is none that is known here, its size does not fit its data, or OpenCV is missing.
+        DecodeError: Unknown encoding, a size that does not fit the data, or OpenCV is missing.
     """
     given = image.encoding if image.encoding in _PIXELS else str(image.encoding).lower()
     if given in _PIXELS:
@@ -263,7 +261,7 @@ def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
     if given == _WIDE:
         return np.ascontiguousarray(_upper(_rows(image, 1, 2), image)), Encoding.MONO8
     if given not in _CONVERTED:
-        raise DecodeError(f"images of encoding {image.encoding!r} are not read, only {', '.join(ENCODINGS)}")
+        raise DecodeError(f"images of encoding {image.encoding!r} are not supported, only {', '.join(ENCODINGS)}")
     high, wide, name = _CONVERTED[given]
     rows = _rows(image, high, wide)
     if given.endswith("16"):
@@ -278,13 +276,13 @@ def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
         ) from error
     try:
         found = cv2.cvtColor(np.ascontiguousarray(rows), getattr(cv2, f"COLOR_{name}"))
-    except cv2.error as error:  # an odd width or height, of which this encoding has no halves
+    except cv2.error as error:  # an odd width or height, which this encoding cannot halve
         raise DecodeError(f"an image of {image.width}×{image.height} {image.encoding} can't be converted") from error
     return np.ascontiguousarray(found, dtype=np.uint8), Encoding.BGR8
 
 
 def _rows(image: Any, high: float, wide: int) -> NDArray[np.uint8]:
-    """Return the rows of an image without their padding: ``high`` rows a row of pixels, ``wide`` bytes a pixel."""
+    """Return the rows of an image without padding: ``high`` rows per row of pixels, ``wide`` bytes per pixel."""
     height, width, step = int(image.height), int(image.width), int(image.step)
     data = np.frombuffer(image.data, np.uint8)
     rows, row = math.ceil(height * high), width * wide
@@ -301,7 +299,7 @@ def _upper(rows: NDArray[np.uint8], image: Any) -> NDArray[np.uint8]:
 
 
 TYPE_NAME: Final = "tf2_msgs/msg/TFMessage"
-#: Of its definition, by REP 2011; ``tests/integration/third_party/ros2_bag.py`` compares it with that of rosbags.
+#: Hash of its definition, by REP 2011; ``tests/integration/third_party/ros2_bag.py`` compares it with rosbags' hash.
 TYPE_HASH: Final = bytes.fromhex("e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087")
 _LITTLE_ENDIAN_CDR: Final = b"\x00\x01\x00\x00"
 

@@ -1,1 +1,1 @@
-"""``sim://``: a simulated drone in a simulated world, alone or with others of one host."""
+"""``sim://``: a simulated drone in a simulated world, alone or with others on the same host."""

@@ -1,4 +1,4 @@
-"""The driver of ``sim://``: one simulated drone, in a world of its own or shared with others."""
+"""The driver of ``sim://``: one simulated drone, in its own world or in a shared one."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ _OCCURRENCES: Final = {
 
 
 class SimDriver(Driver):
-    """A drone of a world of its own, or of a host that several drivers share.
+    """A simulated drone, in its own world or on a host that several drivers share.
 
-    Feedback carries the true state too, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw``
-    [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and of each moving target ``truth.target.x``, ``.y``, ``.z``, ``.yaw`` (a
-    second one is ``truth.target2``; x, y and z also by its name: ``truth.NAME.x``), all in world axes.
-    ``sim.time_s`` is the simulation's own time.
+    Feedback also contains the true state, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``,
+    ``.yaw`` [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and for each moving target ``truth.target.x``, ``.y``, ``.z``,
+    ``.yaw`` (``truth.target2`` for the second one; x, y and z also under its name: ``truth.NAME.x``), all in world
+    axes. ``sim.time_s`` is the simulation's own time.
 
-    With ``autopilot`` in the address real firmware flies the drone: what can be done, the feedback and most parameters
-    are those of the driver for it (``mavlink://``, ``msp://``), the rest as for any simulated drone; see
+    With ``autopilot`` in the address, real firmware flies the drone. Capabilities, feedback and most parameters are
+    then those of the firmware's driver (``mavlink://``, ``msp://``), the rest as for any simulated drone; see
     ``docs/autopilots.md``.
 
     Args:
-        uri: The vehicle's address. With a host, only what it says of firmware counts: the rest is the host's.
-        host: A world that is shared; None: :meth:`open` makes one.
+        uri: The vehicle's address. With a host, only its options for firmware count; the host determines the rest.
+        host: A shared world; None: :meth:`open` makes one.
         drone: Its number in the host.
     """
 
@@ -76,12 +76,12 @@ class SimDriver(Driver):
         if host is not None:
             self.options = replace(host.options, autopilot=own.autopilot, autopilot_folder=own.autopilot_folder)
         self.drone = drone
-        self.host = host  #: the world; None until a driver with a world of its own is opened
+        self.host = host  #: the world; None until a driver with its own world is opened
         self._shared = host is not None
         self._changing = threading.Lock()
         self._limits = Limits()
         self._models = self.options.cameras
-        self._wind: Wind | None = None  # as written before it was opened
+        self._wind: Wind | None = None  # as written before opening
         self._battery = self.options.battery
         self._link = True
         self._setpoints: SetpointController | None = None
@@ -95,11 +95,11 @@ class SimDriver(Driver):
 
     @property
     def firmware(self) -> FirmwareFlight | None:
-        """The real firmware that flies the drone; None: its built-in autopilot does."""
+        """The real firmware that flies the drone; None with the built-in autopilot."""
         return self._firmware
 
     def capabilities(self) -> Capabilities:
-        """Return the actions and cameras that the address asks for."""
+        """Return the actions and cameras in the address."""
         if self._firmware is not None:
             return self._firmware.capabilities(self.options)
         return Capabilities(
@@ -138,7 +138,7 @@ class SimDriver(Driver):
         self._battery = self.options.battery
 
     def _in_force(self, limits: Limits) -> Limits:
-        """Return the limits in force. By set-points alone the drone's own take-off only lifts it off."""
+        """Return the limits in force. With set-points alone, the drone's own take-off only lifts it off."""
         if self._setpoints is None:
             return limits
         return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
@@ -152,34 +152,34 @@ class SimDriver(Driver):
             return super()._apply(action)
         host = self.host
         if host is None or self._sink is None or not self._link:
-            return action  # lost: the drone receives nothing
+            return action  # lost, as the drone receives nothing
         return self._command(host, action)
 
     def _repeat(self, action: AnyAction) -> AnyAction:
         return self._apply(action) if self._firmware is None else self._firmware.apply(action, new=False)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse what the firmware would not do; the built-in autopilot refuses nothing."""
+        """Refuse actions that the firmware would refuse; the built-in autopilot refuses none."""
         if self._firmware is not None:
             self._firmware.driver.check(action)
 
     def left_to(self) -> str:
-        """Return what others made of the firmware's mode; nobody else flies the built-in autopilot."""
+        """Return the firmware mode that others selected; empty for the built-in autopilot."""
         return "" if self._firmware is None else self._firmware.driver.left_to()
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action while nobody is in command, as the firmware's driver does it."""
+        """Apply an action of the failsafe, as the firmware's driver does."""
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Give a pose to the firmware; the built-in autopilot takes none."""
+        """Pass a pose to the firmware; the built-in autopilot accepts none."""
         if self._firmware is None:
             super().external_pose(pose)
         else:
             self._firmware.external_pose(pose)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return what needs attention about the firmware."""
+        """Return preflight findings about the firmware."""
         return [] if self._firmware is None else self._firmware.driver.checkup()
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
@@ -190,18 +190,18 @@ class SimDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return limits, cameras, battery, wind, the radio link, the room and what stands in it."""
+        """Return limits, cameras, battery, wind, the radio link, the room and the objects in it."""
         world = self._known_world()
         surroundings = [] if world is None else [table.room(world.room), table.geometry(world)]
         firmware = [] if self._firmware is None else self._firmware.driver.parameters()
         return [*table.describe(self._present(), self._standard()), *surroundings, *firmware]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. The wind is the whole world's.
+        """Write a parameter. The wind is shared by the whole world.
 
         Raises:
-            UnknownNameError: There is no such parameter.
-            ParameterError: It does not take this value.
+            UnknownNameError: No such parameter.
+            ParameterError: A wrong value.
         """
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
@@ -225,7 +225,7 @@ class SimDriver(Driver):
         return Wind() if world is None else self.options.blowing(world.wind)
 
     def _known_world(self) -> World | None:
-        """Return the world; None if it can't be loaded, which :meth:`open` says why."""
+        """Return the world; None if it can't be loaded (:meth:`open` reports why)."""
         if self._world is None:
             with suppress(SkyloopError):
                 self._world = self.host.simulation.world if self.host is not None else self.options.load_world()
@@ -253,7 +253,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio. A drone that receives nothing holds its position, as real ones do."""
+        """Switch the simulated radio. A drone without reception holds its position, as real ones do."""
         sink = self._sink
         if sink is None:
             return
@@ -268,10 +268,10 @@ class SimDriver(Driver):
             sink.link(LinkState.LOST, "the simulated radio is switched off (parameter sim.link)")
             self._command(host, Hover())
 
-    # Called by the host, on its threads ------------------------------------------------------------------------
+    # Called by the host on its threads -------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Publish the drone's state, as it believes it to be and as it is. On a thread of the host."""
+        """Publish the drone's estimated and true state. Runs on a thread of the host."""
         believed, sink = report.believed, self._sink
         self._battery = believed.battery
         if self._firmware is not None:
@@ -286,7 +286,7 @@ class SimDriver(Driver):
         sink.feedback(feedback_of(report, state, self.options))
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Emit a collision, an emergency or a low battery. On a thread of the host."""
+        """Emit a collision, an emergency or a low battery. Runs on a thread of the host."""
         sink = self._sink
         if sink is None or not self._link:
             return
@@ -298,12 +298,12 @@ class SimDriver(Driver):
             sink.event(kind, occurrence.text, severity, reason=reason)
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many images a second of this camera anybody would see."""
+        """Return how many images per second of this camera have a recipient."""
         sink = self._sink
         return sink.wanted_fps(camera) if sink is not None and self._link else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Publish an image that is due: BGR, uint8, shape (height, width, 3)."""
+        """Publish a due image: BGR, uint8, shape (height, width, 3)."""
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
@@ -316,20 +316,20 @@ class SimDriver(Driver):
             )
 
     def failed(self, error: Exception) -> None:
-        """Emit an event that the simulation or the renderer raised an error."""
+        """Emit an event for an error of the simulation or the renderer."""
         sink = self._sink
         if sink is not None:
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
 
 
 LIFT_M_S: Final = 0.05  #: a climb of more than this starts the motors
-DOWN_M: Final = 0.08  #: so low and still descending is landed
+DOWN_M: Final = 0.08  #: below this height, a descending drone counts as landed
 
 
 class SetpointController:
     """Starts the motors when a set-point climbs, and stops them on the ground when one descends.
 
-    The simulated firmware takes set-points in the air only, so its own take-off to the least height stands in between.
+    The simulated firmware accepts set-points only in the air, so its own take-off to the least height comes first.
     """
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
@@ -339,7 +339,7 @@ class SetpointController:
         self._setpoint: Attitude | Velocity | None = None
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state."""
+        """Command the drone like :meth:`Simulation.command`, but accept set-points in every state."""
         with self._lock:
             if not isinstance(action, Attitude | Velocity):
                 self._setpoint = None
@@ -349,13 +349,13 @@ class SetpointController:
         return action if applied is None else applied
 
     def on_feedback(self, believed: VehicleFeedback) -> None:
-        """Apply the set-point in force to the state that the drone reports now."""
+        """Apply the set-point in force to the newest reported state."""
         with self._lock:
             if self._setpoint is not None:
                 self._follow(believed.state, believed)
 
     def reported_state(self, state: FlightState) -> FlightState:
-        """Return the state that such a vehicle reports: it knows neither hovering nor taking off nor landing."""
+        """Return the state that such a vehicle reports: it does not distinguish hovering, taking off and landing."""
         return FlightState.FLYING if state.airborne else state
 
     def _follow(self, state: FlightState, believed: VehicleFeedback) -> AnyAction | None:

@@ -1,4 +1,4 @@
-"""A simulated drone that real firmware flies: its process, and the driver that speaks to it as to a real vehicle."""
+"""A simulated drone flown by real firmware: its process, and the driver that treats it like a real vehicle."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKi
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
-#: Of a driver that has not been opened: what its kind of vehicle can do does not depend on where it is.
+#: Unopened drivers' addresses: a vehicle's capabilities do not depend on its address.
 _SOMEWHERE: Final = {
     AutopilotKind.ARDUPILOT: "mavlink://udpin:127.0.0.1:14550",
     AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
@@ -58,31 +58,31 @@ _SEVERITIES: Final = {
     FirmwareEventKind.FAILED: Severity.ERROR,
     FirmwareEventKind.DEAF: Severity.INFO,
 }
-_KEPT_REPORTS: Final = 64
-_POSE_STD_M: Final = 0.001
-#: The state that firmware reports is no older: it comes over loopback. Where the simulation is slower than real time,
-#: so is the firmware's clock, and its driver, which takes it for a good one, would say otherwise.
+_KEPT_REPORTS: Final = 64  # for the truth at the time of delayed feedback
+_POSE_STD_M: Final = 0.001  # stated accuracy of the true position
+#: Largest age of the firmware's reported state, as it arrives over loopback. In a simulation slower than real time the
+#: firmware's clock is slow as well; its driver trusts that clock and would report a larger age.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
 
 class FirmwareFlight:
-    """Starts the firmware of one drone, and passes on its driver's reports, with the simulation's truth beside them."""
+    """Starts one drone's firmware and relays its driver's reports together with the simulation's truth."""
 
     def __init__(self, options: SimOptions, inner_options: str) -> None:
         assert options.autopilot is not None
         self.kind = AutopilotKind(options.autopilot)
         self._options = options
         self._inner_options = inner_options
-        self._pattern = make_driver(self._address(_SOMEWHERE[self.kind]))  # raises for an option that it does not have
-        self._lock = threading.Lock()  # of the inner driver's opening and closing
+        self._pattern = make_driver(self._address(_SOMEWHERE[self.kind]))  # raises for an unknown option
+        self._lock = threading.Lock()  # for opening and closing the inner driver
         self._sink: Sink | None = None
         self._host: SimHost | None = None
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
-        self._found = False  # its driver has heard it since it was started
-        self._linked = False  # whether the firmware's driver is to be open
+        self._found = False  # its driver has received data since its start
+        self._linked = False  # whether the firmware's driver should be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 
     def _address(self, address: str) -> str:
@@ -97,11 +97,11 @@ class FirmwareFlight:
 
     @property
     def driver(self) -> Driver:
-        """The driver that speaks to the firmware; before it is opened, one of its kind."""
+        """The firmware's driver; before opening, an unopened one of its kind."""
         return self._inner or self._pattern
 
     def capabilities(self, options: SimOptions) -> Capabilities:
-        """Return what the firmware's driver can do, with the simulated cameras."""
+        """Return the capabilities of the firmware's driver, with the simulated cameras."""
         inner = self._pattern.capabilities()
         return Capabilities(
             vehicle="sim",
@@ -113,11 +113,11 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver is opened as soon as its process runs."""
+        """Start the firmware and let it fly the drone; its driver opens once the process runs."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:
-            folder /= f"drone{drone + 1}"  # each has settings of its own
+            folder /= f"drone{drone + 1}"  # each has its own settings
         instruments = rotors_of(host.simulation.parameters[drone]).instruments
         self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
         self._linked, self._found = True, False
@@ -130,7 +130,7 @@ class FirmwareFlight:
         return f"{WAKING_UP}: {_NAMES[self.kind]} is being started"
 
     def close(self) -> None:
-        """Stop the rotors, and end the driver and the firmware. Idempotent."""
+        """Stop the rotors, then the driver and the firmware. Idempotent."""
         self._close_driver()
         host, firmware = self._host, self._firmware
         if host is not None and host.simulation.flown_by_firmware(self._drone):
@@ -141,7 +141,7 @@ class FirmwareFlight:
         self._reports.clear()
 
     def switch_link(self, *, on: bool) -> None:
-        """Open or close the firmware's driver: without it the vehicle hears nothing, as out of a radio's range."""
+        """Open or close the firmware's driver: without it the vehicle is out of radio range."""
         if on:
             self._linked = True
             self._open_driver()
@@ -173,29 +173,29 @@ class FirmwareFlight:
         if event.kind is FirmwareEventKind.STARTED:
             self._open_driver()
         elif event.kind is FirmwareEventKind.FAILED and sink is not None and not self._found:
-            sink.link(LinkState.LOST, event.text, "set what it names right: it is tried again")
+            sink.link(LinkState.LOST, event.text, "fix the named problem; the start is retried")
 
     def link(self, state: LinkState, reason: str) -> tuple[LinkState, str, str]:
-        """Return what the link of the firmware's driver means for the drone: reason and remedy speak of what is inside.
+        """Translate a link state of the firmware's driver, with a reason and remedy for this drone.
 
-        The driver takes the firmware for a vehicle that somebody else starts, at an address that a person gave.
+        The driver believes that it talks to a vehicle that someone else starts, at an address given by a person.
         """
         self._found = self._found or state in (LinkState.UP, LinkState.DEGRADED)
         if not self._found:
             return LinkState.CONNECTING, self._starting, ""
-        remedy = f"{_NAMES[self.kind]} runs within this drone, and is started again if it ended: wait, or look at its "
+        remedy = f"{_NAMES[self.kind]} runs within this drone, and restarts after an exit: wait, or read its "
         remedy += "output in firmware.log, which autopilot_folder=… keeps"
         return state, reason, remedy if state in (LinkState.CONNECTING, LinkState.LOST) else ""
 
     # Flying ----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, *, new: bool) -> AnyAction:
-        """Have the firmware's driver apply an action; without a link nothing arrives."""
+        """Pass an action to the firmware's driver; without a link it is lost."""
         inner = self._inner
         return action if inner is None else inner.apply(action, new=new)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Give the firmware's driver a pose from outside."""
+        """Pass an external pose to the firmware's driver."""
         inner = self._inner
         if inner is None:
             raise DriverError(_LINK_OFF)
@@ -204,19 +204,19 @@ class FirmwareFlight:
     # Called by the host and by the inner driver ----------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Keep the truth for the feedback that comes; give it to a vehicle that is told its position from outside."""
+        """Keep the truth for later feedback; pass it to a vehicle that needs an external position."""
         self._reports.append(report)
         inner = self._inner
         if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:
             truth = report.truth
-            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # its clock is the computer's
+            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # its clock is the computer's clock
             with suppress(DriverError, UnsupportedError):
                 inner.external_pose(
                     ExternalPose(truth.position_m, truth.quaternion, captured_ns, position_std_m=_POSE_STD_M)
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback with the true state at its time, as far as it is known yet."""
+        """Return the firmware's feedback with the true state at its time, as far as known yet."""
         reports = tuple(self._reports)
         if not reports:
             return feedback
@@ -226,7 +226,7 @@ class FirmwareFlight:
 
 
 class _InnerSink:
-    """Passes on what the firmware's driver reports."""
+    """Relays the reports of the firmware's driver."""
 
     def __init__(self, flight: FirmwareFlight, sink: Sink) -> None:
         self._flight = flight
@@ -246,7 +246,7 @@ class _InnerSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        raise NotImplementedError  # the simulated cameras' pictures do not come this way
+        raise NotImplementedError  # the simulated cameras' pictures take another path
 
     def wants(self, camera: str) -> bool:  # noqa: ARG002
         return False
@@ -284,7 +284,7 @@ def make_firmware(
     instruments: InstrumentParameters,
     folder: Path | None = None,
 ) -> CoupledFirmware:
-    """Return a firmware that is not yet started."""
+    """Return a firmware that is not started yet."""
     if kind is AutopilotKind.ARDUPILOT:
         from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 

@@ -1,18 +1,18 @@
 """Options of a ``sim://`` address. Pure.
 
-Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
-(``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of all
-cameras; ``latency`` of all cameras [s]; ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor
-on the world's wind (1); ``battery`` charge at the start, 0 to 1 (1); ``quality`` of the cameras' images, ``fast``,
-``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle itself takes, the others being left to the
-proxy (all); ``position`` whether the vehicle knows its position, as with an indoor positioning system (1; ``none`` for
-one without); ``velocity`` whether it reports its velocity (1; ``none`` for one that does not); ``truth`` whether
-feedback carries the true state too (1); ``rate`` of feedback [1/s] (40); ``vehicle`` whose response it has,
-``quadrotor`` or ``ardrone``, as identified, or that is modelled down to its rotors, ``racer``, ``iris`` or
-``crazyflie`` (``quadrotor``); ``autopilot`` the real firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4``
-(none), on an ``iris``, or a ``racer`` for Betaflight, if no other is named; ``autopilot_folder`` where it keeps its
-settings (they last as long as the drone). With ``autopilot`` all other options, and ``rate``, are those of the driver
-that speaks to the firmware, ``mavlink://`` or ``msp://``.
+Options: ``world``, its name or file (``room``); ``seed`` (0); ``speed``, seconds of simulation per second (1);
+``cameras`` (``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of
+all cameras; ``latency`` of all cameras [s]; ``noise``, a factor on the noise of all sensors and cameras (1); ``wind``,
+a factor on the world's wind (1); ``battery``, charge at the start, 0 to 1 (1); ``quality`` of the cameras' images,
+``fast``, ``smooth`` or ``best`` (``smooth``); ``native``, the vehicle's own actions, while the proxy provides the
+others (all); ``position``, whether the vehicle knows its position, as with an indoor positioning system (1; ``none``
+for one without); ``velocity``, whether it reports its velocity (1; ``none`` for one that does not); ``truth``, whether
+feedback also contains the true state (1); ``rate`` of feedback [1/s] (40); ``vehicle``, either with an identified
+response, ``quadrotor`` or ``ardrone``, or modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie``
+(``quadrotor``); ``autopilot``, the real firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4`` (none), by
+default on an ``iris``, or a ``racer`` for Betaflight; ``autopilot_folder``, the folder for its settings (by default
+they last as long as the drone). With ``autopilot``, all other options and ``rate`` are those of the firmware's driver,
+``mavlink://`` or ``msp://``.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.BETAFLIGHT: "racer",
     AutopilotKind.PX4: "iris",
 }
-#: What keeps the computer's time never catches up: the world's time would stay behind, and what is seen would look old.
-REAL_TIME_LAG_S: Final = 0.02
-TRUTH_HZ: Final = 100.0  #: how often the truth is noted that is reported beside the firmware's state
+#: Firmware that uses the computer's clock never catches up: world time would fall behind, and images would look old.
+REAL_TIME_LAG_S: Final = 0.02  #: lag beyond which steps are skipped with such firmware
+TRUTH_HZ: Final = 100.0  #: how often to store the truth that goes with the firmware's state
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
@@ -53,7 +53,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
     if autopilot is None:
         reject_unknown_options(uri, KNOWN)
     if uri.place:
-        raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
+        raise UsageError(f"{uri}: a simulated drone has no host; did you mean sim://?world={uri.place}")
     options, world = uri.options, uri.reveal("world")
     quality = options.get("quality", "smooth")
     if quality not in QUALITIES:
@@ -65,7 +65,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         raise UsageError(f"{uri}: firmware needs a vehicle with rotors, such as vehicle=iris: not {vehicle}")
     speed = uri.number("speed", 1.0, minimum=0.01, maximum=100.0)
     if autopilot is AutopilotKind.BETAFLIGHT and speed != 1.0:
-        raise UsageError(f"{uri}: Betaflight's clock is the computer's: speed is 1 with it, not {speed:g}")
+        raise UsageError(f"{uri}: Betaflight uses the computer's clock: speed must be 1, not {speed:g}")
     noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
     return SimOptions(
         world="room" if world is None else world,
@@ -89,7 +89,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
 
 
 def firmware_options(uri: VehicleUri) -> str:
-    """Return the options that are those of the driver that speaks to the firmware, as a query."""
+    """Return the options for the firmware's driver, as a query."""
     own = KNOWN - {"rate"}
     return urlencode({name: uri.reveal(name) for name in uri.options if name not in own}, safe="/,:")
 
@@ -115,7 +115,7 @@ def _models(text: str) -> list[CameraModel]:
         if name not in CAMERAS:
             raise UnknownNameError("simulated camera", name, CAMERAS)
     if len(set(names)) != len(names):
-        raise UsageError(f"cameras={text} names one twice")
+        raise UsageError(f"cameras={text} names a camera twice")
     return [CAMERAS[name] for name in names]
 
 
@@ -142,7 +142,7 @@ def _native(text: str | None) -> frozenset[str]:
     for name in names - EVERY_ACTION:
         raise UnknownNameError("action", name, EVERY_ACTION)
     if not names & {"velocity", "attitude"}:
-        raise UsageError(f"native={text} leaves no set-point to fly by: name velocity or attitude as well")
+        raise UsageError(f"native={text} leaves no set-point: add velocity or attitude")
     if ("takeoff" in names) != ("land" in names):
         raise UsageError(f"native={text}: takeoff and land go together")
     return frozenset(names) | ALWAYS_NATIVE

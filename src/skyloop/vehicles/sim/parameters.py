@@ -28,7 +28,7 @@ _LIMITS: Final = (
 #: Last part of the name, field of :class:`CameraModel`, unit, range, description.
 _CAMERA: Final = (
     ("fps", "fps", "1/s", (0.1, 240.0), "pictures a second of simulated time"),
-    ("latency", "latency_s", "s", (0.0, 5.0), "from the exposure until the picture is handed out"),
+    ("latency", "latency_s", "s", (0.0, 5.0), "from exposure to delivery"),
     ("noise", "noise_sigma", "", (0.0, 100.0), "standard deviation of each pixel, in steps of 0 to 255"),
     ("gain", "exposure_gain", "", (0.05, 20.0), "brightness, relative to the scene's own"),
 )
@@ -36,7 +36,7 @@ _CAMERA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterValues:
-    """The values of all parameters of one drone. Its limits are None where its firmware has limits of its own."""
+    """The values of all parameters of one drone. Limits are None if its firmware has its own."""
 
     limits: Limits | None
     cameras: tuple[CameraModel, ...]
@@ -47,11 +47,11 @@ class ParameterValues:
 
 class _Settable(NamedTuple):
     parameter: Parameter
-    write: Callable[[ParameterValues, Any], ParameterValues]  #: given a value as :func:`_checked` returns it
+    write: Callable[[ParameterValues, Any], ParameterValues]  #: called with a value from :func:`_checked`
 
 
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
-    """Return all parameters with their present values; ``standard`` holds the defaults."""
+    """Return all parameters with their present values; ``standard`` contains the defaults."""
     return [entry.parameter for entries in _GROUPS.values() for entry in entries(state, standard)]
 
 
@@ -61,7 +61,7 @@ def names(state: ParameterValues) -> frozenset[str]:
 
 
 def room(room: Room) -> Parameter:
-    """Return the parameter that names the room's walls, by which the proxy refuses places beyond them."""
+    """Return the parameter with the room's walls, which the proxy uses to refuse positions beyond them."""
     x, y, z = room.size_m
     walls = str(Box((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)))
     text = "walls of the simulated room, as a box"
@@ -69,17 +69,17 @@ def room(room: Room) -> Parameter:
 
 
 def geometry(world: World) -> Parameter:
-    """Return the parameter that says what stands in the world, for maps."""
+    """Return the parameter with the objects in the world, for maps."""
     text = encode_world(geometry_of(world))
-    return Parameter(WORLD, ParameterType.TEXT, text, read_only=True, description="what stands in the world, as JSON")
+    return Parameter(WORLD, ParameterType.TEXT, text, read_only=True, description="objects in the world, as JSON")
 
 
 def with_value(state: ParameterValues, name: str, value: Value) -> tuple[ParameterValues, Value]:
-    """Return the values after writing one, and this one as it was written.
+    """Return the values after writing one, and that value as written.
 
     Raises:
-        UnknownNameError: There is no such parameter.
-        ParameterError: It does not take this value.
+        UnknownNameError: No such parameter.
+        ParameterError: A wrong value.
     """
     group = _GROUPS.get(name.partition(".")[0])
     for entry in group(state, state) if group is not None else ():
@@ -148,7 +148,7 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
         minimum=-20.0,
         maximum=20.0,
         default=standard.wind.mean_m_s,
-        description="mean wind: where it blows to, east, north and up",
+        description="mean wind, as the direction it blows to: east, north and up",
     )
     gust = Parameter(
         name="sim.gust",
@@ -167,14 +167,14 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
         minimum=0.0,
         maximum=1.0,
         default=standard.battery,
-        description="charge left, 0 to 1",
+        description="remaining charge, 0 to 1",
     )
     link = Parameter(
         name="sim.link",
         type=ParameterType.BOOL,
         value=state.link,
         default=True,
-        description="whether the drone's radio works: without it nothing is received, and commands are lost",
+        description="whether the drone's radio works; without it no data arrives and commands are lost",
     )
     return [
         _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=value))),
@@ -184,12 +184,12 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
     ]
 
 
-#: What gives the parameters of each group, by the first part of their names.
+#: The source of each group's parameters, by the first part of their names.
 _GROUPS: Final = {"limits": _limit_entries, "camera": _camera_entries, "sim": _world_entries}
 
 
 def _checked(parameter: Parameter, value: Value) -> Value:
-    """Return a value as it is written: a bool, a float, or a tuple of three."""
+    """Return a value in written form: a bool, a float, or a tuple of three."""
     kind, name = parameter.type, parameter.name
     if kind is ParameterType.BOOL:
         if not isinstance(value, bool):

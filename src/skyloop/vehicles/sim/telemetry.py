@@ -1,4 +1,4 @@
-"""The simulator's report of a drone as feedback. Pure."""
+"""Convert the simulator's report of a drone to feedback. Pure."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
     """Return a report as feedback.
 
     Args:
-        report: The drone as it believes to be and as it is, on this host's clock.
+        report: The drone's estimated and true state, on this host's clock.
         state: The flight state to report, which is less detailed for a vehicle that flies by set-points alone.
-        options: Whether the vehicle reports its position and its velocity, and whether the truth is reported too.
+        options: Whether the vehicle reports its position, its velocity and the truth.
     """
     believed = report.believed
     native = native_of(report, options)
@@ -43,7 +43,7 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
 
 
 def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
-    """Return the simulation's time, and the truth if it is reported, as native telemetry."""
+    """Return the simulation's time and, if reported, the truth as native telemetry."""
     native: dict[str, Value] = {"sim.time_s": report.truth.time_s}
     if not options.truth:
         return native
@@ -62,9 +62,9 @@ def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
 
 
 def truth_at(reports: Sequence[Report], captured_ns: int) -> Report:
-    """Return the report of a time, with the drone's true motion interpolated between the two around it.
+    """Return the report at a time, interpolating the drone's true motion between its two neighbours.
 
-    There is at least one, oldest first; before the first and after the last, those count.
+    ``reports`` is sorted and not empty; times outside it get the first or last report.
     """
     after = bisect_right(reports, captured_ns, key=lambda report: report.captured_ns)
     if after == 0:

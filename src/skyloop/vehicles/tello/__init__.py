@@ -1,1 +1,1 @@
-"""``tello://HOST``: the Ryze Tello, by its text protocol."""
+"""``tello://HOST``: the Ryze Tello and its text protocol."""

@@ -1,4 +1,4 @@
-"""The driver of ``tello://``: what the proxy calls, put together from the link, the video and the parameters."""
+"""The driver of ``tello://``, which joins link, video and parameters."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ACTIONS: Final = frozenset(
 
 
 class TelloDriver(Driver):
-    """A Ryze Tello. ``docs/tello.md`` has its options, parameters, events and telemetry."""
+    """A Ryze Tello. See ``docs/tello.md`` for options, parameters, events and telemetry."""
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -36,12 +36,12 @@ class TelloDriver(Driver):
         self._link: TelloLink | None = None
         self._settings: DroneSettings | None = None
         self._video: LiveVideo | None = None
-        self._video_ns = 0  # when a picture came last
+        self._video_ns = 0  # arrival of the last picture
 
     def capabilities(self) -> Capabilities:
-        """Return what the drone can do.
+        """Return the drone's capabilities.
 
-        The camera that looks down is announced though only SDK 3.0 can switch to it.
+        The list includes the camera that looks down, although only SDK 3.0 can switch to it.
         """
         return Capabilities(
             vehicle="tello",
@@ -70,7 +70,7 @@ class TelloDriver(Driver):
         self._link = self._settings = self._video = None
 
     def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
-        """Run the session's callbacks. On the link's thread."""
+        """Run the session's callbacks. Runs on the link's thread."""
         deliver(sink, pending)
         link, settings = self._link, self._settings
         if self._video is not None or not self.options.video or link is None or settings is None:
@@ -92,7 +92,7 @@ class TelloDriver(Driver):
         return self._apply(action, new=False)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return what the drone's newest state says about a flight."""
+        """Return preflight findings from the drone's newest state."""
         link = self._link
         if link is None:
             raise DriverError(f"{self.uri} is not open")
@@ -102,11 +102,11 @@ class TelloDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters. Those that depend on the version of the drone's SDK appear once it is known."""
+        """Return the parameters. Those that depend on the version of the SDK appear once it is known."""
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. Takes up to 0.95 s: the drone answers."""
+        """Write a parameter. Waits up to 0.95 s for the drone's answer."""
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)
@@ -138,7 +138,7 @@ class TelloDriver(Driver):
         decoder = TelloVideo(self.options.concealed, hand_on)
 
         def came(coded: Coded) -> None:
-            # Video of which nothing can be shown, for too long, is asked for as one that does not come.
+            # Video that cannot be shown for too long is requested again, like video that does not arrive.
             if coded.is_key or not (decoder.waits and (sink.wants(settings.camera) or wants_stream())):
                 self._video_ns = monotonic_ns()
 

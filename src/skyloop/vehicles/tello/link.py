@@ -1,4 +1,4 @@
-"""The sockets of one drone: commands and their answers, and state."""
+"""The sockets of one drone: for commands and their answers, and for state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BUFFER: Final = 1 << 20  # half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
-    """Return a socket that sends commands and receives their answers, from the drone's port alone."""
+    """Return a socket that sends commands and receives answers from the drone's port only."""
     made = _through(options)
     try:
         made.bind((options.local or "", 0))
@@ -31,7 +31,7 @@ def command_socket(options: TelloOptions, address: str) -> socket.socket:
 
 
 def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.socket:
-    """Return a socket that receives what comes to a UDP port of this host, from anybody: check the sender."""
+    """Return a socket bound to a UDP port of this host. It receives from any sender: check who it is."""
     made = _through(options)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
@@ -41,7 +41,7 @@ def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.soc
         if error.errno == errno.EADDRINUSE:
             raise OSError(
                 error.errno,
-                f"UDP port {port} of {local} is in use: end the other program, or see how docs/tello.md flies several",
+                f"UDP port {port} of {local} is in use: stop the other program, or see docs/tello.md for more drones",
             ) from error
         raise
     return made
@@ -59,28 +59,28 @@ def _through(options: TelloOptions) -> socket.socket:
     return made
 
 
-ASK_S: Final = 0.95  #: a command is answered within this, or it failed
+ASK_S: Final = 0.95  #: a command without an answer in this time has failed
 
 
 class TelloLink(VehicleLink[TelloSession]):
-    """Commands with their answers, and state, of one drone."""
+    """The link to one drone: commands, their answers, and state."""
 
     def __init__(
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
     ) -> None:
         super().__init__("skyloop-tello", session, deliver, clock)
-        self.addresses: tuple[str, str] | None = None  #: the drone's, and this host's towards it
+        self.addresses: tuple[str, str] | None = None  #: the drone's and this host's, on the way to it
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
 
     # From the proxy's threads ----------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
-        """Have the session accept an action, and send it soon. Any thread. See :meth:`SetpointController.apply`."""
+        """Pass an action to the session and send it soon. Any thread. See :meth:`SetpointController.apply`."""
         return self._decide(partial(self.session.command, action, new=new))
 
     def ask(self, text: str) -> str | None:
-        """Send a command and wait for its answer, up to 0.95 s; None if none came. Any thread but the link's."""
+        """Send a command and wait up to 0.95 s for its answer; None without one. Any thread but the link's."""
         return self._wait_for_answer(partial(self.session.ask, text), ASK_S, None)
 
     # On the link's thread --------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ class TelloLink(VehicleLink[TelloSession]):
     def _open_sockets(self) -> None:
         options = self.session.options
         with self.lock:
-            self._close_sockets()  # first: the new one for state has the same port
+            self._close_sockets()  # first, as the new one for state needs the same port
         address = self._lookup.address(options.host)
         commands = command_socket(options, address)
         local = str(commands.getsockname()[0])

@@ -1,4 +1,4 @@
-"""Options of a ``tello://`` address. Pure. ``docs/tello.md`` has them as a table."""
+"""Options of a ``tello://`` address. Pure. ``docs/tello.md`` lists them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from skyloop.vehicles.tello.wire import PORT, STATE_PORT, VIDEO_PORT
 
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")
-MOST_CONCEALED: Final = 30  #: pictures from one key to the next
-_LEAST_PORT: Final = 1025  # that the Tello's command takes
+MOST_CONCEALED: Final = 30  #: pictures between keys
+_LEAST_PORT: Final = 1025  # accepted by the Tello's command
 KNOWN: Final = {
     *("local", "interface", "port", "state_port", "video_port", "video", "concealed", "pads", "velocity_axes"),
     *INTRINSICS_OPTIONS,
@@ -25,11 +25,11 @@ KNOWN: Final = {
 
 
 class VelocityAxes(StrEnum):
-    """Which axes the drone's ``vgx`` and ``vgy`` are along. The SDK's guides do not say."""
+    """The axes of the drone's ``vgx`` and ``vgy``, which the SDK's guides do not specify."""
 
-    START = "start"  #: x along the heading that it was switched on with
+    START = "start"  #: x along the heading at switch-on
     BODY = "body"  #: x along its nose
-    NONE = "none"  #: not to be trusted: feedback has no velocity
+    NONE = "none"  #: unusable: feedback has no velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +37,19 @@ class TelloOptions:
     """A parsed address."""
 
     host: str
-    local: str | None = None  #: this host's address to talk from, and to be sent to
-    interface: str | None = None  #: this host's interface to talk through
+    local: str | None = None  #: this host's address to send from and receive at
+    interface: str | None = None  #: this host's network interface
     port: int = PORT
     state_port: int = STATE_PORT
     video_port: int = VIDEO_PORT
     video: bool = True
-    concealed: int = 0  #: damaged pictures that a shown one may build on
-    pads: bool = False  #: look for mission pads from the beginning
+    concealed: int = 0  #: damaged pictures that a displayed one may build on
+    pads: bool = False  #: detect mission pads from the start
     velocity_axes: VelocityAxes = VelocityAxes.START
 
     @property
     def own_ports(self) -> bool:
-        """Whether the drone needs a command about where to send state and video."""
+        """Whether a command must tell the drone where to send state and video."""
         return (self.state_port, self.video_port) != (STATE_PORT, VIDEO_PORT)
 
 
@@ -78,7 +78,7 @@ def options_of(uri: VehicleUri) -> TelloOptions:
         velocity_axes=VelocityAxes(axes),
     )
     if made.state_port == made.video_port:
-        raise UsageError(f"{uri}: state and video can't both come to port {made.state_port}")
+        raise UsageError(f"{uri}: state and video can't share port {made.state_port}")
     return made
 
 

@@ -1,6 +1,6 @@
-"""Settings of the driver and of the drone as parameters, and how they are written.
+"""Settings of the driver and of the drone as parameters, and how to write them.
 
-The drone can't be asked what is set: what was written last is shown, and sent again after the drone was lost.
+The drone's settings can't be queried. The last written value is shown, and sent again after a link loss.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GREATEST: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A setting that the drone keeps: its parameter, the first SDK that has it, and the command of each value."""
+    """A setting stored in the drone: its parameter, the first SDK that has it, and the command for each value."""
 
     parameter: Parameter
     since: Sdk
@@ -101,13 +101,13 @@ FULL: Final = "tello.full_stick."
 
 
 def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
-    """Return the parameters of the greatest set-points, and of what a full stick comes to."""
+    """Return the parameters of the largest set-points and of the effect of a full stick."""
     usual = Scale()
     made = []
     for name, field, unit, (low, high), text in _SCALES:
         for prefix, scale, what in (
             (LIMITS, limits, f"greatest {text}; never more than a full stick"),
-            (FULL, full, f"{text} that the drone makes of a full stick: measure it, and set-points come true"),
+            (FULL, full, f"{text} of the drone at full stick: measure it to make set-points accurate"),
         ):
             value, default = getattr(scale, field), getattr(usual, field)
             made.append(
@@ -119,7 +119,7 @@ def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
 
 
 def flip_parameter(value: str) -> Parameter:
-    """Return the parameter whose writing flips the drone."""
+    """Return the parameter that flips the drone when written."""
     return Parameter(
         FLIP,
         ParameterType.TEXT,
@@ -132,7 +132,7 @@ def flip_parameter(value: str) -> Parameter:
 
 
 def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
-    """Return what the drone reported of itself, read-only."""
+    """Return the drone's reported properties, read-only."""
     made = []
     if sdk is not None:
         made.append(
@@ -148,12 +148,12 @@ def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
 
 
 def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
-    """Return the settings that this version of the SDK has; none while it is not known."""
+    """Return the settings in this version of the SDK; none while it is unknown."""
     return {name: setting for name, setting in SETTINGS.items() if sdk is not None and sdk.knows(setting.since)}
 
 
 class DroneSettings:
-    """The values of all parameters. Those of the drone are written through the link."""
+    """The values of all parameters. The drone's own are written through the link."""
 
     def __init__(self, link: TelloLink) -> None:
         self._link = link
@@ -163,7 +163,7 @@ class DroneSettings:
 
     @property
     def camera(self) -> str:
-        """The camera whose pictures come."""
+        """The camera that the drone sends."""
         return str(self._values[CAMERA])
 
     def parameters(self) -> list[Parameter]:
@@ -181,8 +181,7 @@ class DroneSettings:
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force. Takes up to 0.95 s.
 
-        Raises for a name or a value that does not fit, for a flip on the ground, and where the drone refuses or is
-        silent.
+        Raises for a wrong name or value, for a flip on the ground, and if the drone refuses or does not answer.
         """
         known = {parameter.name: parameter for parameter in self.parameters()}
         if name not in known:

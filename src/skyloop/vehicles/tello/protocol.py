@@ -1,4 +1,4 @@
-"""The protocol of one drone, from the first datagram on: state and answers in, commands out. No socket, no clock."""
+"""The protocol of one drone from the first datagram on: state and answers in, commands out. No socket, no clock."""
 
 from __future__ import annotations
 
@@ -26,45 +26,45 @@ from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
 from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
-TRIES: Final = 3
-MOTION_NS: Final = nanoseconds(20.0)  #: the latest answer to a take-off or landing that is still expected
+TRIES: Final = 3  #: of a request before it fails
+MOTION_NS: Final = nanoseconds(20.0)  #: limit for the answer to a take-off or landing
 
-#: Takes the answer, or None if there was none.
+#: Receives the answer, or None if there was none.
 Done = Callable[[str | None], None]
 
 
 @dataclass(slots=True)
 class Request:
-    """A command whose answer is waited for."""
+    """A command that expects an answer."""
 
     text: str
-    done: Done  #: is given the answer, or None if there was none
-    tries: int = TRIES  #: how often it is sent at most
-    sent_ns: int | None = None  #: when it was sent last
+    done: Done  #: called with the answer, or None if there was none
+    tries: int = TRIES  #: how often to send it at most
+    sent_ns: int | None = None  #: when last sent
 
 
 class Conversation:
-    """Asks one thing at a time.
+    """Sends one request at a time.
 
-    *Motions*, such as a take-off, are sent by others, but answered through here, seconds later: while one is not
-    answered, nothing is asked that is answered in the same words.
+    *Motions*, such as a take-off, are sent elsewhere, but their answers arrive here, seconds later. Until then, no
+    request is sent that has the same answers.
 
-    ``counts``: ``answered``, ``unanswered`` requests, and ``stray`` replies that belong to nothing.
+    ``counts``: ``answered`` and ``unanswered`` requests, and ``stray`` replies that match neither.
     """
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("answered", "unanswered", "stray"), 0))
         self._queue: deque[Request] = deque()
         self._asked: Request | None = None
-        self._motions: dict[str, int] = {}  # command, and when it was sent last
+        self._motions: dict[str, int] = {}  # command, and when last sent
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is asked or waits to be asked."""
+        """Whether no request is in flight or queued."""
         return self._asked is None and not self._queue
 
     def ask(self, request: Request) -> None:
-        """Ask something after what waits already."""
+        """Queue a request."""
         self._queue.append(request)
 
     def moved(self, text: str, now_ns: int) -> None:
@@ -72,7 +72,7 @@ class Conversation:
         self._motions[text] = now_ns
 
     def abandon(self) -> None:
-        """Give up all requests: the drone is gone."""
+        """Fail all requests after a link loss."""
         waiting = [self._asked] if self._asked is not None else []
         waiting += self._queue
         self._queue.clear()
@@ -82,7 +82,7 @@ class Conversation:
             request.done(None)
 
     def on_reply(self, reply: str) -> str | None:
-        """Handle a reply; return the motion that it answers, None if it answers none."""
+        """Handle a reply; return the motion that it answers, or None."""
         asked = self._asked
         plain_error = is_error(reply) and ":" not in reply
         if asked is not None and answers(reply, asked.text) and not (plain_error and self._motions):
@@ -125,31 +125,31 @@ class Conversation:
 
 
 TICK_NS: Final = nanoseconds(0.05)  #: between two ``rc``
-HURRY_NS: Final = nanoseconds(0.02)  #: least time between two ``rc``
-DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states come ten times a second
-LOST_NS: Final = nanoseconds(1.5)
+HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc``
+DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states arrive ten times a second
+LOST_NS: Final = nanoseconds(1.5)  #: of silence
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
-ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
-ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
+ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state arrives
+ALIVE_NS: Final = nanoseconds(4.0)  #: between requests that prevent the drone's automatic landing after 15 s
 ALONE_NS: Final = nanoseconds(30.0)  #: without any command it has landed by then: it begins to after 15 s
-ASK_NS: Final = nanoseconds(5.0)  #: a drone that others fly is asked who it is for no longer
-DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
-VIDEO_NS: Final = nanoseconds(2.0)  #: without video that can be shown for so long it is asked for
+ASK_NS: Final = nanoseconds(5.0)  #: limit for asking a drone flown by another program for its version
+DEAF: Final = 2  #: unanswered requests in a row that mean our commands are not received
+VIDEO_NS: Final = nanoseconds(2.0)  #: after this time without usable video, request it
 ALIVE: Final = "wifi?"
-DEFAULT_HOST: Final = "192.168.10.1"  #: of a Tello that opens a network of its own
+DEFAULT_HOST: Final = "192.168.10.1"  #: of a Tello that is its own access point
 _TELLOS_NETWORK: Final = "192.168.10."
 
 _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 
 
 class TelloSession(VehicleSession):
-    """The protocol of one opened driver with its drone. Not thread-safe.
+    """The protocol between one opened driver and its drone. Not thread-safe.
 
     Args:
-        options: Of the vehicle's address.
+        options: Options of the vehicle's address.
         now_ns: The time of opening.
-        extra: Gives telemetry of others for feedback's ``native``.
-        video_ns: When video came last that can be shown, or a key picture; 0 for never.
+        extra: Returns further telemetry for ``Feedback.native``.
+        video_ns: Returns when usable video or a key picture last arrived; 0 for never.
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
@@ -167,16 +167,16 @@ class TelloSession(VehicleSession):
         self.setpoints = SetpointController()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
-        self._watch = RestartWatch()  # of the seconds that the motors ran for
-        self.sdk: Sdk | None = None  #: None until the drone answered ``sdk?``; SDK 1.3 answers with an error
+        self._watch = RestartWatch()  # watches the count of seconds with running motors
+        self.sdk: Sdk | None = None  #: None until ``sdk?`` is answered; SDK 1.3 answers with an error
         self.serial = ""
-        self.ready = False  #: whether state comes and commands are answered
-        self.remembered: dict[str, str] = {}  #: parameter and the command that set it, sent again after a loss
+        self.ready = False  #: whether state arrives and commands are answered
+        self.remembered: dict[str, str] = {}  #: parameter to the command that set it, for a link loss
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
-        self._lost_ns = self._sent_ns = now_ns  # when it was lost, or a hover asked for since; when anything was sent
+        self._lost_ns = self._sent_ns = now_ns  # the link loss or a later hover request; the last sent datagram
         self._alive_ns = self._found_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
@@ -185,7 +185,7 @@ class TelloSession(VehicleSession):
         self._rc_ns = 0
         self._flips: list[str] = []
         self._reported_ports = False
-        self._answered = False  # while no state comes
+        self._answered = False  # while no state arrives
         self.local = ""  #: this host's address towards the drone
         self._place = f"{options.host}, UDP port {options.port}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
@@ -195,7 +195,7 @@ class TelloSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action and have it sent soon; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it soon; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)
@@ -209,12 +209,12 @@ class TelloSession(VehicleSession):
         return applied
 
     def ask(self, text: str, done: Done) -> None:
-        """Send a command; ``done`` gets the answer, or None if there was none."""
+        """Send a command; ``done`` receives the answer, or None without one."""
         self.conversation.ask(Request(text, done))
         self.due_ns = 0
 
     def flip(self, direction: str) -> None:
-        """Send a flip, once: a repeat would flip it twice."""
+        """Send a flip, once: a repeat would flip the drone twice."""
         self._flips.append(f"flip {direction}")
         self.due_ns = 0
 
@@ -225,13 +225,13 @@ class TelloSession(VehicleSession):
         return self.setpoints.forget_landing()
 
     def close(self) -> None:
-        """End the session: requests that wait get no answer."""
+        """End the session; queued requests get no answer."""
         self.conversation.abandon()
 
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_state(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram of the state port, whatever it holds. Never raises."""
+        """Handle a datagram from the state port. Never raises for any content."""
         try:
             state = parse(datagram)
         except DecodeError:
@@ -256,11 +256,11 @@ class TelloSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return what the drone's newest state says about a flight."""
+        """Return preflight findings from the drone's newest state."""
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram of the port that commands are sent from, whatever it holds. Never raises."""
+        """Handle a datagram from the command port. Never raises for any content."""
         reply = decoded(datagram)
         if not reply:
             self.counts["damaged"] += 1
@@ -294,11 +294,11 @@ class TelloSession(VehicleSession):
     # Time ------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """Return the commands that are due now, each for a datagram of its own."""
+        """Return the commands that are due now, one per datagram."""
         self._check_silence(now_ns)
         self.due_ns = now_ns + TICK_NS
         texts = []
-        alone = self._lands_by_itself(now_ns)
+        alone = self._left_to_land(now_ns)
         if self._received_ns is None and not alone and now_ns - self._entered_ns >= ENTER_NS:
             self._entered_ns = now_ns
             texts.append(ENTER)
@@ -320,8 +320,8 @@ class TelloSession(VehicleSession):
             self._sent_ns = now_ns
         return [text.encode("ascii") for text in texts]
 
-    def _lands_by_itself(self, now_ns: int) -> bool:
-        """Return whether only landings and stops are sent, as all else would keep what is not heard in the air."""
+    def _left_to_land(self, now_ns: int) -> bool:
+        """Return whether to send only landings and stops, so that a lost drone lands without further commands."""
         if not self.setpoints.flies_unheard or now_ns - self._lost_ns < KEPT_NS:
             return False
         if now_ns - self._sent_ns >= ALONE_NS:
@@ -329,7 +329,7 @@ class TelloSession(VehicleSession):
         return self.setpoints.flies_unheard
 
     def _keep_alive(self, now_ns: int) -> None:
-        """Ask something now and then: it keeps the drone awake, and shows whether our commands are received."""
+        """Send a periodic request, which keeps the drone awake and shows whether it receives our commands."""
         if self._is_silent(now_ns):
             return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
@@ -340,7 +340,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
-        """Return whether to ask nothing, as each question keeps what nobody flies from landing by itself."""
+        """Return whether to send no requests, as each one delays the automatic landing of a drone without a pilot."""
         asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
         return asked and self.setpoints.flown_by_others
 
@@ -360,23 +360,23 @@ class TelloSession(VehicleSession):
         missing = self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS
         if missing and self.conversation.idle and not self._is_silent(now_ns):
             self._asked_video_ns = now_ns
-            self.conversation.ask(Request("streamon", _whatever))
+            self.conversation.ask(Request("streamon", _ignore_reply))
 
     def _describe_silence(self, since: str, why: str) -> str:
         if self._answered:
-            why += f", though it answers: does a firewall of this host let UDP port {self.options.state_port} in?"
+            why += f", though it answers: does a firewall of this host block UDP port {self.options.state_port}?"
         if self.options.host == DEFAULT_HOST and self.local and not self.local.startswith(_TELLOS_NETWORK):
             why += f"; this computer is in no network of a Tello, its address is {self.local}"
         return f"no state{since} from {self._place}{why}"
 
     def _advice(self) -> str:
         if self._answered:
-            return f"let UDP port {self.options.state_port} in at this computer's firewall"
+            return f"allow incoming UDP port {self.options.state_port} in this computer's firewall"
         if self.options.host.startswith("127."):
             return "start the emulated drone: skyloop sim --firmware tello"
         return "switch the Tello on and join its Wi-Fi network, TELLO-…; or correct the host in the address"
 
-    # Losing and finding ----------------------------------------------------------------------------------------
+    # Link loss and recovery ------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns, self._lost_ns = None, now_ns
@@ -390,7 +390,7 @@ class TelloSession(VehicleSession):
         self._unreachable, self._answered = "", False
         self._deaf, self._alive_ns, self._found_ns, self._asked_video_ns = 0, now_ns, now_ns, 0
         if self.setpoints.left_alone:
-            self._set_link_state(LinkState.DEGRADED, "it lands by itself: nothing is sent until it is commanded")
+            self._set_link_state(LinkState.DEGRADED, "it lands automatically: nothing is sent until a command")
         self.due_ns = 0
 
     def _on_version(self, reply: str | None) -> None:
@@ -404,7 +404,7 @@ class TelloSession(VehicleSession):
         self.ready, self._deaf = True, 0
         self.conversation.ask(Request("sn?", self._on_serial))
         for text in self.remembered.values():
-            self.conversation.ask(Request(text, _whatever))
+            self.conversation.ask(Request(text, _ignore_reply))
         self._set_link_state(LinkState.UP)
 
     def _on_serial(self, reply: str | None) -> None:
@@ -412,5 +412,5 @@ class TelloSession(VehicleSession):
             self.serial = reply
 
 
-def _whatever(_reply: str | None) -> None:
-    """Ignore the answer: what became of the command shows in the drone's state or video."""
+def _ignore_reply(_reply: str | None) -> None:
+    """Ignore the answer: the drone's state or video shows the effect of the command."""

@@ -1,6 +1,6 @@
-"""Set-points to sticks and motions: the last action, until the drone's state shows that it is done. Pure.
+"""Turn set-points into sticks and motions: keep the last action until the drone's state shows it done. Pure.
 
-Answers decide nothing: they come seconds late, or not at all. A take-off or landing is sent again until it shows.
+Answers decide nothing: they arrive seconds late or not at all. A take-off or landing is repeated until it shows.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from skyloop.vehicles.tello.wire import (
     is_error,
 )
 
-FULL_TILT_RAD: Final = 0.2  #: the attitude that is taken for a full stick: as much as an AR.Drone tilts indoors
+FULL_TILT_RAD: Final = 0.2  #: attitude of a full stick; chosen: as much as an AR.Drone tilts indoors
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """A number for each stick: what a full one comes to, or the most that is asked for."""
+    """One number per stick: the effect of a full stick, or the largest set-point."""
 
     speed: float = FULL_SPEED_M_S  #: [m/s]
     climb: float = FULL_CLIMB_M_S  #: [m/s]
@@ -53,9 +53,9 @@ class Scale:
 
 
 def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
-    """Return the sticks, and what they ask for: each number within its limit, and no more than a full stick.
+    """Return the sticks and the set-point they stand for: within the limits, and at most a full stick.
 
-    The Tello holds a speed, and no attitude: a tilt is taken as a share of the full stick, and so of the full speed.
+    The Tello holds a speed, not an attitude: a tilt becomes a share of the full stick, and so of the full speed.
     """
     climb = min(full.climb, limits.climb)
     yaw = min(full.yaw_rate, limits.yaw_rate)
@@ -84,17 +84,17 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
-AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is sent again
+AGAIN_NS: Final = nanoseconds(1.5)  #: repeat a take-off or landing that does not show by then
 TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
-RISES_NS: Final = nanoseconds(3.0)  #: so long after a take-off was sent what stands may rise: real ones do after 1.1 s
+RISES_NS: Final = nanoseconds(3.0)  #: how long a sent take-off may still start; real drones rise after 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
 
 class Decision(Enum):
-    """What is wanted of take-off and landing."""
+    """The wish for take-off or landing."""
 
-    STAY = auto()  #: as it is: in the air if it flies
+    STAY = auto()  #: in the air if it flies, on the ground otherwise
     TAKE_OFF = auto()
     LAND = auto()
 
@@ -102,40 +102,40 @@ class Decision(Enum):
 class SetpointController:
     """Remembers the last action and turns it into commands.
 
-    ``full`` is what a full stick comes to, ``limits`` the most that is asked for.
+    ``full`` is the effect of a full stick, ``limits`` the largest set-point.
     """
 
     def __init__(self) -> None:
         self.watch = FlightWatch()
         self.full = Scale()
         self.limits = Scale()
-        self.receiving = False  #: whether the drone's state comes
-        #: After a stop or landing that was given up, until somebody commands: a Tello lands by itself after 15 s then.
+        self.receiving = False  #: whether the drone's state arrives
+        #: After an abandoned stop or landing, until the next command: silence makes it land after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
         self._stick = LEVEL
         self._decided_ns = 0
-        self._sent_ns: int | None = None  # the take-off or landing
-        self._rises_until_ns = 0  # a take-off was sent, and may show until then
-        self._state_ns = 0  # when its state came last
-        self._was_in_air = False  # when its state came last, or it was to rise just then
-        self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
+        self._sent_ns: int | None = None  # take-off or landing
+        self._rises_until_ns = 0  # a take-off that we sent may show until then
+        self._state_ns = 0  # arrival of the last state
+        self._was_in_air = False  # in the last state, or by a take-off that we just sent
+        self._steering = False  # we started or took this flight; otherwise another program may fly it
         self._events: list[VehicleEvent] = []
 
     @property
     def intent(self) -> tuple[object, ...]:
-        """Changes when something else is to be sent."""
+        """A value that changes when the commands to send change."""
         return self._decision, self._stick, self.stop.active
 
     @property
     def flown_by_others(self) -> bool:
-        """Whether nothing from here is to keep it in the air: it was given up, or this flight is not ours."""
+        """Whether we must not keep the drone in the air: we abandoned it, or the flight is not ours."""
         return self.left_alone or (self.watch.phase.airborne and not self._steering)
 
     @property
     def flies_unheard(self) -> bool:
-        """Whether it flew or was to rise when it was heard last, and may fly still."""
+        """Whether the drone flew or was taking off when the link was lost, and may still fly."""
         return not self.receiving and self._was_in_air
 
     def flight_state(self) -> FlightState:
@@ -148,7 +148,7 @@ class SetpointController:
             return FlightState.FLYING
         return self.watch.phase
 
-    # What is decided -------------------------------------------------------------------------------------------
+    # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Accept an action.
@@ -156,15 +156,15 @@ class SetpointController:
         Args:
             action: One of the driver's ``ACTIONS``.
             now_ns: The present time.
-            new: Whether an application newly asked for it. What nobody decided, but a landing, does nothing to a drone
-                that is :attr:`left_alone`.
+            new: Whether an application just requested it. For a drone that is :attr:`left_alone`, actions that no
+                application requested have no effect, except a landing.
 
         Returns:
-            What is applied: a set-point within the limits, or hover after an emergency stop.
+            The applied action: a set-point within the limits, or hover after an emergency stop.
 
         Raises:
-            DriverError: A take-off while nothing is received or after an emergency stop, or a reset while it is not
-                received or its motors still run.
+            DriverError: A take-off without data from the drone or after an emergency stop, or a reset without data or
+                while the motors still run.
         """
         if isinstance(action, Idle):
             return action
@@ -172,7 +172,7 @@ class SetpointController:
             self._stop_motors(now_ns)
         elif isinstance(action, ResetEmergency):
             if self.stop.active and not self.receiving:
-                raise DriverError("no data from the drone: whether it is on the ground is not known")
+                raise DriverError("no data from the drone: cannot tell whether it is on the ground")
             self.stop.reset()
         elif self.stop.active:
             if isinstance(action, Takeoff):
@@ -208,7 +208,7 @@ class SetpointController:
 
     def _remain(self, stick: Stick, now_ns: int) -> None:
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return  # or a take-off that was withdrawn would show after all
+            return  # otherwise a withdrawn take-off could still happen
         if self._decision is Decision.LAND:
             self._decide(Decision.STAY, now_ns)
         self._stick = stick
@@ -234,7 +234,7 @@ class SetpointController:
         self._steering, self.left_alone = False, True
 
     def forget_landing(self) -> bool:
-        """Land no longer; return whether it was to."""
+        """Cancel a pending landing; return whether there was one."""
         if self._decision is not Decision.LAND:
             return False
         self._decision, self.watch.sinking = Decision.STAY, False
@@ -242,17 +242,17 @@ class SetpointController:
         return True
 
     def forget_flight(self) -> None:
-        """Take it for landed: it was not heard, and sent nothing, for as long as it takes it to land by itself."""
+        """Assume a landing: without contact or commands, the drone had the time to land automatically."""
         self._was_in_air = self._steering = False
 
-    # What is received ---------------------------------------------------------------------------------------------
+    # Receiving ----------------------------------------------------------------------------------------------------
 
     def on_state(self, now_ns: int) -> None:
-        """Handle that the watch has seen a new state."""
+        """Handle a new state that the watch has seen."""
         phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
-        if rose and phase is FlightState.LANDED:  # it fell over, or was stopped: a take-off begins once
+        if rose and phase is FlightState.LANDED:  # it fell over or was stopped: start only once
             self._decide(Decision.STAY, now_ns)
             text = "the drone began to take off, and its motors stopped: it is not started again"
             self._events.append(message(text, "no_takeoff", Severity.WARNING))
@@ -264,7 +264,7 @@ class SetpointController:
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the answer to a take-off or landing. That to an emergency stop shows nothing: the motors do."""
+        """Handle the answer to a take-off or landing. For an emergency stop only the motors' state counts."""
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused
@@ -274,7 +274,7 @@ class SetpointController:
             self._events.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
 
     def lost(self, now_ns: int) -> None:
-        """Cancel a take-off and level the sticks: nothing is received any more. A landing is still sent."""
+        """Cancel a take-off and level the sticks after a link loss. A landing is still sent."""
         self.receiving = False
         self._was_in_air |= now_ns < self._rises_until_ns
         if self._decision is Decision.TAKE_OFF:
@@ -283,7 +283,7 @@ class SetpointController:
         self.watch = FlightWatch()
         self.watch.sinking = self._decision is Decision.LAND
 
-    # What is sent ----------------------------------------------------------------------------------------------
+    # Sending ---------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
@@ -291,7 +291,7 @@ class SetpointController:
         return events
 
     def motions(self, now_ns: int) -> list[str]:
-        """Return the commands due now that are answered seconds later."""
+        """Return the due commands that are answered seconds later."""
         if self.stop.active:
             return [EMERGENCY] if self.stop.step(self._motors_are_off(now_ns), now_ns) else []
         if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
@@ -311,9 +311,9 @@ class SetpointController:
         return []
 
     def stick(self) -> Stick | None:
-        """Return the sticks for ``rc``, None if none are to be sent.
+        """Return the sticks for ``rc``; None to send none.
 
-        A drone that stands, rises or sinks is left alone, and so is one that another program flies.
+        None for a drone that is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

@@ -1,8 +1,8 @@
-"""State strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
+"""Convert state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
 
-No field of the state says what the drone is doing, so :class:`FlightWatch` finds it out: ``time`` grows by one each
-second while the motors run, and stands still otherwise; the distance sensor shows whether the ground is near. What was
-asked for only names what is seen: a climb that was asked for is a take-off.
+No field of the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` grows by one each second
+only while the motors run, and the distance sensor shows whether the ground is near. Our own commands only name the
+observation: a climb after a take-off command is a take-off.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 
 
 def height_m(state: State) -> float | None:
-    """Return the height above what is below [m]: measured if possible, else above the place of take-off.
+    """Return the height above the surface below [m]: measured if possible, else above the place of take-off.
 
-    The distance sensor reports 10 cm on the ground; so does a drone that is 10 cm high, and then its height says so.
+    The distance sensor reports 10 cm on the ground and at a height of 10 cm; the reported height tells them apart.
     """
     if state.distance_cm is not None:
         on_ground = state.distance_cm <= GROUND_CM and (state.height_cm or 0.0) < GROUND_CM
@@ -37,9 +37,9 @@ def height_m(state: State) -> float | None:
 
 
 def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
-    """Return the velocity forward, left, up [m/s], from numbers along these axes; None if it is not known.
+    """Return the velocity forward, left, up [m/s], from numbers along these axes; None if unknown.
 
-    ``vgx`` and its like are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
+    ``vgx``, ``vgy`` and ``vgz`` are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
     """
     if state.speed_dm_s is None or axes is VelocityAxes.NONE:
         return None
@@ -55,7 +55,7 @@ def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
 def feedback_of(
     state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
 ) -> Feedback:
-    """Return the drone's state in SI units and our axes. What it does not report is None."""
+    """Return the drone's state in SI units and our axes. Values that it does not report are None."""
     acceleration = state.acceleration_mg
     factor = STANDARD_GRAVITY / 1000
     return Feedback(
@@ -75,7 +75,7 @@ def feedback_of(
 
 
 def native_of(state: State) -> dict[str, Value]:
-    """Return the state by the drone's own names and in its own units."""
+    """Return the state with the drone's own names and units."""
     return dict(state.fields)
 
 
@@ -85,14 +85,14 @@ def _angle(degrees: float | None) -> float | None:
 
 # The phase of flight -------------------------------------------------------------------------------------------------
 
-STILL_NS: Final = nanoseconds(1.6)  #: if the count of seconds stands still for so long, the motors are off
-GRACE_NS: Final = nanoseconds(2.5)  #: how long a count that has just ended, or not begun, is waited for
-LOW_M: Final = 0.15
-HIGH_M: Final = 0.25
-HOVER_M: Final = 0.4
-SLOW_DM_S: Final = 1.0
-SETTLED: Final = 3  #: samples in a row that are high and slow end a take-off
-RISE_NS: Final = nanoseconds(8.0)  #: the longest that a take-off is taken for one
+STILL_NS: Final = nanoseconds(1.6)  #: if the count of seconds pauses for this long, the motors are off
+GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or not yet begun
+LOW_M: Final = 0.15  #: at most this height is near the ground
+HIGH_M: Final = 0.25  #: from this height on the drone is off the ground
+HOVER_M: Final = 0.4  #: least height at the end of a take-off
+SLOW_DM_S: Final = 1.0  #: vertical speed at the end of a take-off, at most
+SETTLED: Final = 3  #: consecutive high and slow samples that end a take-off
+RISE_NS: Final = nanoseconds(8.0)  #: longest take-off
 
 _S = FlightState
 
@@ -100,8 +100,8 @@ _S = FlightState
 class FlightWatch:
     """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
 
-    ``rising`` and ``sinking``: whether a take-off or a landing was asked for and is not done. ``landing_answered``:
-    whether the drone answered that it landed.
+    ``rising`` and ``sinking``: a take-off or a landing was requested and is not done. ``landing_answered``: the drone
+    answered that it landed.
     """
 
     def __init__(self) -> None:
@@ -110,8 +110,8 @@ class FlightWatch:
         self.sinking = False
         self.landing_answered = False
         self._motor_s: int | None = None
-        self._counted_ns: int | None = None  # when the count grew
-        self._since_ns = 0  # when it was first seen
+        self._counted_ns: int | None = None  # when the count last grew
+        self._since_ns = 0  # when the count was first seen
         self._phase_ns = 0
         self._settled = 0
 
@@ -121,7 +121,7 @@ class FlightWatch:
         return self.phase is _S.HOVERING
 
     def motors(self, now_ns: int) -> bool | None:
-        """Return whether the motors run; None while that can't be known."""
+        """Return whether the motors run; None while unknown."""
         if self._counted_ns is not None and now_ns - self._counted_ns < STILL_NS:
             return True
         return None if self._motor_s is None or now_ns - self._since_ns < STILL_NS else False
@@ -166,8 +166,8 @@ class FlightWatch:
         return _S.HOVERING
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
-        """Return whether a drone that stood does not any more. Being carried about is no take-off."""
-        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # or they ran before it landed
+        """Return whether a landed drone has taken off. Carrying it around is not a take-off."""
+        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before landing
         if self.rising and (high or (motors and begun)):
             return True
         return bool(high and motors and in_phase_ns > GRACE_NS)
@@ -175,9 +175,9 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: estimate: people report that the motors are refused somewhat above
-COOL_C: Final = 85.0
-PAD_LOST: Final = 5  #: states in a row without it, before a pad counts as out of view
+HOT_C: Final = 90.0  #: estimate: users report that the drone refuses to start its motors somewhat above
+COOL_C: Final = 85.0  #: the drone counts as hot until it is below this again
+PAD_LOST: Final = 5  #: consecutive states without a pad until it counts as out of view
 
 
 class Health:
@@ -190,16 +190,16 @@ class Health:
         self._without = 0
 
     def changes(self, state: State) -> list[VehicleEvent]:
-        """Return what changed since the last call."""
+        """Return events for the changes since the last call."""
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return whether it is cool enough to fly; nothing while its temperature is not known."""
+        """Return a finding about a drone too hot to fly; nothing while its temperature is unknown."""
         if self._celsius is None:
             return []
         if not self._hot:
             return [Diagnostic("temperature", True, f"{self._celsius:g} °C")]
-        detail = f"{self._celsius:g} °C: it refuses its motors, or lands by itself, when it is hotter"
+        detail = f"{self._celsius:g} °C: when hotter, it refuses to start its motors or lands"
         return [Diagnostic("temperature", False, detail, "let it cool with its fan free, or fly: moving air cools it")]
 
     def _temperature(self, range_c: tuple[float, float] | None) -> list[VehicleEvent]:
@@ -225,7 +225,7 @@ class Health:
 
 
 def _seen(pad: Pad) -> VehicleEvent:
-    """Report a pad with its place: the drone's, in the pad's axes [m]."""
+    """Return the event for a pad with the drone's position in the pad's axes [m]."""
     text = f"mission pad m{pad.number} is in view"
     if pad.place_cm is None:
         return message(text, "mission_pad", pad=pad.number, in_view=True)

@@ -1,7 +1,7 @@
-"""The drone's video: its cameras, datagrams to pictures, and a decoder that shows what is whole.
+"""The drone's video: its cameras, pictures from datagrams, and a decoder that shows only whole pictures.
 
-Intrinsics: a calibration of one such drone as published with tello_ros, for pictures of 960×720; another drone's differ
-by some per cent. Nothing is known of the lens of the camera that looks down.
+Intrinsics: the calibration of one drone, published with tello_ros, for pictures of 960×720; other drones differ by some
+per cent. Nothing is known about the lens of the camera that looks down.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras, of which the drone shows one at a time; the one that looks down needs SDK 3.0.
+    """Return both cameras; the drone shows one at a time, and the one that looks down needs SDK 3.0.
 
     Intrinsics in the address are the front camera's.
     """
@@ -64,9 +64,9 @@ def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
 
 
 def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | None:
-    """Return a camera's intrinsics for pictures of another width, which the drone makes smaller when asked to.
+    """Return a camera's intrinsics for another picture width, to which the drone can scale pictures down.
 
-    Those of the bottom camera are not known: None.
+    None for the bottom camera, whose intrinsics are unknown.
     """
     known = front.intrinsics
     if camera != FRONT or known is None:
@@ -83,13 +83,13 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
-POLL_S: Final = 0.1
-SILENT_S: Final = 3.0  #: without a datagram for so long, the port is opened again
-BURST: Final = 64
+POLL_S: Final = 0.1  #: longest wait in one read
+SILENT_S: Final = 3.0  #: without a datagram for this long, reopen the port
+BURST: Final = 64  #: datagrams per read
 
 
 class VideoStream:
-    """The port that video comes to. Pictures have no stamps: they count as captured when their first datagram came."""
+    """The port for video. Pictures have no stamps: their first datagram's arrival is their capture time."""
 
     def __init__(
         self, options: TelloOptions, addresses: Callable[[], tuple[str, str] | None], connection: int, clock: Clock
@@ -115,7 +115,7 @@ class VideoStream:
         return self._assembly.stray
 
     def read(self) -> list[Coded]:
-        """Return the pictures that arrived, after :data:`POLL_S` at most."""
+        """Return the pictures that arrived, within :data:`POLL_S`."""
         frames: list[Coded] = []
         if wait_readable(self._socket, POLL_S):
             self._drain(frames)
@@ -128,7 +128,7 @@ class VideoStream:
         self._socket.close()
 
     def _drain(self, frames: list[Coded]) -> None:
-        """Read what came. Stops with a picture, so that it is decoded while the next one comes."""
+        """Read what arrived, up to the end of a picture, so that it is decoded while the next one arrives."""
         for _ in range(BURST):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
@@ -145,20 +145,20 @@ class VideoStream:
 
 # Decoder -------------------------------------------------------------------------------------------------------------
 
-MOST_UNITS: Final = 120  #: kept to be decoded again; key pictures of the drone are 30 apart
+MOST_UNITS: Final = 120  #: kept for a second decoding; key pictures of the drone are 30 apart
 _PURPOSE: Final = "the video of a Tello"
 
 
 class TelloVideo:
     """Decodes one stream.
 
-    A decoder that refuses any damage works from a whole key picture on. At the first damage another one takes over, if
-    that is allowed, which fills what is missing with what stood there before; it decodes again what came since the key.
-    After more damaged pictures than allowed, or a damaged key, nothing is shown up to the next whole key.
+    Decoding starts at a whole key picture with a decoder that refuses any damage. If concealment is allowed, a second
+    decoder takes over at the first damage and decodes again from that key; it fills gaps from the previous picture.
+    After a damaged key, or more damaged pictures than allowed, nothing is shown until the next whole key.
 
     Args:
-        concealed: How many damaged pictures a shown one may build on.
-        on_whole: Called with each picture that shows no damage and builds on none. On the decoding thread.
+        concealed: How many damaged pictures a displayed one may build on.
+        on_whole: Called with each picture that is undamaged and builds on undamaged ones. On the decoding thread.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -168,13 +168,13 @@ class TelloVideo:
         require_pyav(_PURPOSE)
         self._concealed = concealed
         self._on_whole = on_whole
-        self._came: int | None = None  # number of the picture before
+        self._came: int | None = None  # number of the previous picture
         self.waited = 0
         self.damaged = 0
         self._strict: VideoCodecContext | None = None
         self._patching: VideoCodecContext | None = None
         self._units: list[bytes] = []  # since the key, while there is no damage
-        self._damage = 0  # pictures since the key
+        self._damage = 0  # damaged pictures since the key
         self._number = 0
 
     def restart(self) -> None:
@@ -183,14 +183,14 @@ class TelloVideo:
 
     @property
     def waits(self) -> bool:
-        """Whether nothing can be shown up to the next whole key."""
+        """Whether nothing can be shown until the next whole key."""
         return self._strict is None and self._patching is None
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         """See :class:`skyloop.drivers.live_video.Decoder`."""
         unit = coded.data
         if not isinstance(unit, AccessUnit):
-            raise TypeError("a picture of a Tello is wanted")
+            raise TypeError("expected a picture of a Tello")
         came, self._came = self._came, unit.number
         left_out = came is not None and unit.number != came + 1
         if unit.is_key:
@@ -236,7 +236,7 @@ class TelloVideo:
         return image
 
     def _note_damage(self) -> None:
-        """Patch from here on, or wait for a key if there is too much damage."""
+        """Conceal from here on, or wait for a key if there is too much damage."""
         self.damaged += 1
         self._damage += 1
         if self._damage > self._concealed:
@@ -248,13 +248,13 @@ class TelloVideo:
         self._units = []
 
     def _decode(self, context: VideoCodecContext, data: bytes) -> av.VideoFrame | None:
-        """Return the picture; None if there is none, or the decoder says that it is damaged."""
+        """Return the picture; None without one, or if the decoder reports damage."""
         import av
 
         try:
             images = context.decode(av.Packet(data))
         except (av.error.FFmpegError, ValueError):
             return None
-        # CABAC may end a damaged picture early without an error: FFmpeg fills the rest then, and says so.
+        # CABAC may end a damaged picture early without an error; FFmpeg then fills the rest and flags the picture.
         concealed = images and images[-1].is_corrupt and context is not self._patching
         return images[-1] if images and not concealed else None

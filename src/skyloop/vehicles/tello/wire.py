@@ -2,18 +2,18 @@
 
 From Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide".
 
-What SDK 3.0 (Tello Talent, and EDU with newer firmware) has besides is known from the commands that djitellopy sends.
+The additions of SDK 3.0 (Tello Talent, and EDU with newer firmware) are known from the commands that djitellopy sends.
 
-A reply does not say what it answers, and may come seconds late or twice. So a reply is taken for a command's only if it
-has the shape that this command's answers have.
+A reply does not name its command, and may arrive seconds late or twice. It therefore counts as a command's reply only
+if it has the shape of that command's answers.
 
-State comes ten times a second; what is not known is None. Axes are those of aviation, x forward, y right, z down:
-positive pitch is nose up, positive roll right side down, positive yaw clockwise. That attitude and accelerations agree
-in this is seen in recorded strings: a Tello that sends a pitch of 8° sends 0.116 g along its x.
+State arrives ten times a second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
+positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm that attitude
+and accelerations agree in this: a Tello that sends a pitch of 8° sends 0.116 g along its x.
 
-Video is H.264 in Annex B form, cut into pieces of 1460 bytes without any header. Nothing numbers the pieces. A piece
-that is shorter than the others ends a picture; one that begins with a start code begins the next. Of a picture whose
-piece was lost in the middle the only sign is that it does not decode.
+Video is H.264 in Annex B form, cut into pieces of 1460 bytes without headers or numbers. A piece that is shorter than
+the others ends a picture; one that begins with a start code begins the next. If a piece is lost in the middle of a
+picture, only the decoder notices.
 """
 
 from __future__ import annotations
@@ -40,36 +40,36 @@ from skyloop.drivers.h264 import unit_type as type_of
 from skyloop.drivers.h264 import units as units_of
 from skyloop.errors import DecodeError
 
-PORT: Final = 8889  #: where the Tello takes commands; it answers to where a command came from
-STATE_PORT: Final = 8890  #: of the client, where state comes
-VIDEO_PORT: Final = 11111  #: of the client, where video comes
+PORT: Final = 8889  #: the Tello's, for commands; it answers to the sender's port
+STATE_PORT: Final = 8890  #: the client's, for state
+VIDEO_PORT: Final = 11111  #: the client's, for video
 HOST: Final = "192.168.10.1"  #: of a Tello that is its own access point
-SILENCE_S: Final = 15.0  #: without a command for so long the Tello lands by itself
+SILENCE_S: Final = 15.0  #: without a command for this long the Tello lands
 
-ENTER: Final = "command"  #: nothing works before it
+ENTER: Final = "command"  #: must come first
 MAX_STICK: Final = 100
-#: What a stick of 100 comes to. Estimates: no guide says it, and people take ``rc`` for cm/s and degrees a second.
+#: Effect of a stick of 100. Estimates: no guide gives it, and users read ``rc`` as cm/s and degrees a second.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: no command and no reply of the SDK is nearly as long
+MAX_COMMAND: Final = 256  #: all commands and replies of the SDK are much shorter
 
 
 class Sdk(StrEnum):
-    """Versions of the protocol. Each knows what those before it know."""
+    """Versions of the protocol, each a superset of the previous ones."""
 
     V1_3 = "1.3"
     V2_0 = "2.0"
     V3_0 = "3.0"
 
     def knows(self, other: Sdk) -> bool:
-        """Whether it is this one or newer."""
+        """Return whether this version is the other one or newer."""
         return self.value >= other.value
 
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """``rc``: each from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
+    """``rc``: values from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
 
     right: int = 0
     forward: int = 0
@@ -85,12 +85,12 @@ LEVEL: Final = Stick()
 
 
 def ports(state: int, video: int) -> str:
-    """SDK 3.0: where state and video are to be sent."""
+    """Return the command that sets the ports for state and video (SDK 3.0)."""
     return f"port {state} {video}"
 
 
 def decoded(datagram: bytes) -> str | None:
-    """The text of a datagram without what surrounds it; None for what is no text of this protocol."""
+    """Return a datagram's text without surrounding white space; None if it is not text of this protocol."""
     if len(datagram) > MAX_COMMAND:
         return None
     try:
@@ -104,7 +104,7 @@ _ERROR: Final = re.compile(r"(error|unknown command|out of range|unactive|forced
 
 
 class Shape(Enum):
-    """What an answer that is no error looks like."""
+    """The form of an answer other than an error."""
 
     OK = re.compile(r"ok\Z", re.IGNORECASE)
     NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
@@ -115,7 +115,7 @@ class Shape(Enum):
     FIELDS = re.compile(r"[a-z]+:-?[\d.]+;([a-z]+:-?[\d.]+;)*\Z")  #: ``attitude?``, ``acceleration?``
 
 
-#: What is answered otherwise than with "ok".
+#: Commands with other answers than "ok".
 READ: Final = {
     "speed?": Shape.NUMBER,
     "battery?": Shape.NUMBER,
@@ -133,17 +133,17 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Of a command's answer."""
+    """Return the shape of a command's answer."""
     return READ.get(command, Shape.OK)
 
 
 def is_error(reply: str) -> bool:
-    """Whether it reports that a command, whichever, was not executed."""
+    """Return whether a reply reports that a command, whichever, was not executed."""
     return _ERROR.match(reply) is not None
 
 
 def answers(reply: str, command: str) -> bool:
-    """Whether this reply can be this command's: an answer of its shape, or an error."""
+    """Return whether this reply can belong to this command: an answer of its shape, or an error."""
     if reply.lower().startswith("unknown command"):
         named = reply.partition(":")[2].strip()
         return named in ("", command)
@@ -151,11 +151,11 @@ def answers(reply: str, command: str) -> bool:
 
 
 MAX_STATE: Final = 1024
-FIELDS: Final = 64  #: more than any version has
+FIELDS: Final = 64  #: more than in any version
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's "nothing measured"
-GROUND_CM: Final = 10  #: what the distance sensor reports on the ground, and the least that it can
-NO_PAD: Final = -1  #: none is seen; -2: they are not looked for
-NOWHERE_CM: Final = -100  #: each coordinate while no pad is seen
+GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, and its minimum
+NO_PAD: Final = -1  #: none in view; -2: detection is off
+NOWHERE_CM: Final = -100  #: each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
 
 Vector = tuple[float, float, float]
@@ -163,7 +163,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Pad:
-    """A mission pad that is seen, and where the Tello is above it: axes as printed on the pad, z up [cm]."""
+    """A mission pad in view and the Tello's position above it: axes as printed on the pad, z up [cm]."""
 
     number: int
     place_cm: Vector | None
@@ -172,26 +172,26 @@ class Pad:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state string. None: missing, or the value that means "not known"."""
+    """One state string. None: missing, or the drone's value for "unknown"."""
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
     yaw_deg: float | None = None
     speed_dm_s: Vector | None = None  #: ``vgx``, ``vgy``, ``vgz``
     temperature_c: tuple[float, float] | None = None  #: lowest and highest
-    distance_cm: float | None = None  #: ``tof``: to what is below
-    height_cm: float | None = None  #: above where it took off; may be negative
+    distance_cm: float | None = None  #: ``tof``: to the surface below
+    height_cm: float | None = None  #: above the place of take-off; may be negative
     battery_percent: float | None = None
     barometer: float | None = None  #: as sent; its zero and unit differ between versions
-    motor_s: int | None = None  #: how long motors have run since it was switched on
+    motor_s: int | None = None  #: running time of the motors since switch-on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None
-    pads: bool = False  #: whether it has fields for pads at all
-    fields: tuple[tuple[str, float | Vector], ...] = ()  #: all of it, as sent
+    pads: bool = False  #: whether it has fields for pads
+    fields: tuple[tuple[str, float | Vector], ...] = ()  #: all fields, as sent
 
 
 def parse(datagram: bytes) -> State:
-    """A state datagram. Fields that make no sense are left out; raises :class:`DecodeError` if nothing is left.
+    """Return the state in a datagram, without invalid fields. Raises :class:`DecodeError` if none is valid.
 
     A string that was cut off loses its last field, unless it ends with its semicolon.
     """
@@ -200,7 +200,7 @@ def parse(datagram: bytes) -> State:
     try:
         text = datagram.decode("ascii")
     except UnicodeDecodeError:
-        raise DecodeError("a state string with bytes that are no ASCII") from None
+        raise DecodeError("a state string with bytes that are not ASCII") from None
     fields: dict[str, float | Vector] = {}
     for part in text.strip("\r\n\0 ").split(";")[:FIELDS]:
         match = _FIELD.match(part)
@@ -245,11 +245,11 @@ def _state(fields: dict[str, float | Vector]) -> State:
     )
 
 
-PADS: Final = range(1, 9)  #: the numbers of the pads that there are
+PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 and 0: none is in view; some firmware says 257 then
+    if number is None or number not in PADS:  # -1 and 0: none in view; some firmware sends 257 then
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -257,39 +257,38 @@ def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector 
 
 
 def build(fields: list[tuple[str, str]]) -> bytes:
-    """A state datagram with these fields, in their order, as a Tello ends it."""
+    """Return a state datagram with these fields, in their order, with the Tello's line end."""
     return ("".join(f"{name}:{value};" for name, value in fields) + "\r\n").encode("ascii")
 
 
-PIECE: Final = 1460  #: bytes of every datagram of a picture but its last
-MAX_PICTURE: Final = 1 << 19  #: bytes; real ones have a fiftieth of that
-_HEAD: Final = 256  # bytes in which parameter sets and the beginning of the first slice are looked for
+PIECE: Final = 1460  #: bytes in every datagram of a picture but the last
+MAX_PICTURE: Final = 1 << 19  #: bytes; real pictures have a fiftieth of that
+_HEAD: Final = 256  # bytes searched for parameter sets and the beginning of the first slice
 
 
 @dataclass(frozen=True, slots=True)
 class AccessUnit:
-    """One picture as it came."""
+    """One picture as received."""
 
     data: bytes
     is_key: bool  #: decoding can begin here
-    arrived_ns: int  #: when its first piece came
-    after_gap: bool  #: a picture before it is known to be missing or damaged
-    whole: bool  #: nothing shows that a piece of its own is missing
-    number: int = 0  #: counts the pictures that came
+    arrived_ns: int  #: when its first piece arrived
+    after_gap: bool  #: an earlier picture is known to be missing or damaged
+    whole: bool  #: no sign of a missing piece in this picture
+    number: int = 0  #: counts the pictures that arrived
     width: int = 0  #: by the newest parameters [px]; 0 before the first
     height: int = 0
 
 
 def pieces(picture: bytes) -> list[bytes]:
-    """A picture's datagrams."""
+    """Return a picture's datagrams."""
     return [picture[at : at + PIECE] for at in range(0, len(picture), PIECE)]
 
 
 class Assembly:
-    """Pieces in the order of their coming to pictures. Never raises for what it is fed.
+    """Assembles pictures from pieces in the order of arrival. Never raises for any input.
 
-    ``stray`` counts bytes that belong to no picture, ``missing`` the pictures that the numbers in the stream show to be
-    missing.
+    ``stray`` counts bytes outside of pictures, ``missing`` the pictures missing by the numbers in the stream.
     """
 
     def __init__(self) -> None:
@@ -300,15 +299,15 @@ class Assembly:
         self._arrived_ns = 0
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
-        self._gap = True  # since the last picture that was given out
+        self._gap = True  # since the last returned picture
         self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
-        """A datagram that came now; the pictures that are complete with it, at most two."""
+        """Add a datagram that arrived now; return the completed pictures, at most two."""
         found = []
         begins = piece.startswith(START)
         if begins and self._has_picture():
-            found += self._end(whole=False)  # its last piece was lost, unless it was as long as the others
+            found += self._end(whole=False)  # the last piece is missing, unless it was as long as the others
         if not begins and not self._pieces:
             self.stray += len(piece)
             self._gap = True
@@ -324,7 +323,7 @@ class Assembly:
         return found
 
     def _has_picture(self) -> bool:
-        """Whether a slice has come; parameter sets may come in datagrams of their own."""
+        """Return whether a slice has arrived; parameter sets may arrive in separate datagrams."""
         if not self._pieces:
             return False
         return any(type_of(unit) in (SLICE, IDR) for unit in units_of(self._head()))
@@ -355,7 +354,7 @@ class Assembly:
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
-        """Whether the number of this picture does not follow that of the one before. Takes note of it."""
+        """Return whether this picture's number does not follow the previous one, and remember the number."""
         try:
             for unit in head:
                 if type_of(unit) == SPS:

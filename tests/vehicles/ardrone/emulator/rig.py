@@ -1,4 +1,4 @@
-"""A vehicle that writes down what it is told, and a board on a clock that the tests move."""
+"""A vehicle that records its commands, and a board on a clock that the tests move."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ _NEXT = {
 
 
 class RecordingVehicle:
-    """Is at once in the state that a command asks for."""
+    """Goes at once into the state that a command requests."""
 
     def __init__(self, state: FlightState = FlightState.LANDED) -> None:
         self.state = state
         self.told: list[AnyAction] = []
         self.limits = Limits()
-        self.lying = True  #: whether a reset of an emergency works
+        self.lying = True  #: whether it lies on the ground, so that a reset works
 
     def command(self, action: AnyAction) -> AnyAction:
         self.told.append(action)
@@ -68,13 +68,13 @@ class RecordingVehicle:
     def set_limits(self, limits: Limits) -> None:
         self.limits = limits
 
-    def take_told(self) -> list[AnyAction]:
+    def take_commands(self) -> list[AnyAction]:
         told, self.told = self.told, []
         return told
 
 
 class Bench:
-    """A main board on the bench: its vehicle, its clock, and what its control port sent."""
+    """A main board on the bench: its vehicle, its clock, and the output of its control port."""
 
     def __init__(self, version: int = 2, state: FlightState = FlightState.LANDED) -> None:
         self.vehicle = RecordingVehicle(state)
@@ -84,7 +84,7 @@ class Bench:
         self._sequence = 0
 
     def say(self, name: str, *arguments: Argument) -> None:
-        """A command with the next sequence number, in a datagram of its own."""
+        """Send a command with the next sequence number in a separate datagram."""
         self._sequence += 1
         self.logic.receive(format_command(name, self._sequence, *arguments))
 
@@ -92,7 +92,7 @@ class Bench:
         self.say("CONFIG", key, value)
 
     def wait(self, seconds: float, believed: VehicleFeedback = RESTING) -> None:
-        """Time passes without a command."""
+        """Let time pass without a command."""
         self.clock.advance(seconds)
         self.logic.supervise(replace(believed, state=self.vehicle.state))
 

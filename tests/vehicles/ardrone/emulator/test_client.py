@@ -1,4 +1,4 @@
-"""The emulated AR.Drone over its sockets, as a plain client sees it."""
+"""The emulated AR.Drone over its sockets, as seen by a plain client."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Switch = Callable[..., ArdroneFirmware]
 
 @pytest.fixture
 def switch_on() -> Iterator[Switch]:
-    """Emulated drones that are switched off with the test."""
+    """Emulated drones that are switched off at the end of the test."""
     with ExitStack() as running:
 
         def make(*, host: SimHost | None = None, speed: float = FAST, **settings: object) -> ArdroneFirmware:
@@ -70,7 +70,7 @@ def take_off(pilot: Pilot) -> None:
 # Navdata and configuration -------------------------------------------------------------------------------------
 
 
-def test_navdata_begins_with_the_bootstrap_and_goes_on_as_configured(pilot: Pilot) -> None:
+def test_navdata_begins_with_the_bootstrap_and_then_follows_the_configuration(pilot: Pilot) -> None:
     first = pilot.until(lambda n: True, "something comes")
     assert first.sequence == 1
     assert first.options == {}
@@ -80,10 +80,10 @@ def test_navdata_begins_with_the_bootstrap_and_goes_on_as_configured(pilot: Pilo
     assert set(demo.options) == {o.Demo, o.VisionDetect}
     assert demo.state & (State.DEMO | State.BOOTSTRAP) == State.DEMO
     pilot.configure("general:navdata_demo", "FALSE")
-    full = pilot.until(lambda n: len(n.options) > 2, "all options come")
+    full = pilot.until(lambda n: len(n.options) > 2, "all options arrive")
     assert len(full.options) == 28
     pilot.configure("general:navdata_options", str(1 << 1 | 1 << 27))
-    assert set(pilot.until(lambda n: len(n.options) == 2, "the chosen ones come").options) == {o.Time, o.Gps}
+    assert set(pilot.until(lambda n: len(n.options) == 2, "the chosen ones arrive").options) == {o.Time, o.Gps}
     assert [n.sequence for n in pilot.seen] == list(range(1, len(pilot.seen) + 1))
 
 
@@ -93,19 +93,19 @@ def test_the_rates_of_demo_and_full_navdata(pilot: Pilot) -> None:
         pilot.configure("general:navdata_demo", demo)
         pilot.until(lambda n: bool(n.state & State.DEMO) is (demo == "TRUE"), "the mode is changed")  # noqa: B023
         begun_s, last = time.monotonic(), pilot.seen[-1].sequence + count
-        pilot.until(lambda n: n.sequence >= last, "so many came")  # noqa: B023
+        pilot.until(lambda n: n.sequence >= last, "enough arrived")  # noqa: B023
         rates[demo] = count / (time.monotonic() - begun_s)
     # 15 a second and, here, some 100; fewer on a busy machine.
     assert 4 < rates["TRUE"] < 20
     assert 1.5 * rates["TRUE"] < rates["FALSE"] < 140
 
 
-def test_several_clients_are_answered_at_the_ports_they_ask_from(drone: ArdroneFirmware, pilot: Pilot) -> None:
-    pilot.until(lambda n: n.sequence > 3, "the first one is told")
+def test_several_clients_are_answered_at_their_own_ports(drone: ArdroneFirmware, pilot: Pilot) -> None:
+    pilot.until(lambda n: n.sequence > 3, "navdata for the first one")
     with Pilot(drone.ports) as other:
         other.speaks = False
-        assert other.until(lambda n: True, "the other one is told").sequence == 1
-        pilot.until(lambda n: True, "the first one is told more")
+        assert other.until(lambda n: True, "navdata for the other one").sequence == 1
+        pilot.until(lambda n: True, "more navdata for the first one")
 
 
 def test_the_configuration_is_read_over_the_control_port(pilot: Pilot) -> None:
@@ -115,7 +115,7 @@ def test_the_configuration_is_read_over_the_control_port(pilot: Pilot) -> None:
     assert len(dump) == 103
     pilot.until(lambda n: n.state & State.COMMAND_ACK, "the dump is acknowledged")
     pilot.say("CONFIG", "custom:session_id", "0000000a")
-    assert pilot.read_configuration(6) == {}  # ids, no keys
+    assert pilot.read_configuration(6) == {}  # ids, not keys
 
 
 # Flight --------------------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def test_the_motors_are_cut_and_the_emergency_is_reset(pilot: Pilot) -> None:
     take_off(pilot)
 
 
-def test_a_pilot_who_is_gone_leaves_a_drone_that_lands(drone: ArdroneFirmware, pilot: Pilot) -> None:
+def test_a_drone_without_its_pilot_lands(drone: ArdroneFirmware, pilot: Pilot) -> None:
     pilot.configure("general:navdata_demo", "FALSE")
     take_off(pilot)
     pilot.pcmd = (1, 0.0, -0.3, 0.0, 0.0)
@@ -167,7 +167,7 @@ def test_a_low_battery_lands_it(drone: ArdroneFirmware, pilot: Pilot) -> None:
     drone.host.simulation.set_charge(0, 0.02)
     pilot.until(lambda n: n.state & State.BATTERY_LOW and in_state(2)(n), "it has landed")
     pilot.say("REF", TAKE_OFF)
-    pilot.until(lambda n: n.state & State.START_BUTTON, "the command was heard")
+    pilot.until(lambda n: n.state & State.START_BUTTON, "the command arrived")
     assert drone.host.simulation.state(0) is FlightState.LANDED
 
 
@@ -175,13 +175,13 @@ def test_a_low_battery_lands_it(drone: ArdroneFirmware, pilot: Pilot) -> None:
 
 
 def frames(drone: ArdroneFirmware, count: int, parser: PaveParser | None = None) -> list[PaveFrame]:
-    """So many frames of a new connection."""
+    """Return this many frames of a new connection."""
     parser, taken = parser or PaveParser(), list[PaveFrame]()
     with socket.create_connection((HERE, drone.ports.video), 5) as video:
         video.settimeout(10)
         while len(taken) < count:
             data = video.recv(65536)
-            assert data, "the drone hung up"
+            assert data, "the drone closed the connection"
             taken += parser.feed(data)
     assert parser.skipped_bytes == 0
     return taken
@@ -223,7 +223,7 @@ def test_the_channel_and_the_codec_are_switched_in_flight(drone: ArdroneFirmware
     assert drone.logic.video.fps == 15
 
 
-def test_the_video_of_an_ar_drone_1_comes_in_datagrams(switch_on: Switch) -> None:
+def test_the_video_of_an_ar_drone_1_arrives_in_datagrams(switch_on: Switch) -> None:
     drone = switch_on(version=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as video:
         video.settimeout(10)
@@ -235,7 +235,7 @@ def test_the_video_of_an_ar_drone_1_comes_in_datagrams(switch_on: Switch) -> Non
     assert pictures[1].pixels.std() > 10
 
 
-def test_an_ar_drone_1_sends_no_pictures_to_a_pilot_who_is_gone(switch_on: Switch) -> None:
+def test_an_ar_drone_1_stops_sending_pictures_when_its_pilot_is_gone(switch_on: Switch) -> None:
     drone = switch_on(version=1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as video, Pilot(drone.ports) as pilot:
         video.sendto(b"\1", (HERE, drone.ports.video))
@@ -259,7 +259,7 @@ def test_garbage_on_every_port_is_survived(drone: ArdroneFirmware, pilot: Pilot)
         with socket.create_connection((HERE, port), 5) as client:
             client.sendall(noise.randbytes(50_000))
     pilot.configure("general:navdata_demo", "FALSE")
-    pilot.until(in_state(2), "it is well")
+    pilot.until(in_state(2), "it works")
 
 
 def test_a_flight_over_a_bad_link(switch_on: Switch) -> None:
@@ -271,7 +271,7 @@ def test_a_flight_over_a_bad_link(switch_on: Switch) -> None:
         pilot.until(in_state(2), "it has landed")
         numbers = [n.sequence for n in pilot.seen]
     assert numbers[-1] > len(set(numbers)), "some were lost"
-    assert len(set(numbers)) < len(numbers), "some came twice"
+    assert len(set(numbers)) < len(numbers), "some arrived twice"
 
 
 def test_a_restart_in_flight_on_the_same_ports(drone: ArdroneFirmware, pilot: Pilot) -> None:
@@ -284,10 +284,10 @@ def test_a_restart_in_flight_on_the_same_ports(drone: ArdroneFirmware, pilot: Pi
             _ = drone.ports
         drone.start()
     assert astuple(drone.ports) == astuple(before)
-    pilot.seen.clear()  # so that it asks anew
+    pilot.seen.clear()  # so that it requests navdata again
     assert pilot.until(lambda n: True, "it is there again").state & State.BOOTSTRAP
     pilot.configure("general:navdata_demo", "FALSE")
-    assert in_state(4)(pilot.until(lambda n: n.options, "options come")), "the vehicle hovered meanwhile"
+    assert in_state(4)(pilot.until(lambda n: n.options, "options arrive")), "the vehicle hovered meanwhile"
     pilot.ref = LAND
     pilot.until(in_state(2), "it has landed")
 
@@ -299,7 +299,7 @@ def test_two_drones_share_a_world(switch_on: Switch) -> None:
         for pilot in (one, other):
             pilot.configure("general:navdata_demo", "FALSE")
         take_off(one)
-        assert in_state(2)(other.until(lambda n: n.options, "the other one tells"))
+        assert in_state(2)(other.until(lambda n: n.options, "the other one sends navdata"))
     assert host.simulation.state(1) is FlightState.LANDED
 
 
@@ -309,12 +309,12 @@ def test_two_drones_share_a_world(switch_on: Switch) -> None:
 @pytest.mark.parametrize(
     "settings", [{"version": 3}, {"header_size": 60}, {"delay_s": -1.0}, {"delay_s": float("nan")}]
 )
-def test_what_no_drone_has_is_refused(settings: dict[str, float]) -> None:
+def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         ArdroneFirmware(SimHost(SimOptions(world="empty")), **settings)  # type: ignore[arg-type]
 
 
-def test_ports_that_are_taken_are_refused_and_nothing_is_left_behind(drone: ArdroneFirmware) -> None:
+def test_ports_in_use_are_refused_without_leaks(drone: ArdroneFirmware) -> None:
     host = SimHost(SimOptions(world="empty"))
     with pytest.raises(LinkError, match="navdata port"):
         ArdroneFirmware(host, ports=drone.ports).start()

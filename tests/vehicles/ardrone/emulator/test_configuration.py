@@ -13,7 +13,7 @@ MINE: Ids = ("0a0b0c0d", "11111111", "22222222")
 
 
 def in_session(version: int = 2) -> Configuration:
-    """A configuration that a program with ids of its own uses."""
+    """Return a configuration in use by a program with its own ids."""
     made = Configuration(version)
     for key, one_id in zip(("session", "profile", "application"), MINE, strict=True):
         assert made.write(f"custom:{key}_id", one_id, MINE)
@@ -28,7 +28,7 @@ def in_session(version: int = 2) -> Configuration:
         ("general:ardrone_name", "Käthe", "Käthe"),
         ("control:altitude_max", "2500", 2500),
         ("control:altitude_max", "2500.7", 2500),
-        ("control:altitude_max", "1", 500),  # brought into the range
+        ("control:altitude_max", "1", 500),  # clamped to the range
         ("control:euler_angle_max", "0.25", 0.25),
         ("control:euler_angle_max", "9", 0.52),
         ("video:video_codec", "131", VideoCodec.H264_720P),
@@ -58,7 +58,7 @@ def test_a_key_is_written(key: str, text: str, value: Value) -> None:
         ("network:at_port", "5556"),  # of an AR.Drone 1
     ],
 )
-def test_what_makes_no_sense_is_ignored(key: str, text: str) -> None:
+def test_nonsense_is_ignored(key: str, text: str) -> None:
     configuration = Configuration(2)
     before = configuration.dump()
     assert not configuration.write(key, text)
@@ -66,13 +66,13 @@ def test_what_makes_no_sense_is_ignored(key: str, text: str) -> None:
 
 
 @given(st.sampled_from(sorted(KEYS)) | st.text(), st.text() | st.integers().map(str), st.sampled_from([1, 2]))
-def test_any_text_leaves_a_configuration_that_can_be_sent(key: str, text: str, version: int) -> None:
+def test_a_configuration_can_be_sent_after_any_text(key: str, text: str, version: int) -> None:
     configuration = Configuration(version)
     configuration.write(key, text)
     assert parse_dump(configuration.dump()).keys() == keys_of(version).keys()
 
 
-def test_the_channels_of_an_ar_drone_1_go_round() -> None:
+def test_the_channels_of_an_ar_drone_1_wrap_around() -> None:
     configuration = Configuration(1)
     seen = []
     for _ in range(5):
@@ -81,7 +81,7 @@ def test_the_channels_of_an_ar_drone_1_go_round() -> None:
     assert seen == [1, 2, 3, 0, 1]
 
 
-def test_outdoors_there_are_other_limits() -> None:
+def test_outdoor_flight_has_other_limits() -> None:
     configuration = Configuration(2)
     configuration.write("control:outdoor_control_vz_max", "1500")
     configuration.write("control:euler_angle_max", "0.1")
@@ -95,10 +95,10 @@ def test_outdoors_there_are_other_limits() -> None:
     assert configuration["control:euler_angle_max"] == 0.1
 
 
-def test_a_session_of_its_own_begins_with_the_factorys_values() -> None:
+def test_a_new_session_begins_with_factory_values() -> None:
     configuration = Configuration(2)
     configuration.write("video:codec_fps", "20")  # of the session
-    configuration.write("control:altitude_max", "1500")  # of everybody
+    configuration.write("control:altitude_max", "1500")  # shared
     configuration.write("custom:session_id", MINE[0])
     assert configuration["video:codec_fps"] == 30
     assert configuration["control:altitude_max"] == 1500
@@ -120,7 +120,7 @@ def test_values_belong_to_their_session_user_and_application() -> None:
 
 
 @pytest.mark.parametrize("ids", [None, (MINE[0], MINE[1], "33333333"), ("00000000",) * 3])
-def test_other_ids_are_not_obeyed(ids: Ids | None) -> None:
+def test_commands_with_other_ids_are_ignored(ids: Ids | None) -> None:
     configuration = in_session()
     assert not configuration.write("control:altitude_max", "1500", ids)
     assert configuration["control:altitude_max"] == 3000
@@ -147,14 +147,14 @@ def test_a_deleted_session_leaves_the_default_one(text: str) -> None:
     assert configuration["video:codec_fps"] == 30
 
 
-def test_the_default_session_can_not_be_deleted() -> None:
+def test_the_default_session_cannot_be_deleted() -> None:
     configuration = Configuration(2)
     assert not configuration.write("custom:session_id", "-00000000")
     assert configuration.ids == ("00000000",) * 3
 
 
-def test_there_is_room_for_so_many_sessions() -> None:
+def test_the_number_of_sessions_is_limited() -> None:
     configuration = Configuration(2)
     made = [configuration.write("custom:session_id", f"{n:08x}") for n in range(1, MOST_CUSTOM + 2)]
     assert made == [True] * MOST_CUSTOM + [False]
-    assert configuration.write("custom:session_id", f"{1:08x}"), "one that is there can still be chosen"
+    assert configuration.write("custom:session_id", f"{1:08x}"), "an existing one can still be chosen"

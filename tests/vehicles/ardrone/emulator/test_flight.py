@@ -1,4 +1,4 @@
-"""The emulated drone's flight logic, on a vehicle that does at once what it is told."""
+"""The emulated drone's flight logic, on a vehicle that obeys at once."""
 
 from __future__ import annotations
 
@@ -70,15 +70,15 @@ def test_the_emergency_bit_toggles_only_when_it_was_0_before() -> None:
     bench = Bench(state=S.FLYING)
     for _ in range(3):
         bench.say("REF", EMERGENCY)
-    assert bench.vehicle.take_told() == [EmergencyStop()]
+    assert bench.vehicle.take_commands() == [EmergencyStop()]
     bench.say("REF", 0)
     for _ in range(3):
         bench.say("REF", EMERGENCY)
-    assert bench.vehicle.take_told() == [ResetEmergency()]
+    assert bench.vehicle.take_commands() == [ResetEmergency()]
     assert bench.vehicle.state is S.LANDED
 
 
-def test_an_emergency_is_reset_as_soon_as_the_drone_lies() -> None:
+def test_an_emergency_is_reset_once_the_drone_lies_on_the_ground() -> None:
     bench = Bench(state=S.EMERGENCY)
     bench.vehicle.lying = False
     bench.say("REF", EMERGENCY)
@@ -88,7 +88,7 @@ def test_an_emergency_is_reset_as_soon_as_the_drone_lies() -> None:
     assert bench.vehicle.state is S.LANDED
 
 
-def test_why_there_is_an_emergency_shows() -> None:
+def test_the_reason_for_an_emergency_is_reported() -> None:
     bench = Bench(state=S.FLYING)
     assert not bench.state & State.EMERGENCY
     bench.say("REF", EMERGENCY)
@@ -103,7 +103,7 @@ def test_why_there_is_an_emergency_shows() -> None:
 
 
 @pytest.mark.parametrize("tilted", [replace(RESTING, roll_rad=1.1), replace(RESTING, pitch_rad=-1.1)])
-def test_the_motors_are_cut_when_the_angles_are_out_of_range(tilted: VehicleFeedback) -> None:
+def test_excessive_angles_cut_the_motors(tilted: VehicleFeedback) -> None:
     bench = Bench(state=S.FLYING)
     bench.wait(0.01, tilted)
     assert bench.vehicle.told == [EmergencyStop()]
@@ -112,7 +112,7 @@ def test_the_motors_are_cut_when_the_angles_are_out_of_range(tilted: VehicleFeed
     assert not bench.state & State.FLYING
 
 
-def test_steep_angles_on_the_ground_are_none_of_its_business() -> None:
+def test_steep_angles_on_the_ground_are_ignored() -> None:
     bench = Bench()
     bench.wait(0.01, replace(RESTING, roll_rad=1.5))
     assert bench.vehicle.told == []
@@ -126,14 +126,14 @@ def test_a_low_battery_lands_the_drone_and_keeps_it_there(low: VehicleFeedback) 
     bench = Bench(state=S.HOVERING)
     bench.say("REF", TAKE_OFF)
     bench.wait(0.01, low)
-    assert bench.vehicle.take_told() == [Land()]
+    assert bench.vehicle.take_commands() == [Land()]
     assert bench.state & State.BATTERY_LOW
     bench.vehicle.state = S.LANDED
     bench.say("REF", TAKE_OFF)
-    assert bench.vehicle.take_told() == []
+    assert bench.vehicle.take_commands() == []
 
 
-def test_the_voltage_that_is_low_can_be_configured_and_has_a_hysteresis() -> None:
+def test_the_low_voltage_is_configurable_with_hysteresis() -> None:
     bench = Bench()
     bench.configure("general:vbat_min", "11000")
     low = []
@@ -162,7 +162,7 @@ def test_pcmd_is_scaled_by_the_limits(values: tuple[float, ...], expected: tuple
     assert close(bench.vehicle.told[0], *expected)
 
 
-def test_configured_limits_hold_at_once() -> None:
+def test_configured_limits_apply_at_once() -> None:
     bench = Bench(state=S.HOVERING)
     for key, text in (
         ("control:euler_angle_max", "0.3"),
@@ -178,7 +178,7 @@ def test_configured_limits_hold_at_once() -> None:
     bench.configure("control:altitude_max", "100000")
     bench.configure("control:euler_angle_max", "0")
     assert bench.vehicle.limits.altitude_m == 100.0
-    assert bench.vehicle.limits.tilt_rad == 0.02, "the least that the simulated vehicle can have"
+    assert bench.vehicle.limits.tilt_rad == 0.02, "the simulated vehicle's minimum"
 
 
 def test_without_the_flag_it_hovers() -> None:
@@ -188,13 +188,13 @@ def test_without_the_flag_it_hovers() -> None:
 
 
 @pytest.mark.parametrize("state", [S.LANDED, S.TAKING_OFF, S.LANDING, S.EMERGENCY])
-def test_pcmd_is_for_flight(state: FlightState) -> None:
+def test_pcmd_needs_a_flying_drone(state: FlightState) -> None:
     bench = Bench(state=state)
     bench.say("PCMD", 1, 0.1, 0.0, 0.0, 0.0)
     assert bench.vehicle.told == []
 
 
-def test_numbers_that_are_none_are_ignored() -> None:
+def test_numbers_that_are_not_finite_are_ignored() -> None:
     bench = Bench(state=S.HOVERING)
     nan, infinite = 0x7FC00000, 0x7F800000
     bench.say("PCMD", 1, nan, 0, 0, 0)
@@ -216,9 +216,9 @@ def test_combined_yaw_turns_with_the_roll_where_it_is_configured(level: str, tur
 @pytest.mark.parametrize(
     ("heading", "yaw_deg", "expected"),
     [
-        (0.0, 90.0, (0.0, TILT)),  # both look north: ahead is ahead
-        (0.5, 90.0, (TILT, 0.0)),  # the pilot looks east, the drone north: ahead of the pilot is to its right
-        (0.0, 0.0, (-TILT, 0.0)),  # the drone looks east: north is to its left
+        (0.0, 90.0, (0.0, TILT)),  # both face north: ahead is ahead
+        (0.5, 90.0, (TILT, 0.0)),  # the pilot faces east, the drone north: the pilot's ahead is the drone's right
+        (0.0, 0.0, (-TILT, 0.0)),  # the drone faces east: north is to its left
         (1.0, 90.0, (0.0, -TILT)),
     ],
 )
@@ -254,7 +254,7 @@ def test_set_points_are_finite(
 
 
 @given(st.floats(0, 1), st.floats(0, 5000), st.floats(0, 10), st.integers(0, 200_000))
-def test_whatever_is_configured_the_vehicle_can_have(tilt: float, climb: float, yaw: float, ceiling: int) -> None:
+def test_any_configuration_gives_possible_limits(tilt: float, climb: float, yaw: float, ceiling: int) -> None:
     configuration = Configuration(2)
     for key, value in (
         ("euler_angle_max", tilt),
@@ -270,7 +270,7 @@ def test_whatever_is_configured_the_vehicle_can_have(tilt: float, climb: float, 
 
 
 @pytest.mark.parametrize(("state", "trimmed"), [(S.LANDED, True), (S.HOVERING, False), (S.EMERGENCY, False)])
-def test_the_flat_trim_is_for_the_ground(state: FlightState, trimmed: bool) -> None:
+def test_the_flat_trim_needs_a_landed_drone(state: FlightState, trimmed: bool) -> None:
     bench = Bench(state=state)
     bench.wait(0.01, replace(RESTING, roll_rad=0.02, pitch_rad=-0.01))
     bench.say("FTRIM")
@@ -285,17 +285,17 @@ def test_the_magnetometer_is_calibrated_by_a_turn_in_flight() -> None:
     bench.say("CALIB", 0)
     bench.say("PCMD", 1, 1.0, 0.0, 0.0, 0.0)
     bench.say("CALIB", 0)
-    assert bench.vehicle.take_told() == [Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S)]
+    assert bench.vehicle.take_commands() == [Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S)]
     for _ in range(50):
         bench.say("COMWDG")
         bench.wait(0.1)
-    assert bench.vehicle.take_told() == [Hover()]
+    assert bench.vehicle.take_commands() == [Hover()]
     bench.say("PCMD", 1, 1.0, 0.0, 0.0, 0.0)
     assert close(bench.vehicle.told[0], TILT, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("by_key", [False, True])
-def test_a_flip_is_noted_in_flight_and_nothing_comes_of_it(by_key: bool) -> None:
+def test_a_flip_in_flight_is_recorded_only(by_key: bool) -> None:
     bench = Bench()
     for state in (S.LANDED, S.HOVERING):
         bench.vehicle.state = state
@@ -314,22 +314,22 @@ def test_a_flip_is_noted_in_flight_and_nothing_comes_of_it(by_key: bool) -> None
 # Silence -------------------------------------------------------------------------------------------------------
 
 
-def test_a_pilot_who_falls_silent_lets_it_hover_and_then_land() -> None:
+def test_a_silent_pilot_makes_it_hover_and_then_land() -> None:
     bench = Bench(state=S.HOVERING)
     bench.say("REF", TAKE_OFF)
     bench.say("PCMD", 1, 0.0, -0.5, 0.0, 0.0)
-    bench.vehicle.take_told()
+    bench.vehicle.take_commands()
     bench.wait(0.24)
     assert bench.vehicle.told == []
     bench.wait(0.02)
-    assert bench.vehicle.take_told() == [Hover()]
+    assert bench.vehicle.take_commands() == [Hover()]
     bench.wait(1.7)
     assert bench.vehicle.told == []
     bench.wait(0.1)
-    assert bench.vehicle.take_told() == [Land()]
+    assert bench.vehicle.take_commands() == [Land()]
 
 
-def test_how_long_it_waits_before_it_lands_can_be_configured() -> None:
+def test_the_time_before_the_landing_is_configurable() -> None:
     bench = Bench(state=S.HOVERING)
     bench.configure("general:com_watchdog", "10")
     bench.wait(9.9)

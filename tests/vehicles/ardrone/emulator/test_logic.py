@@ -13,16 +13,16 @@ from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.vehicles.ardrone.emulator.rig import Bench
 
-ALIVE = 0x0F800090  # of a drone that is well: altitude control, camera ready, its threads
+ALIVE = 0x0F800090  # of a healthy drone: altitude control, camera ready, its threads
 
 
-def test_the_state_before_anything_was_heard_is_that_of_a_real_drone() -> None:
+def test_the_initial_state_is_that_of_a_real_drone() -> None:
     bench = Bench()
     bench.wait(10.0)
     assert bench.state == ALIVE | State.BOOTSTRAP | State.COMMUNICATION_WATCHDOG
 
 
-def test_the_state_of_a_drone_that_is_flown() -> None:
+def test_the_state_of_a_drone_in_flight() -> None:
     bench = Bench()
     bench.configure("general:navdata_demo", "TRUE")
     bench.say("CTRL", 5, 0)
@@ -37,7 +37,7 @@ def test_the_state_of_a_drone_that_is_flown() -> None:
 
 
 @pytest.mark.parametrize("clear", [0, 5])
-def test_a_config_is_acknowledged_until_that_is_cleared(clear: int) -> None:
+def test_the_acknowledgement_of_a_config_stays_until_cleared(clear: int) -> None:
     bench = Bench()
     assert not bench.state & State.COMMAND_ACK
     bench.configure("general:navdata_demo", "FALSE")
@@ -50,14 +50,14 @@ def test_a_config_is_acknowledged_until_that_is_cleared(clear: int) -> None:
 @pytest.mark.parametrize(
     ("key", "text"), [("general:no_such", "1"), ("leds:leds_anim", "red"), ("general:vbat_min", "x")]
 )
-def test_even_what_is_not_obeyed_is_acknowledged(key: str, text: str) -> None:
+def test_ignored_configs_are_also_acknowledged(key: str, text: str) -> None:
     bench = Bench()
     bench.configure(key, text)
     assert bench.state & State.COMMAND_ACK
 
 
 @pytest.mark.parametrize("mode", [4, 6])
-def test_the_control_port_sends_what_is_asked_for(mode: int) -> None:
+def test_the_control_port_sends_the_requested_dump(mode: int) -> None:
     bench = Bench()
     bench.say("CTRL", mode, 0)
     (text,) = bench.texts
@@ -100,7 +100,7 @@ def test_the_watchdog_bit_is_set_by_silence_and_cleared_on_demand() -> None:
     assert not bench.state & State.COMMUNICATION_WATCHDOG
 
 
-def test_a_lost_link_begins_anew_with_the_bootstrap() -> None:
+def test_a_lost_link_restarts_with_the_bootstrap() -> None:
     bench = Bench()
     bench.configure("general:navdata_demo", "TRUE")
     bench.configure("custom:session_id", "0000000a")
@@ -115,7 +115,7 @@ def test_a_lost_link_begins_anew_with_the_bootstrap() -> None:
     assert not bench.state & State.BOOTSTRAP
 
 
-def test_a_drone_that_nobody_ever_spoke_to_has_lost_nobody() -> None:
+def test_a_drone_without_any_client_reports_no_lost_link() -> None:
     bench = Bench()
     bench.wait(60.0)
     assert not bench.state & State.COMMUNICATION_LOST
@@ -124,7 +124,7 @@ def test_a_drone_that_nobody_ever_spoke_to_has_lost_nobody() -> None:
 # Commands ------------------------------------------------------------------------------------------------------
 
 
-def test_lights_are_noted() -> None:
+def test_lights_are_recorded() -> None:
     bench = Bench()
     bench.say("LED", 3, 2.5, 4)
     assert bench.logic.leds == LedAnimation(3, 2.5, 4)
@@ -132,7 +132,7 @@ def test_lights_are_noted() -> None:
     assert bench.logic.leds == LedAnimation(1, 0.5, 6)
 
 
-def test_the_configuration_says_which_video() -> None:
+def test_the_configuration_selects_the_video() -> None:
     bench = Bench()
     for key, text in (
         ("video_channel", "1"),
@@ -167,7 +167,7 @@ def test_the_old_commands_for_camera_and_detection() -> None:
         ("COMWDG", (0,)),
     ],
 )
-def test_commands_that_real_programs_send_are_taken(name: str, arguments: tuple[int, ...]) -> None:
+def test_commands_of_real_programs_are_accepted(name: str, arguments: tuple[int, ...]) -> None:
     bench = Bench()
     bench.say(name, *arguments)
     assert bench.logic.malformed == 0

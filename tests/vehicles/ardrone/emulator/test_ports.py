@@ -1,4 +1,4 @@
-"""The emulated drone's ports: slow and broken clients, datagrams with faults, the loop that serves them."""
+"""The emulated drone's ports: slow and broken clients, datagrams with faults, and the loop that serves them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def stream(loop: Loop) -> Iterator[StreamPort]:
 
 
 def done(loop: Loop) -> None:
-    """Wait until the loop has done all that was posted before."""
+    """Wait until the loop has run all earlier jobs."""
     passed = threading.Event()
     loop.post(passed.set)
     assert passed.wait(5)
@@ -47,7 +47,7 @@ def done(loop: Loop) -> None:
 # Loop ----------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_due_later_is_done_later(loop: Loop) -> None:
+def test_callbacks_run_in_the_order_of_their_times(loop: Loop) -> None:
     order: list[str] = []
     now_ns = monotonic_ns()
     loop.at(now_ns + 20_000_000, lambda: order.append("third"))
@@ -70,7 +70,7 @@ def test_an_error_does_not_end_the_loop(loop: Loop, caplog: pytest.LogCaptureFix
 # Streams -------------------------------------------------------------------------------------------------------
 
 
-def test_a_slow_client_stalls_nobody_and_goes_on_with_a_key_frame(loop: Loop, stream: StreamPort) -> None:
+def test_a_slow_client_stalls_no_other_and_continues_with_a_key_frame(loop: Loop, stream: StreamPort) -> None:
     loop.start()
     address = HERE, stream.port
     size, numbers = 20_000, itertools.count()
@@ -105,14 +105,14 @@ def read(client: socket.socket, size: int) -> bytes:
     return data
 
 
-def test_clients_may_say_what_they_like_and_go(loop: Loop, stream: StreamPort) -> None:
+def test_clients_may_send_anything_and_leave(loop: Loop, stream: StreamPort) -> None:
     loop.start()
     with socket.create_connection((HERE, stream.port), 5) as client:
         wait_until(lambda: stream.outlets, "it is connected")
         client.sendall(bytes(range(256)) * 40)
         loop.post(lambda: stream.broadcast(b"hello"))
         assert read(client, 5) == b"hello"
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # go with a reset
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # leave with a reset
     wait_until(lambda: not stream.outlets, "it is gone")
 
 
@@ -128,7 +128,7 @@ def test_too_many_clients_are_turned_away(loop: Loop, stream: StreamPort) -> Non
             client.close()
 
 
-def test_a_port_that_is_taken_is_named(loop: Loop) -> None:
+def test_a_port_in_use_is_named(loop: Loop) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind((HERE, 0))
         port = other.getsockname()[1]
@@ -140,7 +140,7 @@ def test_a_port_that_is_taken_is_named(loop: Loop) -> None:
 
 
 def echoed(faults: Faults, count: int, delay_s: float = 0.0) -> tuple[list[int], list[int]]:
-    """What a port hears of so many datagrams, and what the sender hears of its answers."""
+    """Return what a port receives of this many datagrams, and what the sender receives of the answers."""
     loop, heard = Loop("test"), list[int]()
 
     def answer(datagram: bytes, sender: Address) -> None:
@@ -166,11 +166,11 @@ def echoed(faults: Faults, count: int, delay_s: float = 0.0) -> tuple[list[int],
         port.close()
 
 
-def test_without_faults_everything_comes_as_it_was_sent() -> None:
+def test_without_faults_everything_arrives_unchanged() -> None:
     assert echoed(Faults(), 50) == (list(range(50)), list(range(50)))
 
 
-def test_faults_befall_both_ways_and_are_the_same_for_the_same_seed() -> None:
+def test_faults_affect_both_directions_and_depend_on_the_seed() -> None:
     faults = Faults(seed=3, drop=0.2, duplicate=0.2, reorder=0.2)
     heard, answers = echoed(faults, 100)
     assert echoed(faults, 100) == (heard, answers)
@@ -180,7 +180,7 @@ def test_faults_befall_both_ways_and_are_the_same_for_the_same_seed() -> None:
     assert set(answers) < set(heard)
 
 
-def test_delayed_datagrams_come_later_both_ways() -> None:
+def test_delays_apply_in_both_directions() -> None:
     loop = Loop("test")
     port = DatagramPort(
         loop, (HERE, 0), lambda data, sender: port.send(data, sender), name="test", faults=Faults(), delay_s=0.03

@@ -1,4 +1,4 @@
-"""Which AT commands are new."""
+"""Which AT commands count as new."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from skyloop.vehicles.ardrone.emulator.logic import CommandSequence
     ("numbers", "taken"),
     [
         ((1, 2, 3), (True, True, True)),
-        ((0, 1, 2), (False, True, True)),  # as node-ar-drone begins
+        ((0, 1, 2), (False, True, True)),  # as sent by node-ar-drone
         ((5, 4, 5, 6), (True, False, False, True)),
-        ((7, 8, 1, 2, 8), (True, True, True, True, True)),  # 1 begins anew
+        ((7, 8, 1, 2, 8), (True, True, True, True, True)),  # 1 restarts
         ((1, 1), (True, True)),
         ((-3, -2), (False, False)),
         ((4_294_967_295, 3), (True, False)),
@@ -33,7 +33,7 @@ def test_two_seconds_of_silence_make_old_numbers_new() -> None:
     assert not sequence.takes(50, clock())
 
 
-def test_commands_that_are_not_taken_do_not_end_the_silence() -> None:
+def test_ignored_commands_do_not_end_the_silence() -> None:
     sequence, clock = CommandSequence(), ManualClock()
     sequence.takes(100, clock())
     for number in range(10, 30):

@@ -1,4 +1,4 @@
-"""What the emulated drone tells: units, axes and signs of navdata's options."""
+"""The emulated drone's navdata: units, axes and signs of its options."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MOVING = replace(
 
 
 def told(snapshot: Snapshot, tags: list[int] = EVERY) -> Navdata:
-    """After a way over the wire."""
+    """Return the options after encoding and decoding."""
     return decode(encode(0, 1, options_of(snapshot, tags)))
 
 
@@ -83,10 +83,10 @@ def test_the_inertial_options_have_x_forward_y_right_z_down() -> None:
     assert angles is not None
     assert physical.accs == pytest.approx((100.0, -200.0, -1000.0))
     assert physical.gyros == pytest.approx((math.degrees(0.1), -math.degrees(0.2), -math.degrees(0.3)))
-    assert angles.theta > 0, "thrust to the front: the nose is up"
+    assert angles.theta > 0, "forward thrust: the nose is up"
 
 
-def test_what_else_the_simulation_knows() -> None:
+def test_other_values_from_the_simulation() -> None:
     navdata = of_moving()
     raw, altitude, pressure = navdata.get(o.RawMeasures), navdata.get(o.Altitude), navdata.get(o.KalmanPressure)
     magneto, pwm, wifi = navdata.get(o.Magneto), navdata.get(o.Pwm), navdata.get(o.Wifi)
@@ -105,7 +105,7 @@ def test_what_else_the_simulation_knows() -> None:
     assert navdata.get(o.Gps) == o.Gps()
 
 
-def test_a_flat_trim_moves_what_counts_as_level() -> None:
+def test_a_flat_trim_shifts_level() -> None:
     navdata = told(Snapshot(MOVING, FlightState.LANDED, time=0, trim_rad=(0.1, 0.2)))
     demo, trims = navdata.get(o.Demo), navdata.get(o.Trims)
     assert demo is not None
@@ -113,13 +113,13 @@ def test_a_flat_trim_moves_what_counts_as_level() -> None:
     assert trims == pytest.approx((0.0, -0.2, 0.1))
 
 
-def test_all_options_have_the_sizes_of_a_real_drones() -> None:
+def test_all_options_have_the_sizes_of_a_real_drone() -> None:
     navdata = of_moving()
     assert len(navdata.options) == 28
     assert navdata.unknown == ()
 
 
-def test_values_that_no_field_can_hold_are_cut() -> None:
+def test_values_out_of_a_fields_range_are_clamped() -> None:
     wild = replace(
         MOVING, altitude_m=-3.0, battery_v=1e9, angular_velocity_rad_s=(1e6,) * 3, acceleration_m_s2=(-1e6,) * 3
     )
@@ -142,7 +142,7 @@ def test_values_that_no_field_can_hold_are_cut() -> None:
         (~0, True, 1, list(range(20))),
     ],
 )
-def test_which_options_go_out(mask: int, demo: bool, version: int, tags: list[int]) -> None:
+def test_which_options_are_sent(mask: int, demo: bool, version: int, tags: list[int]) -> None:
     assert tags_of(mask, demo=demo, version=version) == tags
 
 
@@ -153,7 +153,7 @@ def test_the_drones_clock() -> None:
     assert clock.navdata_time(5_000_000_000 + 2049 * 10**9) == 1 << 21, "wraps after 2048 s"
 
 
-def test_listeners_have_numbers_of_their_own() -> None:
+def test_each_listener_has_its_own_sequence() -> None:
     listeners = Listeners()
     first, second = ("127.0.0.1", 1), ("127.0.0.1", 2)
     assert listeners.refresh(first)
@@ -163,7 +163,7 @@ def test_listeners_have_numbers_of_their_own() -> None:
     assert dict(listeners.next_sequences()) == {first: 2, second: 1}
 
 
-def test_a_listener_too_many_takes_the_place_of_the_one_not_heard_of_for_longest() -> None:
+def test_a_listener_too_many_replaces_the_one_with_the_oldest_request() -> None:
     listeners = Listeners()
     for port in range(MOST):
         listeners.refresh(("127.0.0.1", port))

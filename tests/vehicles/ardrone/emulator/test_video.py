@@ -1,4 +1,4 @@
-"""The emulated drone's video: what its encoders make, and the thread that they work on."""
+"""The emulated drone's video: the output of its encoders, and the thread that they run on."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def plain(level: int, width: int = 64, height: int = 36) -> Picture:
 
 
 def frames_of(count: int, settings: VideoSettings = SETTINGS, header_size: int = 68) -> list[PaveFrame]:
-    """What a client reads of so many pictures that become brighter."""
+    """Return the frames that a client reads for this many pictures, each brighter than the last."""
     packer, parser = PavePacker(DroneClock(0), header_size, lambda: (0.1, 0.2, 0.3)), PaveParser()
     frames = []
     for n in range(count):
@@ -65,13 +65,13 @@ def frames_of(count: int, settings: VideoSettings = SETTINGS, header_size: int =
 # Cameras -------------------------------------------------------------------------------------------------------
 
 
-def test_the_cameras_of_an_ar_drone_1_see_as_far_as_parrot_says() -> None:
+def test_the_cameras_of_an_ar_drone_1_have_parrots_fields_of_view() -> None:
     (pixel,) = FRONT_1.project(np.array([[np.tan(np.radians(46.0)), 0.0, 1.0]]))
     assert pixel[0] - FRONT_1.cx == pytest.approx(np.hypot(320, 240) / 2, rel=0.01)
     assert np.hypot(176, 144) / 2 / BOTTOM_1.fx == pytest.approx(np.tan(np.radians(32.0)), rel=0.01)
 
 
-def test_the_cameras_of_an_ar_drone_2_are_those_that_its_driver_knows() -> None:
+def test_the_cameras_of_an_ar_drone_2_match_the_drivers() -> None:
     known = {camera.name: camera for camera in cameras_of(parse_uri("ardrone://127.0.0.1"), 2)}
     for model in (FRONT_2, BOTTOM_2_SENT):
         assert model.intrinsics() == known[model.name].intrinsics
@@ -82,7 +82,7 @@ def test_the_cameras_of_an_ar_drone_2_are_those_that_its_driver_knows() -> None:
 # Encoding ------------------------------------------------------------------------------------------------------
 
 
-def test_key_pictures_come_as_often_as_from_the_drone() -> None:
+def test_key_pictures_are_as_frequent_as_the_drones() -> None:
     frames = frames_of(2 * GROUP + 1)
     assert [n for n, frame in enumerate(frames) if frame.is_key] == [0, GROUP, 2 * GROUP]
     assert {frame.type for frame in frames} == {FrameType.IDR, FrameType.P}
@@ -90,7 +90,7 @@ def test_key_pictures_come_as_often_as_from_the_drone() -> None:
     assert [frame.timestamp_ms for frame in frames[:4]] == [0, 33, 66, 99]
 
 
-def test_a_payload_is_as_the_drones() -> None:
+def test_a_payload_is_like_the_drones() -> None:
     key, other = frames_of(2)
     units = key.payload.split(b"\0\0\0\1")
     assert units[0] == b""
@@ -100,7 +100,7 @@ def test_a_payload_is_as_the_drones() -> None:
     assert other.payload.count(b"\0\0\0\1") == 1
 
 
-def test_other_units_are_left_out_and_start_codes_are_long() -> None:
+def test_other_units_are_dropped_and_start_codes_are_long() -> None:
     sei, sps, pps, idr = b"\6\5\1", b"\x67ab", b"\x68c", b"\x65defg"
     encoded = as_the_drone_does(b"\0\0\0\1" + sei + b"\0\0\1" + sps + b"\0\0\1" + pps + b"\0\0\1" + idr)
     assert encoded.payload == b"\0\0\0\1" + sps + b"\0\0\0\1" + pps + b"\0\0\0\1" + idr
@@ -116,7 +116,7 @@ def test_other_units_are_left_out_and_start_codes_are_long() -> None:
         (VideoCodec.MP4_360P_H264_720P, Codec.MPEG4_VISUAL, (640, 360), 0, "mpeg4"),
     ],
 )
-def test_what_is_sent_can_be_decoded(
+def test_the_stream_can_be_decoded(
     codec: VideoCodec, of: Codec, size: tuple[int, int], stream_id: int, decoder: str, header_size: int
 ) -> None:
     context = av.CodecContext.create(decoder, "r")
@@ -133,7 +133,7 @@ def test_every_value_of_the_codec_has_a_format() -> None:
     assert set(FORMATS) == {codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P}
 
 
-def test_an_encoder_of_another_bitrate_begins_with_a_key_picture() -> None:
+def test_an_encoder_with_another_bitrate_begins_with_a_key_picture() -> None:
     packer = PavePacker(DroneClock(0), 64, lambda: (0.0, 0.0, 0.0))
     pieces = [
         packer.pack(plain(50), replace(SETTINGS, bitrate_kbps=kbps), 0) for kbps in (1000, 1000, 2000, 2000, 1000)
@@ -141,7 +141,7 @@ def test_an_encoder_of_another_bitrate_begins_with_a_key_picture() -> None:
     assert [piece is not None and piece.starts for piece in pieces] == [True, False, True, False, True]
 
 
-def test_without_pyav_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyav_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"skyloop install video"):
         require_encoder()
@@ -179,7 +179,7 @@ def test_a_picture_in_the_corner_of_another() -> None:
 
 @dataclass
 class Gate:
-    """A packer that waits in each picture until it is let go on."""
+    """A packer that blocks in each picture until released."""
 
     entered: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     open: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
@@ -193,7 +193,7 @@ class Gate:
         return Piece(bytes([level, picture[0, 0, 0]]), starts=True)
 
 
-def test_a_newer_picture_overtakes_one_that_waits() -> None:
+def test_a_newer_picture_replaces_a_waiting_one() -> None:
     gate, sent = Gate(), list[bytes]()
     encoding = VideoEncoding(gate, lambda: SETTINGS, lambda piece: sent.append(piece.data))
     encoding.start()
@@ -211,7 +211,7 @@ def test_a_newer_picture_overtakes_one_that_waits() -> None:
         encoding.stop()
 
 
-def test_a_picture_that_can_not_be_encoded_is_not_the_last(caplog: pytest.LogCaptureFixture) -> None:
+def test_encoding_continues_after_a_picture_that_cannot_be_encoded(caplog: pytest.LogCaptureFixture) -> None:
     gate, sent = Gate(), list[bytes]()
     gate.open.release(9)
     encoding = VideoEncoding(gate, lambda: SETTINGS, lambda piece: sent.append(piece.data))
@@ -235,14 +235,14 @@ def test_a_picture_that_can_not_be_encoded_is_not_the_last(caplog: pytest.LogCap
         (VideoChannel.BOTTOM_WITH_FRONT, {"front", "bottom"}, [b"\x14\x0a"]),
     ],
 )
-def test_the_channel_says_which_camera_is_seen(channel: VideoChannel, wanted: set[str], sent: list[bytes]) -> None:
+def test_the_channel_selects_the_camera(channel: VideoChannel, wanted: set[str], sent: list[bytes]) -> None:
     gate, pieces = Gate(), list[bytes]()
     gate.open.release(9)
     settings = replace(SETTINGS, channel=channel)
     encoding = VideoEncoding(gate, lambda: settings, lambda piece: pieces.append(piece.data))
     assert {camera for camera in ("front", "bottom") if encoding.wants(camera)} == wanted
     pictures = {"front": plain(10, 160, 120), "bottom": plain(20, 160, 120)}
-    for camera in ("bottom", "front") if channel in (0, 2) else ("front", "bottom"):  # what is seen large comes last
+    for camera in ("bottom", "front") if channel in (0, 2) else ("front", "bottom"):  # the large picture comes last
         encoding.show(camera, pictures[camera], 0)
     encoding.start()
     try:

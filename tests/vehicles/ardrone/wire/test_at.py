@@ -1,4 +1,4 @@
-"""AT commands: what is written can be read, and what others write as well."""
+"""AT commands: our own can be read back, and those of other programs can be read."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_floats_as_bits(value: float, bits: int) -> None:
 
 
 @given(FLOATS)
-def test_any_float_comes_back(value: float) -> None:
+def test_any_float_survives_a_round_trip(value: float) -> None:
     assert to_float(to_bits(value)) == value
 
 
@@ -97,11 +97,11 @@ def test_anything_can_be_parsed(datagram: bytes) -> None:
         b'AT*CONFIG=1,"' + b"a" * MAX_LINE + b'"\r',
     ],
 )
-def test_malformed_lines_are_counted_and_the_others_taken(line: bytes) -> None:
+def test_malformed_lines_are_counted_and_the_others_accepted(line: bytes) -> None:
     assert parse_commands(line + b"AT*COMWDG=2\r") == ([AtCommand("COMWDG", 2, ())], 1)
 
 
-def test_a_zero_byte_at_the_end_is_no_part_of_the_command() -> None:
+def test_a_zero_byte_at_the_end_is_not_part_of_the_command() -> None:
     assert parse_commands(b"AT*COMWDG=2\r\0") == ([AtCommand("COMWDG", 2, ())], 0)
 
 
@@ -115,6 +115,6 @@ def test_a_zero_byte_at_the_end_is_no_part_of_the_command() -> None:
         (("a" * MAX_LINE,), "at most 1024"),
     ],
 )
-def test_what_cannot_be_sent(arguments: tuple[float | str, ...], says: str) -> None:
+def test_arguments_that_cannot_be_sent(arguments: tuple[float | str, ...], says: str) -> None:
     with pytest.raises(UsageError, match=says):
         format_command("CONFIG", 1, *arguments)

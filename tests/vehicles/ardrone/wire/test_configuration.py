@@ -1,4 +1,4 @@
-"""Values and dumps of the configuration: as written, as read, as recorded in the facts of real drones."""
+"""Values and dumps of the configuration: written, read, and compared with those of real drones."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ def test_values_as_the_drone_writes_them(value: Value, text: str) -> None:
 
 
 @given(st.booleans() | st.integers(-(2**31), 2**31 - 1))
-def test_whole_values_come_back(value: Value) -> None:
+def test_whole_values_survive_a_round_trip(value: Value) -> None:
     assert parse_value(format_value(value), value) == value
 
 
 @given(FLOATS)
-def test_floats_come_back_to_seven_digits(value: float) -> None:
+def test_floats_keep_seven_digits(value: float) -> None:
     back = parse_value(format_value(value), 0.0)
     assert isinstance(back, float)
     assert math.isclose(back, value, rel_tol=1e-6, abs_tol=1e-44)
 
 
 @given(st.lists(FLOATS, min_size=1, max_size=9))
-def test_vectors_come_back(values: list[float]) -> None:
+def test_vectors_survive_a_round_trip(values: list[float]) -> None:
     back = parse_value(format_value(tuple(values)), (0.0,))
     assert isinstance(back, tuple)
     assert back == pytest.approx(values, rel=1e-6, abs=1e-44)
@@ -66,12 +66,12 @@ def test_other_ways_to_write_them(text: str, like: Value) -> None:
     ("text", "like"),
     [("maybe", True), ("1.5", 0), ("", 0), ("nan", 0.0), ("inf", 0.0), ("{ 1.0 x }", (0.0,)), ("{ nan }", (0.0,))],
 )
-def test_texts_that_are_no_such_value(text: str, like: Value) -> None:
+def test_texts_of_another_type(text: str, like: Value) -> None:
     with pytest.raises(DecodeError, match="is no"):
         parse_value(text, like)
 
 
-def test_a_dump_comes_back() -> None:
+def test_a_dump_survives_a_round_trip() -> None:
     values = {name: key.default for name, key in KEYS.items()}
     dump = format_dump(values)
     assert dump.endswith(END_OF_DUMP)

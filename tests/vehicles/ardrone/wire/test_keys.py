@@ -1,4 +1,4 @@
-"""The table of keys is consistent in itself, and has what the drivers and the emulated drones rely on."""
+"""The table of keys is consistent, and has the keys that drivers and emulated drones rely on."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ BOOTSTRAPS = [
     for line in content("ardrone2/navdata-bootstrap-hex.txt").decode().splitlines()
     if line and not line.startswith("#")
 ]
-#: Sizes with tag and size as ``navdata_common.h`` has them, by tag.
+#: Sizes including tag and size, as in ``navdata_common.h``, by tag.
 SIZES = {
     **{0: 148, 1: 8, 2: 52, 3: 46, 4: 16, 5: 12, 6: 88, 7: 16, 8: 24, 9: 76, 10: 56, 11: 16, 12: 44, 13: 92},
     **{14: 108, 15: 364, 16: 328, 17: 8, 18: 40, 19: 65, 20: 12, 21: 18, 22: 75, 23: 56, 24: 72, 25: 32, 26: 8},
@@ -100,7 +100,7 @@ def test_the_two_options_of_tag_27() -> None:
 
 
 @pytest.mark.parametrize("kind", LAYOUTS, ids=lambda kind: kind.__name__)
-def test_an_option_comes_back(kind: type[Any]) -> None:
+def test_an_option_survives_a_round_trip(kind: type[Any]) -> None:
     layout = LAYOUTS[kind]
     bytes_of_zeros = bytes(layout.size)
     option = layout.unpack(bytes_of_zeros, 0)
@@ -110,7 +110,7 @@ def test_an_option_comes_back(kind: type[Any]) -> None:
 
 
 @given(st.data())
-def test_any_content_of_an_option_comes_back_as_it_was(data: st.DataObject) -> None:
+def test_any_content_of_an_option_survives_a_round_trip(data: st.DataObject) -> None:
     kind = data.draw(st.sampled_from(list(LAYOUTS)))
     layout = LAYOUTS[kind]
     content = data.draw(st.binary(min_size=layout.size, max_size=layout.size))
@@ -121,11 +121,11 @@ def test_any_content_of_an_option_comes_back_as_it_was(data: st.DataObject) -> N
         assert layout.pack(option) == content
 
 
-def test_options_not_known_are_listed() -> None:
+def test_unknown_options_are_listed() -> None:
     body = header() + struct.pack("<HHI", 1, 8, 5) + struct.pack("<HH3s", 99, 7, b"abc") + struct.pack("<HHI", 0, 8, 1)
     navdata = decode(with_checksum(body))
     assert navdata.get(Time) == Time(5)
-    assert navdata.unknown == ((99, 7), (0, 8)), "a known tag with another size is not known either"
+    assert navdata.unknown == ((99, 7), (0, 8)), "a known tag with another size is also unknown"
 
 
 def test_an_option_by_hand() -> None:
@@ -149,7 +149,7 @@ def test_an_option_by_hand() -> None:
         (with_checksum(header())[:-1] + b"\xff", "damaged"),
     ],
 )
-def test_what_is_no_navdata(datagram: bytes, says: str) -> None:
+def test_other_bytes_are_refused(datagram: bytes, says: str) -> None:
     with pytest.raises(DecodeError, match=says):
         decode(datagram)
 
@@ -165,7 +165,7 @@ def test_anything_is_decoded_or_refused(tail: bytes) -> None:
 
 @needs_recordings
 @given(st.integers(0, len(RECORDED) - 1), st.integers(0, 7))
-def test_one_flipped_bit_is_always_found(at: int, bit: int) -> None:
+def test_one_flipped_bit_is_always_detected(at: int, bit: int) -> None:
     damaged = bytearray(RECORDED)
     damaged[at] ^= 1 << bit
     with pytest.raises(DecodeError):
@@ -174,11 +174,11 @@ def test_one_flipped_bit_is_always_found(at: int, bit: int) -> None:
 
 @needs_recordings
 @given(st.integers(0, len(RECORDED) - 1))
-def test_a_cut_datagram_is_always_found(length: int) -> None:
+def test_a_truncated_datagram_is_always_detected(length: int) -> None:
     with pytest.raises(DecodeError):
         decode(RECORDED[:length])
 
 
-def test_a_tag_seen() -> None:
+def test_a_detected_tag() -> None:
     seen = VisionDetect(detected=1, kinds=(10, 0, 0, 0), xc=(500, 0, 0, 0), yc=(250, 0, 0, 0), distance=(150, 0, 0, 0))
     assert decode(encode(0, 3, [Demo(), seen])).get(VisionDetect) == seen

@@ -62,7 +62,7 @@ def test_a_torn_start_is_skipped_and_counted() -> None:
 
 
 @pytest.mark.parametrize("step", [1 << 20, 1448])
-def test_garbage_after_a_frame_costs_this_frame_as_it_may_have_grown_within(step: int) -> None:
+def test_garbage_after_a_frame_costs_that_frame_as_it_may_have_been_inserted_within(step: int) -> None:
     cut = 68 + len(WHOLE[0].payload)
     frames, parser = parse(START[:cut] + b"rubbish PaVE and more rubbish" * 9 + START[cut:], step)
     assert [frame.payload for frame in frames] == [frame.payload for frame in WHOLE[1:]]
@@ -71,7 +71,7 @@ def test_garbage_after_a_frame_costs_this_frame_as_it_may_have_grown_within(step
     assert parser.broken_frames >= 1
 
 
-def test_what_a_frame_lacks_or_has_too_much_of_is_found_by_what_follows() -> None:
+def test_missing_and_extra_bytes_are_detected_by_the_next_frame() -> None:
     cut = 68 + len(WHOLE[0].payload)
     for data in (START[: cut - 2000] + START[cut + 3000 :], START[: cut - 2000] + b"more" + START[cut - 2000 :]):
         frames, parser = parse(data, 1 << 20)
@@ -88,7 +88,7 @@ def test_a_length_that_is_too_long_costs_one_frame_only() -> None:
     assert parser.broken_frames >= 1
 
 
-def test_a_length_beyond_reason_is_no_header() -> None:
+def test_a_header_with_an_absurd_length_is_ignored() -> None:
     data = bytearray(START)
     struct.pack_into("<I", data, 8, DEFAULT_MAX_PAYLOAD + 1)
     frames, parser = parse(bytes(data))
@@ -101,7 +101,7 @@ def test_an_advertisement_carries_nothing() -> None:
     advertisement[31] = 1
     frames, parser = parse(bytes(advertisement) + START)
     assert [frame.payload for frame in frames] == [frame.payload for frame in WHOLE]
-    assert parser.broken_frames <= 1  # the last one of the cut
+    assert parser.broken_frames <= 1  # the last one of the excerpt
 
 
 @settings(max_examples=150, deadline=None)
@@ -120,12 +120,12 @@ def test_anything_is_survived_in_bounded_memory(pieces: list[bytes]) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32), st.integers(1, 40), st.integers(1, 70_000))
-def test_flipped_bits_never_raise_and_cost_only_what_they_hit(seed: int, flips: int, step: int) -> None:
+def test_flipped_bits_never_raise_and_cost_only_the_frames_they_hit(seed: int, flips: int, step: int) -> None:
     data = bytearray(START)
     chance = random.Random(seed)
     for _ in range(flips):
         data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
     frames, _ = parse(bytes(data), max(step, 500))
     untouched = {frame.payload for frame in WHOLE} & {frame.payload for frame in frames}
-    # A flip hits one frame; a frame whose signature was hit takes at worst the neighbour's tail with it.
+    # A flip hits one frame; one in a frame's signature takes at worst the neighbour's end with it.
     assert len(untouched) >= len(WHOLE) - 2 * flips

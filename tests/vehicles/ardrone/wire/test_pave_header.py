@@ -1,4 +1,4 @@
-"""Headers of PaVE frames, written and compared with those of real drones."""
+"""Headers of PaVE frames, built and compared with those of real drones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveParser, bui
 from tests.support.recordings import recorded
 
 
-def test_the_first_header_of_a_real_drone_of_today() -> None:
+def test_the_first_header_of_a_real_drone_with_recent_firmware() -> None:
     real = recorded("ardrone2/video-8s.pave").read_bytes()[:68]
     header = build_header(
         payload_size=10253,
@@ -29,7 +29,7 @@ def test_the_first_header_of_a_real_drone_of_today() -> None:
     assert len(header) == 68
 
 
-def test_the_first_header_of_a_real_drone_of_early_days() -> None:
+def test_the_first_header_of_a_real_drone_with_early_firmware() -> None:
     real = recorded("ardrone2/video-64-byte-headers.pave").read_bytes()[:64]
     header = build_header(
         payload_size=2632,
@@ -57,7 +57,7 @@ def test_the_first_header_of_a_real_drone_of_early_days() -> None:
     position=st.integers(0, 1 << 63),
     header_size=st.sampled_from([64, 68]),
 )
-def test_what_is_built_is_parsed(
+def test_built_headers_are_parsed(
     payload: bytes,
     type: FrameType,
     codec: Codec,
@@ -86,7 +86,7 @@ def test_what_is_built_is_parsed(
     parser = PaveParser()
     frames = parser.feed(header + payload)
     parser.end()
-    if b"PaVE" in payload:  # may be taken for the next frame
+    if b"PaVE" in payload:  # may look like the next frame
         return
     (frame,) = frames
     assert (frame.codec, frame.type, frame.width, frame.height) == (codec, type, width, height)

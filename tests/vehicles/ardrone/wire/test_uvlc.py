@@ -1,4 +1,4 @@
-"""Pictures of UVLC written bit by bit, each with one thing that the format has."""
+"""UVLC pictures written bit by bit, each with one feature of the format."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.vehicles.ardrone.wire.uvlc_bits import (
     with_first,
 )
 
-# What the README of djtrance/ardrone1_video_decoder shows of a real drone's datagram, in the order of the stream.
+# A real drone's datagram in the README of djtrance/ardrone1_video_decoder, in the order of the stream.
 REAL_START = bytes.fromhex("00008243 e000033c 6bf2dda9")
 
 
@@ -38,14 +38,14 @@ def decode(bits: str) -> UvlcPicture:
 
 
 def luma(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Of a picture without colour, where all channels are the same."""
+    """Return the luma of a picture without colour, where all channels are equal."""
     assert (pixels[..., 0] == pixels[..., 2]).all()
     assert (pixels[..., 0] == pixels[..., 1]).all()
     return pixels[..., 0]
 
 
 def zigzag() -> list[tuple[int, int]]:
-    """(row, column) in the order of the stream, walked diagonal by diagonal."""
+    """Return (row, column) in the order of the stream, walked diagonal by diagonal."""
     cells = []
     for diagonal in range(15):
         rows = range(max(0, diagonal - 7), min(7, diagonal) + 1)
@@ -54,7 +54,7 @@ def zigzag() -> list[tuple[int, int]]:
 
 
 def block_of(coefficients: dict[int, int], quality: int = 2, mean: int = GREY) -> NDArray[np.uint8]:
-    """The samples of a block of levels by their place in the stream: the definition of the inverse cosine transform."""
+    """Return the samples of a block from its levels by index, by the definition of the inverse cosine transform."""
     samples = np.zeros((8, 8))
     for place, value in {0: mean, **coefficients}.items():
         i, j = zigzag()[place]
@@ -68,7 +68,7 @@ def block_of(coefficients: dict[int, int], quality: int = 2, mean: int = GREY) -
 
 
 def first_block(pairs: str, quality: int = 2, mean: int = GREY) -> NDArray[np.uint8]:
-    """The samples of the first block of a picture that has these pairs in it."""
+    """Return the samples of the first block of a picture that contains these pairs."""
     quant = 31 if quality == 2 else quality
     means = [mean] + [round(1024 / (1 + quality))] * 5
     groups = [[macroblock(means, {0: pairs}), *[grey(quant)] * 4], *[[PLAIN] * 5] * 3]
@@ -83,7 +83,7 @@ def test_the_header_is_the_one_of_a_real_drone() -> None:
     bits = "".join(f"{byte:08b}" for byte in REAL_START)
     start = header(form=2, resolution=2, quant=31, number=6627)
     assert bits.startswith(start)
-    # What follows: a coded macroblock whose blocks all have more than their mean, and no quantiser change.
+    # The rest: a coded macroblock whose blocks all have more than their mean, and no quantiser change.
     assert bits[len(start) :].startswith("0" + "10111111")
     decoded = decode(large_picture(2, 2, start=start))
     assert (decoded.width, decoded.height, decoded.number) == (320, 240, 6627)
@@ -110,7 +110,7 @@ def large_picture(form: int, resolution: int, start: str) -> str:
         (2, 3, (640, 480)),
     ],
 )
-def test_every_size_that_groups_can_be_numbered_for(form: int, resolution: int, size: tuple[int, int]) -> None:
+def test_every_size_whose_groups_can_be_numbered(form: int, resolution: int, size: tuple[int, int]) -> None:
     decoded = decode(large_picture(form, resolution, header(form=form, resolution=resolution)))
     assert (decoded.width, decoded.height) == size
     assert decoded.pixels.shape == (size[1], size[0], 3)
@@ -138,32 +138,32 @@ def test_the_number_has_32_bits() -> None:
     assert decode(picture(start=header(number=0xFFFFFFFF))).number == 0xFFFFFFFF
 
 
-def test_the_words_of_memory_may_come_in_any_bytes_like_thing() -> None:
+def test_any_bytes_like_object_is_accepted() -> None:
     data = packet(picture())
     for given in (data, bytearray(data), memoryview(data)):
         assert (UvlcDecoder().decode(given).pixels == 128).all()
 
 
-def test_groups_may_start_at_whole_words_too() -> None:
+def test_groups_may_also_start_at_whole_words() -> None:
     assert (decode(picture(size=32)).pixels == 128).all()
 
 
-def test_groups_come_in_order() -> None:
+def test_groups_must_be_in_order() -> None:
     second = aligned(header() + PLAIN * 5) + group(2) + PLAIN * 5
-    with pytest.raises(DecodeError, match=r"0x0*21, and does with 0x0*22"):
+    with pytest.raises(DecodeError, match=r"0x0*21, got 0x0*22"):
         decode(aligned(second) + END)
 
 
-def test_what_fills_up_to_a_group_must_be_zeros() -> None:
+def test_padding_before_a_group_must_be_zeros() -> None:
     start = header() + PLAIN * 5
     rest = picture()[len(aligned(start)) :]
     assert len(start) % 8
     assert (decode(aligned(start) + rest).pixels == 128).all()
-    with pytest.raises(DecodeError, match="should go on with start code"):
+    with pytest.raises(DecodeError, match="expected start code"):
         decode(start + "1" * (-len(start) % 8) + rest)
 
 
-def test_a_group_has_a_quantiser_of_its_own() -> None:
+def test_each_group_has_its_own_quantiser() -> None:
     steps = {31: 3, 1: 2, 5: 6, 30: 31}
     groups = [[macroblock([60] * 4 + [round(1024 / step)] * 2)] * 5 for step in steps.values()]
     pixels = decode(picture(groups, quants=tuple(steps))).pixels.reshape(4, 16, 80, 3)
@@ -215,7 +215,7 @@ def test_chroma_belongs_to_two_by_two_pixels() -> None:
 
 def test_a_macroblock_that_is_not_coded_is_all_zero() -> None:
     decoded = decode(picture([[NOT_CODED, *[PLAIN] * 4], *[[PLAIN] * 5] * 3]))
-    assert (decoded.pixels[:16, :16] == (0, 136, 0)).all()  # no light, and the least chroma: what zeros stand for
+    assert (decoded.pixels[:16, :16] == (0, 136, 0)).all()  # zeros mean no light and the least chroma
     assert (decoded.pixels[:, 16:] == 128).all()
 
 
@@ -224,7 +224,7 @@ def test_a_description_has_its_last_bit_set() -> None:
         decode(with_first("0" + "00111111" + PLAIN))
 
 
-def test_the_message_says_where() -> None:
+def test_the_message_names_the_place() -> None:
     with pytest.raises(DecodeError, match="macroblock 3 of group 2: its description"):
         decode(picture([[PLAIN] * 5] * 2 + [[PLAIN] * 3 + ["0" * 9, PLAIN], [PLAIN] * 5]))
 
@@ -245,7 +245,7 @@ def test_a_quantiser_change_counts_to_the_end_of_its_group(change: str, differen
     assert np.abs(pixels[16:].astype(int) - shade(4)).max() <= 1
 
 
-def test_a_quantiser_change_of_the_fixed_table_is_read_and_does_nothing() -> None:
+def test_a_quantiser_change_of_the_fixed_table_is_read_and_ignored() -> None:
     assert (decode(with_first(macroblock([GREY] * 6, dquant="01"))).pixels == 128).all()
 
 
@@ -263,7 +263,7 @@ def test_a_quantiser_stays_in_its_range(quant: int, change: str) -> None:
 
 
 def test_the_worked_example_of_the_developer_guide() -> None:
-    # −26 (the mean, unsigned in real pictures), −3, 0, 0, 0, 0, 7, −5: what the guide prints for all after the mean.
+    # −26 (the mean, unsigned in real pictures), −3, 0, 0, 0, 0, 7, −5: the guide's bits for everything after the mean.
     bits = "1" + "00111" + "000100" + "0001110" + "1" + "0001011"
     assert bits == run(0) + level(-3) + run(4) + level(7) + run(0) + level(-5)
     assert (first_block(bits) == block_of({1: -3, 6: 7, 7: -5})).all()
@@ -280,7 +280,7 @@ def test_each_level(value: int) -> None:
 
 
 @pytest.mark.parametrize(("zeros", "value"), [(0, 180), (15, -33), (31, 20), (40, -16), (62, 33), (62, -20)])
-def test_pairs_longer_than_one_look_between_short_ones(zeros: int, value: int) -> None:
+def test_pairs_longer_than_a_window_between_short_ones(zeros: int, value: int) -> None:
     long = run(zeros) + level(value)
     assert len(long) >= 16
     if zeros:
@@ -297,7 +297,7 @@ def test_a_block_may_have_all_its_coefficients() -> None:
     assert np.abs(first_block(bits).astype(int) - block_of(values)).max() <= 1
 
 
-def test_a_block_said_to_have_coefficients_may_have_none() -> None:
+def test_a_block_marked_as_having_coefficients_may_have_none() -> None:
     assert (first_block("") == 128).all()
 
 
@@ -314,21 +314,21 @@ def test_steps_grow_with_the_quantiser_and_the_frequency(quality: int) -> None:
     [
         (run(62) + level(1) + run(0) + level(1), "a coefficient 64; 63 is the last"),
         (run(40) + level(1) + run(40) + level(1), "a coefficient 82"),
-        (run(64) + level(1), "7 zeros begin no code of a run"),
-        ("0" * 16, "zeros begin no code of a run"),
-        (run(3) + "01", "1 zeros begin no code of a level after a run of 3"),
-        (run(0) + "0" * 12 + "1" * 13, "12 zeros begin no code of a level"),
-        (run(0) + level(206), "greater than any picture has"),
-        (run(13) + level(-115), "greater than any picture has"),
+        (run(64) + level(1), "7 zeros do not begin a code of a run"),
+        ("0" * 16, "zeros do not begin a code of a run"),
+        (run(3) + "01", "1 zeros do not begin a code of a level after a run of 3"),
+        (run(0) + "0" * 12 + "1" * 13, "12 zeros do not begin a code of a level"),
+        (run(0) + level(206), "greater than in any picture"),
+        (run(13) + level(-115), "greater than in any picture"),
     ],
 )
-def test_coefficients_that_no_picture_has(pairs: str, match: str) -> None:
+def test_impossible_coefficients(pairs: str, match: str) -> None:
     with pytest.raises(DecodeError, match=match):
         first_block(pairs)
 
 
-def test_a_mean_that_no_picture_has() -> None:
-    with pytest.raises(DecodeError, match="greater than any picture has"):
+def test_an_impossible_mean() -> None:
+    with pytest.raises(DecodeError, match="greater than in any picture"):
         decode(with_first(macroblock([GREY] * 5 + [685])))
 
 
@@ -345,17 +345,17 @@ def test_zeros_may_fill_the_last_word() -> None:
 
 def test_a_picture_ends_after_its_last_group() -> None:
     bits = picture()[: -len(END)]
-    with pytest.raises(DecodeError, match=r"go on with start code 0x0*3f"):
+    with pytest.raises(DecodeError, match=r"expected start code 0x0*3f"):
         decode(bits)
-    with pytest.raises(DecodeError, match=r"0x0*3f, and does with 0x0*24"):
+    with pytest.raises(DecodeError, match=r"0x0*3f, got 0x0*24"):
         decode(bits + group(4) + PLAIN * 5 + END)
     with pytest.raises(DecodeError, match="macroblock 4 of group 0"):
         decode(aligned(header() + PLAIN * 4) + END)
 
 
 @pytest.mark.parametrize("size", [0, 1, 3, 5, 191])
-def test_a_packet_is_of_whole_words(size: int) -> None:
-    with pytest.raises(DecodeError, match=f"{size} bytes are no whole words"):
+def test_a_packet_consists_of_whole_words(size: int) -> None:
+    with pytest.raises(DecodeError, match=f"{size} bytes are not whole words"):
         UvlcDecoder().decode(packet(picture())[:size])
 
 
@@ -391,16 +391,16 @@ def test_anything_else_is_refused() -> None:
 
 
 def changes(number: int, form: int = 1, resolution: int = 1) -> str:
-    """A P picture that codes its first macroblock, black."""
+    """Return a P picture that codes its first macroblock, in black."""
     start = header(kind=1, number=number, form=form, resolution=resolution)
     return picture([[macroblock([0] * 4 + [GREY] * 2), *[NOT_CODED] * 4], *[[NOT_CODED] * 5] * 3], start=start)
 
 
-def test_what_a_p_picture_does_not_code_stays() -> None:
+def test_uncoded_macroblocks_of_a_p_picture_stay() -> None:
     decoder = UvlcDecoder()
     before = decoder.decode(packet(with_first(macroblock([100, 200, 300, 400, GREY, GREY]))))
     kept = before.pixels.copy()
-    before.pixels[:] = 7  # the user's own by now
+    before.pixels[:] = 7  # owned by the user by now
     after = decoder.decode(packet(changes(6)))
     assert (after.type, after.number) == (PictureType.INTER, 6)
     assert (after.pixels[:16, :16] == 0).all()
@@ -410,14 +410,14 @@ def test_what_a_p_picture_does_not_code_stays() -> None:
     assert (again.pixels == after.pixels).all()
 
 
-def test_a_p_picture_follows_the_last_number_round() -> None:
+def test_a_p_picture_may_follow_the_highest_number() -> None:
     decoder = UvlcDecoder()
     decoder.decode(packet(picture(start=header(number=0xFFFFFFFF))))
     assert decoder.decode(packet(changes(0))).number == 0
 
 
 @pytest.mark.parametrize("number", [4, 5, 7, 0x80000005])
-def test_a_p_picture_needs_the_one_before(number: int) -> None:
+def test_a_p_picture_needs_its_predecessor(number: int) -> None:
     decoder = UvlcDecoder()
     decoder.decode(packet(picture()))
     with pytest.raises(DecodeError, match="but 5 was the last"):
@@ -425,12 +425,12 @@ def test_a_p_picture_needs_the_one_before(number: int) -> None:
     assert decoder.decode(packet(changes(6))).number == 6
 
 
-def test_a_p_picture_is_none_to_start_with() -> None:
-    with pytest.raises(DecodeError, match="changes one that never came"):
+def test_a_stream_cannot_start_with_a_p_picture() -> None:
+    with pytest.raises(DecodeError, match="changes a picture that never arrived"):
         decode(changes(6))
 
 
-def test_a_p_picture_has_the_size_of_the_one_before() -> None:
+def test_a_p_picture_has_the_size_of_its_predecessor() -> None:
     decoder = UvlcDecoder()
     decoder.decode(packet(large_picture(2, 1, header(form=2, resolution=1))))
     with pytest.raises(DecodeError, match="of 80x64 changes one of 160x112"):

@@ -1,4 +1,4 @@
-"""Damaged packets: one kind of error, no hang, and no picture where the format lets it be seen."""
+"""Damaged packets: only one kind of error, no hang, and no picture from damage that the format reveals."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ packets = st.sampled_from(SHOWN)
 
 
 def outcome(data: bytes) -> UvlcPicture | None:
-    """The picture, or None; anything but a DecodeError goes up."""
+    """Return the picture or None; errors other than DecodeError propagate."""
     with contextlib.suppress(DecodeError):
         decoded = UvlcDecoder().decode(data)
         assert decoded.pixels.shape == (decoded.height, decoded.width, 3)
@@ -76,9 +76,9 @@ def test_the_longest_packets_end_soon() -> None:
         assert outcome(start + rest[: len(rest) // 4 * 4]) is None
 
 
-def test_two_in_five_single_flips_are_seen() -> None:
-    # The others hit a mean, a sign or the last bits of a run or level, and make as good a picture as any: there is
-    # no checksum but UDP's.
+def test_two_in_five_single_flips_are_detected() -> None:
+    # The others hit a mean, a sign or the last bits of a run or level, and make an equally valid picture: the only
+    # checksum is UDP's.
     data = SHOWN[2]
     seen = 0
     flips = np.random.default_rng(5).choice(8 * len(data), 400, replace=False)
@@ -89,7 +89,7 @@ def test_two_in_five_single_flips_are_seen() -> None:
     assert seen > 0.4 * len(flips)
 
 
-def test_a_decoder_goes_on_after_damage() -> None:
+def test_a_decoder_continues_after_damage() -> None:
     decoder = UvlcDecoder()
     for data in SHOWN:
         with pytest.raises(DecodeError):

@@ -1,4 +1,4 @@
-"""Pictures through the emulated drone's encoder and the decoder, which share nothing but the format's tables."""
+"""Pictures through the emulated drone's encoder and the decoder, which share only the format's tables."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_every_size(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize(
     ("quant", "at_least_db"), [(1, 39.0), (2, 37.5), (31, 37.5), (8, 31.0), (16, 28.0), (30, 26.0)]
 )
-def test_what_each_quantiser_leaves_of_a_picture(quant: int, at_least_db: float) -> None:
+def test_the_quality_of_each_quantiser(quant: int, at_least_db: float) -> None:
     shown = scenery()
     decoded = through(shown, quant=quant)
     assert decoded.quant == quant
@@ -80,13 +80,13 @@ def test_the_mean_of_any_block_is_within_half_a_step(number: int, seed: int, qua
     assert np.abs(off).max() < (1 + quality) / 8 / 2 + 1.0  # and the rounding of samples and of chroma
 
 
-def test_a_plain_picture_is_what_the_format_says_bit_by_bit() -> None:
+def test_a_plain_picture_matches_the_format_bit_by_bit() -> None:
     plain = np.full((72, 88, 3), 128, np.uint8)
     assert encode(plain, 5) == packet(picture())  # by hand
 
 
-def test_coefficients_are_what_the_format_says_bit_by_bit() -> None:
-    # The first cosine across a block; level 20 of step 5, and a little more than that so that it isn't cut to 19.
+def test_coefficients_match_the_format_bit_by_bit() -> None:
+    # The first cosine across a block; level 20 of step 5, and slightly more so that truncation does not give 19.
     x = np.arange(8)
     shown = np.full((72, 88, 3), 128.0)
     shown[:8, :8] += (102 * np.sqrt(0.5) / 4 * np.cos((2 * x + 1) * np.pi / 16))[:, None]
@@ -128,6 +128,6 @@ def test_a_picture_too_busy_for_the_coarsest_is_refused() -> None:
         (np.zeros((240, 320, 3), np.uint8), 1, 32, "1 to 31, not 32"),
     ],
 )
-def test_what_cannot_be_encoded(shown: Picture, number: int, quant: int, match: str) -> None:
+def test_invalid_arguments(shown: Picture, number: int, quant: int, match: str) -> None:
     with pytest.raises(UsageError, match=match):
         encode(shown, number, quant=quant)

@@ -1,4 +1,4 @@
-"""Writes UVLC by hand, bit by bit and from the format's description: knows nothing of Skyloop's encoder."""
+"""Write UVLC by hand, bit by bit, from the format's description and independent of Skyloop's encoder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def group(number: int, quant: int = 31) -> str:
 
 
 def macroblock(means: list[int], pairs: dict[int, str] | None = None, dquant: str = "") -> str:
-    """A coded one: the 6 means, and the codes of the blocks that have pairs, without their end."""
+    """Return a coded macroblock: the 6 means, and the codes of the blocks with pairs, without their end."""
     pairs = pairs or {}
     described = 0x80 | (0x40 if dquant else 0) | sum(1 << block for block in pairs)
     bits = f"0{described:08b}{dquant}"
@@ -47,7 +47,7 @@ def macroblock(means: list[int], pairs: dict[int, str] | None = None, dquant: st
 
 
 def grey(quant: int) -> str:
-    """A macroblock as near to grey as the quantiser allows."""
+    """Return a macroblock as close to grey as the quantiser allows."""
     return macroblock([round(1024 / (1 + quant)) if quant < 31 else GREY] * 6)
 
 
@@ -66,7 +66,7 @@ def picture(
     quants: tuple[int, ...] = (31, 31, 31, 31),
     size: int = 8,
 ) -> str:
-    """The bits of a picture of 88x72, of which 4 groups of 5 macroblocks are coded; plain grey if not said."""
+    """Return the bits of a picture of 88x72, which has 4 coded groups of 5 macroblocks; plain grey by default."""
     groups = groups or [[PLAIN] * 5] * 4
     bits = start or header(quant=quants[0])
     for number, macroblocks in enumerate(groups):
@@ -77,11 +77,11 @@ def picture(
 
 
 def with_first(first: str) -> str:
-    """The bits of a picture that is plain but for its first macroblock."""
+    """Return the bits of a picture that is plain except for its first macroblock."""
     return picture([[first, *[PLAIN] * 4], *[[PLAIN] * 5] * 3])
 
 
 def packet(bits: str) -> bytes:
-    """As sent: 32-bit words, little-endian."""
+    """Return the datagram: 32-bit words, little-endian."""
     bits = aligned(bits, 32)
     return b"".join(int(bits[at : at + 32], 2).to_bytes(4, "little") for at in range(0, len(bits), 32))

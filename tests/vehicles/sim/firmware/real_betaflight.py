@@ -1,4 +1,4 @@
-"""Real Betaflight for a test: its program, and its ports, of which a computer has one set."""
+"""Real Betaflight for a test: its program and its ports, which exist only once per computer."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from skyloop.vehicles.sim.firmware.betaflight import program_path
 
 @contextmanager
 def real_betaflight() -> Iterator[None]:
-    """Keep the tests of other processes away from its ports meanwhile.
+    """Reserve its ports against tests in other processes.
 
-    Skips where it is not installed, or fails where somebody has promised that it is.
+    Skips if Betaflight is not installed, or fails if the environment promises that it is.
     """
     try:
         program_path()

@@ -1,4 +1,4 @@
-"""Firmware that is a stand-in, flown by readings that a test makes."""
+"""A stand-in for firmware, flown with readings from the tests."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOURCE = Path(skyloop.__file__).parents[1]
 STANDINS = Path(__file__).parent / "standins"
 STEP_S = 0.001
 LONG_S = 60.0
-#: What all stand-ins command, in the simulation's order.
+#: Commands of all stand-ins, in the simulation's order.
 COMMANDS = (0.3, 0.1, 0.2, 0.4)
 AT_REST = Readings(
     time_s=0.0,
@@ -45,18 +45,18 @@ FIX = GpsFix(0.0, 47.4, 8.5, 490.0, (1.0, 2.0, 3.0), 0.5, 0.8, 14)
 
 
 def program(folder: Path, standin: str) -> Path:
-    """Return a stand-in as a program that can be started."""
+    """Return a stand-in as an executable program."""
     path = folder / "bin" / standin
     path.parent.mkdir(parents=True, exist_ok=True)
     text = (STANDINS / f"{standin}.py").read_text(encoding="utf-8")
-    where = f"import sys; sys.path.insert(0, {str(SOURCE)!r})"  # wherever it runs
+    where = f"import sys; sys.path.insert(0, {str(SOURCE)!r})"  # for any working folder
     path.write_text(f"#!{sys.executable}\n{where}\n{text}", encoding="utf-8")
     path.chmod(0o755)
     return path
 
 
 class Rig:
-    """Steps a firmware; collects its events."""
+    """Steps a firmware and collects its events."""
 
     def __init__(self) -> None:
         self.firmware: CoupledFirmware  # set by the test
@@ -76,10 +76,10 @@ class Rig:
             if good(commands):
                 return commands
             time.sleep(STEP_S)
-        raise AssertionError(f"{what} did not come; events: {list(self.events.queue)}")
+        raise AssertionError(f"{what} did not happen; events: {list(self.events.queue)}")
 
     def answered(self) -> None:
-        """Step until the firmware commands."""
+        """Step until the firmware sends commands."""
         self.until(lambda commands: commands is not None and any(commands), "an answer")
 
     def event(self, kind: FirmwareEventKind) -> str:
@@ -100,10 +100,10 @@ class Rig:
 
 @contextmanager
 def flying(make: Callable[[Callable[[FirmwareEvent], None]], CoupledFirmware]) -> Iterator[Rig]:
-    """Start a firmware, and end it in the end."""
+    """Start a firmware, and end it afterwards."""
     rig = Rig()
     rig.firmware = make(rig.events.put)
-    rig.firmware.program._restart_s = 0.05  # a test need not wait
+    rig.firmware.program._restart_s = 0.05  # no waiting in tests
     rig.firmware.start()
     try:
         yield rig

@@ -35,13 +35,13 @@ def states(tmp_path: Path) -> list[dict[str, object]]:
 
 @pytest.fixture
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is no silence
+    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is not silence
 
 
 def test_it_flies_in_step(rig: Rig, patience: None, tmp_path: Path) -> None:
     rig.answered()
     for _ in range(100):
-        assert rig.step() == pytest.approx(COMMANDS)  # each of them: it was waited for
+        assert rig.step() == pytest.approx(COMMANDS)  # every time, as the step waits for them
     told = states(tmp_path)
     times = [state["timestamp"] for state in told]
     assert times == pytest.approx([0.001 * n for n in range(1, len(times) + 1)])
@@ -56,7 +56,7 @@ def test_it_flies_in_step(rig: Rig, patience: None, tmp_path: Path) -> None:
     assert rig.firmware.address.startswith("mavlink://udpin:127.0.0.1:")
 
 
-def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) -> None:
+def test_silence_is_an_event_and_blocks_only_one_step(rig: Rig, tmp_path: Path) -> None:
     rig.answered()
     os.kill(rig.firmware.program.pid, signal.SIGSTOP)
     begun_s = time.monotonic()
@@ -69,10 +69,10 @@ def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) 
     rig.answered()
     assert rig.step() == pytest.approx(COMMANDS)
     times = [float(str(state["timestamp"])) for state in states(tmp_path)]
-    assert max(b - a for a, b in itertools.pairwise(times)) == pytest.approx(0.001)  # its clock stood still
+    assert max(b - a for a, b in itertools.pairwise(times)) == pytest.approx(0.001)  # its clock paused
 
 
-def test_its_death_stops_the_rotors_and_it_is_started_again(rig: Rig) -> None:
+def test_its_death_stops_the_rotors_and_it_is_restarted(rig: Rig) -> None:
     rig.answered()
     os.kill(rig.firmware.program.pid, signal.SIGKILL)
     rig.until(lambda commands: commands == STOPPED, "the rotors' stop")
@@ -87,18 +87,18 @@ def test_other_packets_are_ignored(rig: Rig, monkeypatch: pytest.MonkeyPatch, tm
         second.answered()
         for _ in range(20):
             assert second.step() == pytest.approx(COMMANDS)
-        rig.answered()  # two at once, each with ports of its own
+        rig.answered()  # two at once, each with its own ports
         assert second.firmware.address != rig.firmware.address
 
 
-def test_last_words_of_one_that_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_event_of_its_death_has_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "arducopter")))
     monkeypatch.setenv("STANDIN", "dies")
     with flying(lambda on_event: ArduCopter(on_event)) as rig:
         assert "something went wrong in it" in rig.event(FirmwareEventKind.DIED)
 
 
-def test_without_a_program_the_error_says_where_it_comes_from(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_program_the_error_names_its_source(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(UsageError, match=r"set SKYLOOP_ARDUCOPTER to its path\. How to get it: https://ardupilot\.org"):

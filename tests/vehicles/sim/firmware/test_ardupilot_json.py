@@ -1,4 +1,4 @@
-"""ArduPilot's JSON interface: packets of outputs there and back, whatever else comes, and lines that are JSON."""
+"""ArduPilot's JSON interface: round trips of output packets, other input, and lines that are JSON."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ packets = st.builds(
 )
 
 
-def test_a_packet_as_arducopter_sends_it() -> None:
+def test_a_packet_from_arducopter() -> None:
     data = bytes.fromhex("1a48 9001 07000000") + bytes.fromhex("e803 dc05 d007 4c04") + bytes(24)
     assert decode_servos(data) == ServoPacket(400, 7, (1000, 1500, 2000, 1100, *[0] * 12))
 
 
 @given(packets)
-def test_packets_there_and_back(packet: ServoPacket) -> None:
+def test_packets_survive_a_round_trip(packet: ServoPacket) -> None:
     data = encode_servos(packet)
     assert len(data) <= MAX_PACKET
     assert decode_servos(data) == packet
@@ -45,8 +45,8 @@ def test_packets_there_and_back(packet: ServoPacket) -> None:
 @given(st.binary(max_size=2 * MAX_PACKET))
 @example(b"")
 @example(b"\x1a\x48" + bytes(38))
-@example(b"\x81\x73" + bytes(38))  # 32 outputs are promised, 16 there
-def test_whatever_comes_is_a_packet_or_refused(data: bytes) -> None:
+@example(b"\x81\x73" + bytes(38))  # 32 outputs are announced, 16 present
+def test_any_input_is_a_packet_or_refused(data: bytes) -> None:
     try:
         packet = decode_servos(data)
     except DecodeError:
@@ -57,7 +57,7 @@ def test_whatever_comes_is_a_packet_or_refused(data: bytes) -> None:
 @pytest.mark.parametrize(
     ("data", "words"), [(b"\x1a", "too few"), (bytes(40), "magic number is 0"), (b"\x1aH" + bytes(40), "42 bytes")]
 )
-def test_refusals_say_what_is_wrong(data: bytes, words: str) -> None:
+def test_refusals_give_the_reason(data: bytes, words: str) -> None:
     with pytest.raises(DecodeError, match=words):
         decode_servos(data)
 
@@ -76,7 +76,7 @@ def test_refusals_say_what_is_wrong(data: bytes, words: str) -> None:
         battery_a=st.none() | st.floats(-100, 100),
     )
 )
-def test_states_are_json_lines_of_the_fields_that_are_known(state: SimulatedState) -> None:
+def test_states_are_json_lines_of_the_known_fields(state: SimulatedState) -> None:
     data = encode_state(state)
     assert data[:1] == data[-1:] == b"\n"
     assert b"\n" not in data[1:-1]
@@ -95,6 +95,6 @@ def test_states_are_json_lines_of_the_fields_that_are_known(state: SimulatedStat
     assert ("battery" in fields) == (state.battery_v is not None)
 
 
-def test_arrays_are_as_arducopter_scans_them() -> None:
+def test_arrays_have_the_form_that_arducopter_scans() -> None:
     state = SimulatedState(1.5, (1, 2, 3), (0.5, 0, -9.80665), (0, 0, 0), (1, 0, 0, 0), (0, 0, 0))
     assert re.search(rb'"accel_body":\[0\.5, 0, -9\.80665\]', encode_state(state))

@@ -81,7 +81,7 @@ def test_its_death_stops_the_rotors_and_it_is_started_again_as_it_is(rig: Rig) -
     rig.event(FirmwareEventKind.ANSWERS)
 
 
-def test_another_flies_in_a_network_of_its_own(rig: Rig, tmp_path: Path) -> None:
+def test_another_flies_in_a_separate_network(rig: Rig, tmp_path: Path) -> None:
     if not ports.is_possible():
         pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
     rig.answered()
@@ -98,7 +98,7 @@ def test_another_flies_in_a_network_of_its_own(rig: Rig, tmp_path: Path) -> None
     rig.until(lambda commands: commands == pytest.approx(COMMANDS), "the first one's motors")
 
 
-def test_one_flies_where_there_is_one_network(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_separate_networks_only_one_flies(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "is_possible", lambda: False)
     rig.answered()
     with pytest.raises(UsageError, match="no ports are free for another Betaflight: 1 at most"):
@@ -115,7 +115,7 @@ def test_one_that_cannot_be_configured_is_an_event(tmp_path: Path, monkeypatch: 
 
 
 def test_a_deaf_start_is_ended_and_another_one_begins_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of Betaflight's starts in ten never answers: when it is configured, and when it is to fly."""
+    """One of Betaflight's starts in ten never answers, neither to be configured nor to fly."""
     deaf = tmp_path / "deaf"
     deaf.mkdir()
     for n in range(3):
@@ -124,7 +124,7 @@ def test_a_deaf_start_is_ended_and_another_one_begins_at_once(tmp_path: Path, mo
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "betaflight")))
     rig = Rig()
     rig.firmware = Betaflight(rig.events.put, folder=tmp_path / "kept")
-    rig.firmware.program._restart_s = 600.0  # there is no pause
+    rig.firmware.program._restart_s = 600.0  # it must not pause
     rig.firmware.start()
     try:
         text = rig.event(FirmwareEventKind.DEAF)

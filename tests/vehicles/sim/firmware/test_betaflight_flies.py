@@ -1,6 +1,6 @@
-"""Real Betaflight flies in the simulator, where it is installed: ``docs/autopilots.md`` says how.
+"""Real Betaflight flies in the simulator, if it is installed (see ``docs/autopilots.md``).
 
-It keeps the computer's time, and takes seconds until it lets itself be armed: so a test does all that fits in a flight.
+It uses the computer's clock, and takes seconds before it can be armed, so each test does as much as fits in a flight.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def height_m(drone: skyloop.Drone) -> float:
 
 
 def take_off(drone: skyloop.Drone) -> None:
-    """As a person does: once more where the pilot's process was held up, which ends what it had commanded."""
+    """Take off as a person would: again if a stall of the pilot's process ended its commands."""
     for _ in range(3):
         with suppress(NoAnswerError, RefusedError):
             return drone.takeoff(timeout_s=TAKEOFF_S)
@@ -68,11 +68,11 @@ def climb_to(drone: skyloop.Drone, height: float) -> None:
 
 def ready(drone: skyloop.Drone) -> None:
     """Wait until it would let itself be armed."""
-    eventually(lambda: drone.link.vehicle is LinkState.UP and flags(drone) == "", "it can be armed", PATIENCE_S)
+    eventually(lambda: drone.link.vehicle is LinkState.UP and flags(drone) == "", "arming is possible", PATIENCE_S)
 
 
 def process_in(folder: Path) -> int:
-    """The process id of the firmware that runs in a folder; 0: there is none."""
+    """Return the process id of the firmware that runs in a folder, or 0."""
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             if (process / "cwd").readlink() == folder and str((process / "exe").readlink()) == program_path():
@@ -92,14 +92,14 @@ def test_it_follows_the_marker_and_is_safe_without_link_pilot_or_firmware(
             _is_refused_by_name(drone)
             _comes_back_after_its_death(drone, tmp_path)
             with compared(observer) as agreement:
-                for _ in range(3):  # once more where the pilot's process was held up until the drone landed by itself
+                for _ in range(3):  # again if a stall of the pilot's process made the drone land
                     take_off(drone)
                     score = follow(drone, 30.0).score
                     if score.frames:
                         break
                 assert (score.share_in_view or 0.0) >= IN_VIEW, score
                 _survives_a_cut(drone)
-                flight.close()  # another flies on
+                flight.close()  # another one keeps flying
                 _lands_without_its_pilot(observer, start)
         row = agreement.row()
         for angle in (row.roll_deg, row.pitch_deg, row.yaw_deg):
@@ -124,21 +124,21 @@ def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
     def told(reason: str) -> bool:
         return any(event.data.get("reason") == reason for event in drone.recent_events())
 
-    eventually(lambda: told("firmware_died") and told("firmware_started"), "it is told", PATIENCE_S)
-    eventually(lambda: flags(drone) == "", "another can be armed", PATIENCE_S)
+    eventually(lambda: told("firmware_died") and told("firmware_started"), "both are reported", PATIENCE_S)
+    eventually(lambda: flags(drone) == "", "the next one can be armed", PATIENCE_S)
     assert process_in(folder) not in (0, first)
 
 
 def _survives_a_cut(drone: skyloop.Drone) -> None:
-    """It goes on level, sinking a little, and is flown on: as set up by ``SETTINGS`` of Betaflight's coupling."""
+    """It continues level, sinking slightly, and is then flown further, as set up by ``SETTINGS`` in its coupling."""
     climb_to(drone, 2.2)
     drone.hover()
     drone.config["sim.link"] = False
-    eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is told")
+    eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is reported")
     time.sleep(CUT_S)
     drone.config["sim.link"] = True
     eventually(lambda: drone.link.vehicle is LinkState.UP, "it is found again")
-    eventually(lambda: drone.feedback().position_m is not None, "it is told where it is")
+    eventually(lambda: drone.feedback().position_m is not None, "its position is known")
     assert drone.feedback().state.airborne
     assert (drone.feedback().native or {})["armed"] is True
     climb_to(drone, 1.2)
@@ -156,7 +156,7 @@ def _lands_without_its_pilot(observer: skyloop.Drone, start: Callable[..., Proce
     eventually(lambda: (observer.feedback().native or {}).get("armed") is False, "it is disarmed", PATIENCE_S)
 
 
-def test_another_flies_in_a_network_of_its_own(start: Callable[..., Process], tmp_path: Path) -> None:
+def test_another_flies_in_a_separate_network(start: Callable[..., Process], tmp_path: Path) -> None:
     if not ports.is_possible():
         pytest.skip("no network of one's own can be had here: it takes root or user namespaces")
     words = ("--world", "empty", "--option", "cameras=none", "--option", f"autopilot_folder={tmp_path}")
@@ -168,14 +168,14 @@ def test_another_flies_in_a_network_of_its_own(start: Callable[..., Process], tm
             ready(drone)
         places: list[tuple[float, float, float] | None] = [None]
 
-        def placed() -> bool:  # both at once: on a busy machine one is not told for a moment
+        def placed() -> bool:  # both at once: on a busy machine one may briefly lack a position
             places[:] = [drone.feedback().position_m for drone in (one, two)]
             return None not in places
 
-        eventually(placed, "each knows where it is", PATIENCE_S)
+        eventually(placed, "each knows its position", PATIENCE_S)
         assert places[0] is not None
         assert places[1] is not None
-        assert abs(places[0][0] - places[1][0]) > 0.5, "each is told its own place"
+        assert abs(places[0][0] - places[1][0]) > 0.5, "each gets its own position"
         one.config["msp.aux3"] = 2000
         eventually(lambda: flags(one) == "PARALYZE", "one has its reason", PATIENCE_S)
         assert flags(two) == "", "the other has none"
@@ -190,7 +190,7 @@ def test_it_flies_a_course_of_gates(proxy: Callable[..., Process]) -> None:
     with skyloop.connect("alpha") as drone:
         ready(drone)
         passed = 0
-        for _ in range(3):  # once more where the pilot's process was held up until the drone landed by itself
+        for _ in range(3):  # again if a stall of the pilot's process made the drone land
             take_off(drone)
             course = FlyThroughGates(drone, FIVE_GATES[passed:GATES])
             course.run(seconds=60.0)

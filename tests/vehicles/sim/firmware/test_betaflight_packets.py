@@ -1,4 +1,4 @@
-"""What Betaflight's program exchanges with a simulator: there and back, and whatever else comes."""
+"""The packets between Betaflight's program and a simulator: round trips, and other input."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ single = st.floats(0, 1, width=32)
         pressure_pa=number,
     )
 )
-def test_states_there_and_back(state: FlightState) -> None:
+def test_states_survive_a_round_trip(state: FlightState) -> None:
     data = encode_state(state)
     assert len(data) == 144
     assert decode_state(data) == state
 
 
-def test_a_state_has_its_numbers_where_betaflight_reads_them() -> None:
+def test_a_state_has_betaflights_layout() -> None:
     state = FlightState(1.0, (2, 3, 4), (5, 6, 7), (8, 9, 10, 11), (12, 13, 14), (15, 16, 17), 18.0)
     assert struct.unpack("<18d", encode_state(state)) == tuple(range(1, 19))
 
 
 @given(st.tuples(single, single, single, single))
-def test_motors_there_and_back(motors: tuple[float, float, float, float]) -> None:
+def test_motors_survive_a_round_trip(motors: tuple[float, float, float, float]) -> None:
     assert decode_motors(encode_motors(motors)) == motors
 
 
 @given(st.binary(max_size=160))
 @example(struct.pack("<4f", 0, 0, 0, math.nan))
 @example(struct.pack("<18d", *[math.inf] * 18))
-def test_whatever_comes_is_a_packet_or_refused(data: bytes) -> None:
+def test_any_input_is_a_packet_or_refused(data: bytes) -> None:
     for decode, size in ((decode_motors, 16), (decode_state, 144)):
         try:
             decode(data)
@@ -63,7 +63,7 @@ def test_whatever_comes_is_a_packet_or_refused(data: bytes) -> None:
         assert len(data) == size
 
 
-def test_refusals_say_what_is_wrong() -> None:
+def test_refusals_give_the_reason() -> None:
     with pytest.raises(DecodeError, match="3 bytes, where the motors of Betaflight have 16"):
         decode_motors(b"abc")
     with pytest.raises(DecodeError, match="not finite"):

@@ -1,4 +1,4 @@
-"""Real Betaflight in the simulator keeps the drivers' contract, where it is installed."""
+"""Real Betaflight in the simulator passes the driver suite, if it is installed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
 @pytest.mark.flight
 @pytest.mark.timeout(400)
 class TestBetaflightInTheSimulator(DriverSuite):
-    untouched_parameters = frozenset({"sim.link", "sim.battery"})  # one cuts the suite off, the other drains
+    untouched_parameters = frozenset({"sim.link", "sim.battery"})  # one disconnects the suite, the other drains
     uri = "sim://?autopilot=betaflight&world=empty&seed=4&wind=0&cameras=bottom&fps=10"
     connect_timeout_s = 30.0
     feedback_timeout_s = 10.0

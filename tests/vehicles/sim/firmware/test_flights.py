@@ -1,7 +1,7 @@
-"""Real ArduCopter and PX4 fly in the simulator, where their programs are; Betaflight has tests of its own.
+"""Real ArduCopter and PX4 fly in the simulator, if installed; Betaflight has separate tests.
 
-``SKYLOOP_ARDUCOPTER`` and ``SKYLOOP_PX4`` are the paths of the programs; ``docs/autopilots.md`` says where they come
-from. A flight takes two minutes, at the pace of the clock.
+``SKYLOOP_ARDUCOPTER`` and ``SKYLOOP_PX4`` are the paths of the programs; ``docs/autopilots.md`` lists their sources. A
+flight takes two minutes in real time.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ VARIABLES = {"ardupilot": ardupilot.VARIABLE, "px4": px4.VARIABLE}
 MOST_RMS_DEG = 2.0
 MOST_RMS_M = 0.5
 IN_VIEW = 0.9
-CORNERS = 12  # a minute of them, at the pace of the clock
+CORNERS = 12  # a minute's worth in real time
 
 
 @pytest.fixture(params=sorted(VARIABLES))
 def drone(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[skyloop.Drone]:
-    """One in the demo's room, in the air."""
+    """A drone in the demo's room, in the air."""
     kind = request.param
     if not os.environ.get(VARIABLES[kind]):
         pytest.skip(f"{kind}'s program is not here: {VARIABLES[kind]} must be its path (docs/autopilots.md)")

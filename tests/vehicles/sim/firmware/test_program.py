@@ -1,4 +1,4 @@
-"""A firmware's process: found, started, watched, started again, ended."""
+"""A firmware's process: found, started, watched, restarted, ended."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LONG_S = 60.0
 
 
 class Watched:
-    """A program whose events are kept."""
+    """A program whose events are recorded."""
 
     def __init__(self, command: tuple[str, ...], **options: object) -> None:
         self.events: queue.Queue[FirmwareEvent] = queue.Queue()
@@ -60,7 +60,7 @@ def gone(pid: int) -> bool:
     return False
 
 
-def test_one_that_was_started_in_vain_is_started_again() -> None:
+def test_a_failed_start_is_retried() -> None:
     starts = [0]
 
     def verify() -> None:
@@ -74,7 +74,7 @@ def test_one_that_was_started_in_vain_is_started_again() -> None:
     assert starts == [2]
 
 
-def test_it_runs_until_it_is_closed_and_leaves_nothing_behind() -> None:
+def test_it_runs_until_closed_and_leaves_nothing_behind() -> None:
     with Watched(SLEEPS) as watched:
         text = watched.next(FirmwareEventKind.STARTED)
         pid = watched.program.pid
@@ -86,10 +86,10 @@ def test_it_runs_until_it_is_closed_and_leaves_nothing_behind() -> None:
     assert gone(pid)
     assert not folder.exists()
     assert watched.events.empty()
-    watched.program.close()  # once more does no harm
+    watched.program.close()  # a second close does no harm
 
 
-def test_what_was_killed_is_started_again() -> None:
+def test_a_killed_process_is_restarted() -> None:
     with Watched(SLEEPS) as watched:
         watched.next(FirmwareEventKind.STARTED)
         os.kill(watched.program.pid, signal.SIGKILL)
@@ -98,7 +98,7 @@ def test_what_was_killed_is_started_again() -> None:
         assert watched.program.starts == 2
 
 
-def test_last_words_are_in_the_event_and_the_folder_stays(tmp_path: Path) -> None:
+def test_its_last_output_is_in_the_event_and_the_folder_stays(tmp_path: Path) -> None:
     with Watched(FAILS, folder=tmp_path / "kept") as watched:
         watched.next(FirmwareEventKind.STARTED)
         text = watched.next(FirmwareEventKind.DIED)
@@ -115,7 +115,7 @@ def test_an_exit_code_is_no_signal_unless_there_is_one_of_its_number(code: int) 
         assert watched.next(FirmwareEventKind.DIED) == told[code]
 
 
-def test_one_that_does_not_answer_is_started_again_at_once_but_not_for_ever() -> None:
+def test_one_that_does_not_answer_is_restarted_at_once_but_not_forever() -> None:
     def verify() -> None:
         raise StartedInVainError("it does not listen")
 
@@ -135,7 +135,7 @@ def test_it_ends_with_its_keeper() -> None:
         watched.next(FirmwareEventKind.DIED)
 
 
-def test_one_that_is_stopped_can_be_ended() -> None:
+def test_a_stopped_process_can_be_ended() -> None:
     with Watched(SLEEPS) as watched:
         watched.next(FirmwareEventKind.STARTED)
         pid = watched.program.pid
@@ -143,7 +143,7 @@ def test_one_that_is_stopped_can_be_ended() -> None:
     assert gone(pid)
 
 
-def test_one_that_cannot_be_started_is_tried_again() -> None:
+def test_one_that_cannot_be_started_is_retried() -> None:
     with Watched(("/nowhere/at/all",)) as watched:
         assert "No such file" in watched.next(FirmwareEventKind.FAILED)
         watched.next(FirmwareEventKind.FAILED)
@@ -153,7 +153,7 @@ def test_programs_are_found_by_variable_or_on_the_path(tmp_path: Path, monkeypat
     program = tmp_path / "testware"
     program.write_text("")
     monkeypatch.setenv("SKYLOOP_TESTWARE", str(program))
-    with pytest.raises(UsageError, match=r"SKYLOOP_TESTWARE is '.*', which is no program"):
+    with pytest.raises(UsageError, match=r"SKYLOOP_TESTWARE is '.*', which is not a program"):
         find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.")
     program.chmod(0o755)
     assert find_program("SKYLOOP_TESTWARE", ("testware",), "Testware", "It is here.") == str(program)

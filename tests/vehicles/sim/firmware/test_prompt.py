@@ -1,4 +1,4 @@
-"""What is woken on time: as far as the rights go."""
+"""Prompt wake-ups, as far as permissions allow."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, become_prom
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
-    """What the system was asked for; it gives nothing."""
+    """Return the requests to the system, which refuses all of them."""
     asked: list[tuple[object, ...]] = []
 
     def refuse(*what: object) -> None:
@@ -28,14 +28,14 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
     return asked
 
 
-def test_without_rights_there_is_what_needs_none(asked: list[tuple[object, ...]]) -> None:
+def test_without_permissions_it_uses_what_needs_none(asked: list[tuple[object, ...]]) -> None:
     become_prompt()
     assert asked[0][1] == SLACK_NS
     assert asked[1][1] == os.SCHED_RR
     assert asked[2] == (os.PRIO_PROCESS, 0, NICENESS)
 
 
-def test_with_rights_it_goes_before_all_ordinary_processes(
+def test_with_permissions_it_runs_ahead_of_all_ordinary_processes(
     asked: list[tuple[object, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_setscheduler", lambda *what: asked.append(what))

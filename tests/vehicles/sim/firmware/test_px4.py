@@ -53,11 +53,11 @@ def messages(tmp_path: Path) -> list[tuple[str, int]]:
 
 
 def test_it_flies_in_step(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is no silence
+    monkeypatch.setattr(coupling, "WAIT_S", 20.0)  # a busy machine is not silence
     rig.answered()
     answers = [rig.step(gps=FIX if n == 10 else None) for n in range(40 * STEPS)]
     given = [commands for commands in answers if commands is not None]
-    assert len(given) == 40  # to each state: it was waited for
+    assert len(given) == 40  # for every state, as the step waits for them
     assert all(commands == pytest.approx(COMMANDS) for commands in given)
     told = messages(tmp_path)
     times = [time_us for kind, time_us in told if kind == "HIL_SENSOR"]
@@ -72,14 +72,14 @@ def test_it_flies_in_step(rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: P
     )
 
 
-def test_it_is_told_how_late_the_gps_is(rig: Rig, tmp_path: Path) -> None:
+def test_it_gets_the_delay_of_the_gps(rig: Rig, tmp_path: Path) -> None:
     rig.answered()
     given = (tmp_path / "kept" / "parameters.txt").read_text().splitlines()
     assert {"PX4_PARAM_EKF2_GPS_DELAY=170", "PX4_PARAM_SENS_GPS0_DELAY=170", "PX4_PARAM_MPC_THR_HOVER=0.7"} <= {*given}
 
 
-def test_another_px4_on_the_computer_leaves_the_next_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It was started as the same instance for ever, and ended each time: "PX4 server already running"."""
+def test_beside_another_px4_it_uses_the_next_instance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was once started as the same instance forever, and ended each time with "PX4 server already running"."""
     monkeypatch.setattr(px4, "LOCK_FILE", str(tmp_path / "px4_lock"))
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "px4")))
     (tmp_path / "etc" / "init.d-posix").mkdir(parents=True)
@@ -97,13 +97,13 @@ def test_another_px4_on_the_computer_leaves_the_next_instance(tmp_path: Path, mo
     assert not px4._runs(1)
 
 
-def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) -> None:
+def test_silence_is_an_event_and_blocks_only_one_step(rig: Rig, tmp_path: Path) -> None:
     rig.answered()
     os.kill(rig.firmware.program.pid, signal.SIGSTOP)
     assert "does not answer" in rig.event(FirmwareEventKind.SILENT)
     assert rig.step() == STOPPED
     heard = len(messages(tmp_path))
-    for _ in range(20_000):  # more than a socket takes, were all of it sent
+    for _ in range(20_000):  # more than a socket's buffer, if all of it were sent
         rig.step()
     os.kill(rig.firmware.program.pid, signal.SIGCONT)
     assert "again" in rig.event(FirmwareEventKind.ANSWERS)
@@ -113,7 +113,7 @@ def test_silence_is_an_event_and_blocks_one_step_only(rig: Rig, tmp_path: Path) 
     assert len(times) - heard < 1000
 
 
-def test_its_death_stops_the_rotors_and_it_is_started_again(rig: Rig) -> None:
+def test_its_death_stops_the_rotors_and_it_is_restarted(rig: Rig) -> None:
     rig.answered()
     os.kill(rig.firmware.program.pid, signal.SIGKILL)
     rig.until(lambda commands: commands == STOPPED, "the rotors' stop")
@@ -128,7 +128,7 @@ def test_a_program_without_its_files_is_refused(tmp_path: Path, monkeypatch: pyt
         Px4(print).start()
 
 
-def test_no_more_than_its_ports_allow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_ports_limit_the_number_of_instances(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, str(program(tmp_path, "px4")))
     (tmp_path / "etc" / "init.d-posix").mkdir(parents=True)
     monkeypatch.setattr(px4, "MOST_INSTANCES", 1)

@@ -1,4 +1,4 @@
-"""Several real ArduCopters and PX4s in one world, at other speeds, and what comes of one that dies or hangs.
+"""Several real ArduCopters and PX4s in one world, at other speeds, and the effects of one that dies or hangs.
 
 ``SKYLOOP_ARDUCOPTER`` and ``SKYLOOP_PX4`` are the paths of the programs; see ``test_flights.py``.
 """
@@ -33,13 +33,13 @@ PATIENCE_S = 120.0
 SIDE_M = 0.8
 HEIGHT_M = 1.5
 MOST_WANDER_M = 0.5
-#: Of its position, without its mean taken off: PX4's GPS is wrong by 0.4 m across and 0.7 m in height.
+#: Of its position, including its mean error: PX4's GPS is wrong by 0.4 m horizontally and 0.7 m in height.
 MOST_OFF_M = {"ardupilot": 0.5, "px4": 2.5}
 STOPPED_S = 3.0
 
 
 class Fleet:
-    """Drones of one ``skyloop sim``, each flown by firmware of its own."""
+    """Drones of one ``skyloop sim``, each flown by its own firmware."""
 
     def __init__(self, kinds: tuple[str, ...], process: Process, folder: Path, stack: ExitStack) -> None:
         self.kinds = kinds
@@ -55,7 +55,7 @@ class Fleet:
             ready(drone)
 
     def pid(self, n: int) -> int:
-        """The process of a drone's firmware; 0: there is none."""
+        """Return the process id of a drone's firmware, or 0."""
         folder, name = self._folder / f"drone{n + 1}", PROGRAMS[self.kinds[n]]
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
@@ -64,11 +64,11 @@ class Fleet:
         return 0
 
     def said(self, n: int, reason: str) -> int:
-        """How often an event of a drone came; ``lost``: the loss of its link."""
+        """Return how often a drone's event happened; ``lost``: the loss of its link."""
         return sum(_is(event, reason) for event in list(self._events[n]))
 
     def wait_for(self, n: int, reason: str) -> None:
-        """Wait for an event of a drone that was not waited for yet."""
+        """Wait for the next event of a drone with this reason."""
         self._waited[n, reason] += 1
         eventually(lambda: self.said(n, reason) >= self._waited[n, reason], reason, PATIENCE_S)
 
@@ -80,7 +80,7 @@ class Fleet:
 
 @pytest.fixture
 def fleet(start: Callable[..., Process], tmp_path: Path) -> Iterator[Callable[..., Fleet]]:
-    """Starts drones in one world, of the kinds given; each is ready to take off."""
+    """Start drones of the given kinds in one world; each is ready to take off."""
     with ExitStack() as stack:
 
         def begin(*kinds: str, speed: float = 1.0) -> Fleet:
@@ -106,7 +106,7 @@ def _is(event: Event, reason: str) -> bool:
 
 
 def ready(drone: skyloop.Drone) -> None:
-    """Wait until it may take off."""
+    """Wait until it can take off."""
     eventually(lambda: drone.link.vehicle is LinkState.UP, "its link is up", PATIENCE_S)
     wait_ready(drone, PATIENCE_S)
 
@@ -118,7 +118,7 @@ def truth(drone: skyloop.Drone) -> tuple[float, float, float]:
 
 
 def go(drone: skyloop.Drone, x: float, y: float) -> None:
-    """As a person does: once more where a busy computer held the pilot's process up, and the drone hovers."""
+    """Fly there as a person would: again if a busy computer held the pilot's process up and the drone hovers."""
     for _ in range(5):
         try:
             drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=PATIENCE_S, tolerance_m=0.3)
@@ -130,7 +130,7 @@ def go(drone: skyloop.Drone, x: float, y: float) -> None:
 
 
 def fly_square(drone: skyloop.Drone) -> AgreementRow:
-    """Take off, fly a square beside the others, and land; how well its state agreed with the truth."""
+    """Take off, fly a square among the others, and land; return how well its state agreed with the truth."""
     take_off(drone)
     x, y, _ = truth(drone)
     with compared(drone) as agreement:
@@ -159,7 +159,7 @@ def test_several_fly_in_one_world_and_end_with_it(fleet: Callable[..., Fleet], k
 
 
 @pytest.mark.parametrize("kind", sorted(VARIABLES))
-def test_one_that_dies_or_hangs_is_told_and_flies_again(fleet: Callable[..., Fleet], kind: str) -> None:
+def test_one_that_dies_or_hangs_is_reported_and_flies_again(fleet: Callable[..., Fleet], kind: str) -> None:
     several = fleet("px4", kind)
     other, drone = several.drones
     take_off(other)
@@ -167,7 +167,7 @@ def test_one_that_dies_or_hangs_is_told_and_flies_again(fleet: Callable[..., Fle
     _dies(several)
     take_off(drone)
     drone.config["sim.link"] = False
-    eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is told")
+    eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is reported")
     drone.config["sim.link"] = True
     ready(drone)
     assert drone.feedback().state.airborne
@@ -177,7 +177,7 @@ def test_one_that_dies_or_hangs_is_told_and_flies_again(fleet: Callable[..., Fle
     take_off(drone)
     _hangs(several, in_the_air=True)
     assert other.feedback().state.airborne
-    assert sum((a - b) ** 2 for a, b in zip(truth(other), place, strict=True)) < 1.0, "nobody else is affected"
+    assert sum((a - b) ** 2 for a, b in zip(truth(other), place, strict=True)) < 1.0, "no other drone is affected"
     other.land(timeout_s=PATIENCE_S)
 
 
@@ -202,7 +202,7 @@ def _hangs(several: Fleet, *, in_the_air: bool) -> None:
     several.signal(1, signal.SIGCONT)
     several.wait_for(1, "firmware_answers")
     ready(drone)
-    if in_the_air:  # it takes itself for flying
+    if in_the_air:  # it believes that it is flying
         drone.land(timeout_s=PATIENCE_S)
     assert truth(drone)[2] < 0.3
 
@@ -219,7 +219,7 @@ def test_it_flies_slower_and_faster_than_real_time(fleet: Callable[..., Fleet], 
     (begun_s, simulated_s), row = now(), fly_square(drone)
     ended_s, ended_simulated_s = now()
     rate = (ended_simulated_s - simulated_s) / (ended_s - begun_s)
-    assert 0.1 * speed < rate < 1.05 * speed  # a busy computer is slower, and flies all the same
+    assert 0.1 * speed < rate < 1.05 * speed  # a busy computer is slower, but flies
     assert row.position_wander_m is not None
     assert row.position_wander_m.rms < MOST_WANDER_M, row
     print(kind, speed, rate, row)

@@ -1,4 +1,4 @@
-"""A Tello's board over a simulation that is stepped by the tests: no thread, no socket, no time of its own."""
+"""A Tello's board over a simulation stepped by the tests: no thread, no socket, no clock."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PILOT: Final = ("10.0.0.2", 9000)
 
 
 class Bench:
-    """Time passes in ticks of 20 ms. ``answers`` has what was answered, and to whom."""
+    """A board whose time passes in ticks of 20 ms. ``answers`` lists the answers with their recipients."""
 
     def __init__(self, sdk: Sdk = Sdk.V3_0, pads: Mapping[int, tuple[float, float]] | None = None) -> None:
         world = replace(load_world("empty", 0), targets=())
@@ -53,7 +53,7 @@ class Bench:
             self.tick()
 
     def until(self, condition: Callable[[], bool], within_s: float) -> float:
-        """How long it took [s]."""
+        """Return the time until the condition holds [s]."""
         for ticks in range(round(within_s / TICK_S)):
             if condition():
                 return ticks * TICK_S
@@ -64,7 +64,7 @@ class Bench:
         self.logic.receive(text.encode(), PILOT)
 
     def ask(self, text: str, within_s: float = 0.0) -> str:
-        """What is answered, at once or within a time."""
+        """Return the answer to a command, at once or within a time."""
         before = len(self.answers)
         self.say(text)
         self.until(lambda: len(self.answers) > before, within_s + TICK_S)
@@ -73,7 +73,7 @@ class Bench:
         return answer
 
     def fly(self) -> None:
-        """Take off and be answered."""
+        """Take off and wait for the answer."""
         assert self.ask("command") == "ok"
         assert self.ask("takeoff", 12.0) == "ok"
 

@@ -1,4 +1,4 @@
-"""The emulated Tello does as the guides and recordings say that the real one does."""
+"""The emulated Tello behaves as described in the guides and seen in recordings of real ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_nothing_is_answered_before_command() -> None:
     assert bench.logic.client == PILOT[0]
 
 
-def test_a_take_off_is_answered_long_after_it_hovers_and_a_landing_when_it_stands() -> None:
+def test_a_take_off_is_answered_long_after_it_hovers_and_a_landing_at_touchdown() -> None:
     bench = Bench()
     bench.ask("command")
     assert bench.state.distance_cm == 10
@@ -43,7 +43,7 @@ def test_a_take_off_is_answered_long_after_it_hovers_and_a_landing_when_it_stand
     assert bench.flight is FlightState.LANDED
     stood_s = bench.state.motor_s
     bench.run(3.0)
-    assert bench.state.motor_s == stood_s  # it counts while they run
+    assert bench.state.motor_s == stood_s  # counts while the motors run
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_take_off_is_answered_long_after_it_hovers_and_a_landing_when_it_stand
         ("curve 20 20 0 50 0 0 40", 0.5, 0, 0),
     ],
 )
-def test_moves_end_where_they_should_and_are_answered_then(
+def test_moves_end_at_their_goal_and_are_then_answered(
     command: str, forward_m: float, left_m: float, up_m: float
 ) -> None:
     bench = Bench()
@@ -86,7 +86,7 @@ def test_turns(command: str, left_rad: float) -> None:
     assert bench.state.yaw_deg == pytest.approx(told - math.degrees(left_rad), abs=6)
 
 
-def test_sticks_are_never_answered_and_move_it_until_the_next() -> None:
+def test_sticks_are_never_answered_and_stay_in_force() -> None:
     bench = Bench()
     bench.fly()
     answers = len(bench.answers)
@@ -110,7 +110,7 @@ def test_sticks_are_never_answered_and_move_it_until_the_next() -> None:
     assert len(bench.answers) == answers
 
 
-def test_it_lands_by_itself_after_fifteen_seconds_of_silence() -> None:
+def test_it_lands_after_fifteen_seconds_of_silence() -> None:
     bench = Bench()
     bench.fly()
     bench.say("rc 0 0 0 0")
@@ -120,7 +120,7 @@ def test_it_lands_by_itself_after_fifteen_seconds_of_silence() -> None:
     bench.until(lambda: bench.flight is FlightState.LANDED, 6.0)
 
 
-def test_questions_keep_it_up() -> None:
+def test_questions_keep_it_in_the_air() -> None:
     bench = Bench()
     bench.fly()
     for _ in range(8):
@@ -137,7 +137,7 @@ def test_an_emergency_cuts_the_motors_and_is_forgotten_on_the_ground() -> None:
     assert bench.ask("takeoff", 12.0) == "ok"
 
 
-def test_one_thing_at_a_time() -> None:
+def test_one_command_at_a_time() -> None:
     bench = Bench()
     bench.fly()
     bench.say("forward 100")
@@ -193,7 +193,7 @@ def test_answers_on_the_ground(command: str, answer: str) -> None:
     assert bench.ask(command).strip() == answer
 
 
-def test_what_was_configured_is_in_force() -> None:
+def test_the_configuration_is_in_force() -> None:
     bench = Bench()
     bench.ask("command")
     for command in ("streamon", "port 9990 9991", "setfps low", "setresolution low", "setbitrate 2", "downvision 1"):
@@ -205,7 +205,7 @@ def test_what_was_configured_is_in_force() -> None:
     assert bench.ask("speed?").strip() == "80.0"
 
 
-def test_older_versions_know_less() -> None:
+def test_older_versions_have_fewer_commands() -> None:
     bench = Bench(Sdk.V1_3)
     bench.ask("command")
     for command in ("sdk?", "stop", "mon", "port 9990 9991", "keepalive", "setfps low"):
@@ -238,7 +238,7 @@ def test_mission_pads_in_view() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=60) | st.text(alphabet="abcdflgort m?-0123456789", max_size=30).map(str.encode)))
-def test_any_datagrams_are_taken(datagrams: list[bytes]) -> None:
+def test_any_datagrams_are_survived(datagrams: list[bytes]) -> None:
     bench = Bench()
     bench.ask("command")
     for datagram in datagrams:

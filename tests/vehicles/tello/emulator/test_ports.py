@@ -1,4 +1,4 @@
-"""The emulated Tello on the network: what comes to which port, and what is refused."""
+"""The emulated Tello on the network: its ports, and refused settings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytest.importorskip("av")
 
 
 class Client:
-    """Has a Tello's three ports on this side."""
+    """A client with a Tello's three ports."""
 
     def __init__(self, addresses: Addresses, port: int = 8889) -> None:
         self._open = ExitStack()
@@ -67,7 +67,7 @@ def drone(**settings: Any) -> Iterator[tuple[TelloFirmware, Client]]:
             client.close()
 
 
-def test_state_and_video_come_once_they_are_asked_for() -> None:
+def test_state_and_video_arrive_on_request() -> None:
     with drone() as (_, client):
         assert client.ask("command") == "ok"
         first = parse(client.states.recv(2000))
@@ -80,7 +80,7 @@ def test_state_and_video_come_once_they_are_asked_for() -> None:
         assert not any(unit.after_gap for unit in others)
 
 
-def test_ports_of_their_own() -> None:
+def test_separate_ports() -> None:
     with drone() as (firmware, client), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.settimeout(10.0)
         other.bind((client.commands.getsockname()[0], 0))
@@ -90,7 +90,7 @@ def test_ports_of_their_own() -> None:
         assert firmware.logic.state_port == other.getsockname()[1]
 
 
-def test_loss_befalls_states_and_answers() -> None:
+def test_faults_affect_states_and_answers() -> None:
     with drone(faults=Faults(seed=1, drop=0.5)) as (_, client):
         client.commands.settimeout(0.1)
         answered = 0
@@ -108,7 +108,7 @@ def test_it_sends_less_over_a_bad_link() -> None:
     assert automatic_kbps(0.1) == automatic_kbps(1.0) == LEAST_KBPS
 
 
-def test_a_port_that_is_taken_is_named_and_a_restart_has_it_again() -> None:
+def test_a_port_in_use_is_named_and_reused_after_a_restart() -> None:
     with drone() as (firmware, _):
         host = SimHost(with_tellos(SimOptions(world="empty")))
         with pytest.raises(LinkError, match=r"the drone's command port, UDP 8889 on .* can't be opened"):
@@ -120,7 +120,7 @@ def test_a_port_that_is_taken_is_named_and_a_restart_has_it_again() -> None:
         assert firmware.port == 8889
 
 
-def test_a_free_port_is_found_again() -> None:
+def test_a_free_port_is_kept_after_a_restart() -> None:
     host = SimHost(with_tellos(SimOptions(world="empty")))
     firmware = TelloFirmware(host, port=0)
     with pytest.raises(UsageError, match="not started"):
@@ -139,13 +139,13 @@ def test_a_free_port_is_found_again() -> None:
         ({"pads": {9: (0.0, 0.0)}}, "mission pads are numbered from 1 to 8"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], said: str) -> None:
+def test_invalid_settings_are_refused(settings: dict[str, Any], said: str) -> None:
     host = SimHost(with_tellos(SimOptions(world="empty")))
     with pytest.raises(UsageError, match=said):
         TelloFirmware(host, **settings)
 
 
-def test_its_video_follows_what_is_configured() -> None:
+def test_its_video_follows_the_configuration() -> None:
     with drone() as (_, client):
         for command in ("command", "setbitrate 1", "downvision 1", "setfps middle", "streamon"):
             assert client.ask(command) == "ok"
@@ -162,4 +162,4 @@ def test_its_video_follows_what_is_configured() -> None:
                 return True
             return False
 
-        wait_until(silent, "no more video comes")
+        wait_until(silent, "no more video arrives")

@@ -1,4 +1,4 @@
-"""State strings to values."""
+"""Values from state strings."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def test_every_recorded_string_decodes_in_full() -> None:
         assert state.motor_s == int(told["time"])
         assert state.acceleration_mg is not None
         assert state.pads is ("mid" in told)
-        assert state.pad is None  # none was seen in any of them
+        assert state.pad is None  # no pad in any of them
 
 
-def test_what_means_unknown_is_unknown() -> None:
+def test_values_that_mean_unknown_are_none() -> None:
     flying = parse(strings()[3].encode())
     assert dict(flying.fields)["tof"] == 6553
     assert flying.distance_cm is None
@@ -42,7 +42,7 @@ def test_what_means_unknown_is_unknown() -> None:
 
 
 def test_attitude_and_acceleration_agree_on_their_axes() -> None:
-    """At rest: nose up shows along x, right side down against y; z points down."""
+    """At rest: nose up shows along x, right side down along negative y; z points down."""
     for line in strings():
         state = parse(line.encode())
         assert state.acceleration_mg is not None
@@ -52,7 +52,7 @@ def test_attitude_and_acceleration_agree_on_their_axes() -> None:
         assert x == pytest.approx(1000 * math.sin(math.radians(state.pitch_deg)), abs=30)
 
 
-def test_a_pad_that_is_seen() -> None:
+def test_a_pad_in_view() -> None:
     state = parse(b"mid:3;x:12;y:-7;z:80;mpry:1,-2,30;pitch:0;")
     assert state.pad is not None
     assert (state.pad.number, state.pad.place_cm, state.pad.angles_deg) == (3, (12, -7, 80), (1, -2, 30))
@@ -64,25 +64,25 @@ def test_a_pad_that_is_seen() -> None:
     assert nowhere.place_cm is None
 
 
-def test_a_string_that_was_cut_off_keeps_its_whole_fields() -> None:
+def test_a_truncated_string_keeps_its_whole_fields() -> None:
     whole = strings()[0]
     for end in range(len(whole)):
         try:
             state = parse(whole[:end].encode())
         except DecodeError:
             continue
-        # The last one may have lost digits and nothing tells: all others are as in the whole string.
+        # The last one may have lost digits unnoticed; all others are as in the whole string.
         for name, value in state.fields[:-1]:
             assert dict(parse(whole.encode()).fields)[name] == value
 
 
 @pytest.mark.parametrize("datagram", [b"", b"ok", b"\xff\xfe", b";;;", b"bat:;h:x;", b"a:1;" * 400])
-def test_what_is_no_state_is_refused(datagram: bytes) -> None:
+def test_other_texts_are_refused(datagram: bytes) -> None:
     with pytest.raises(DecodeError):
         parse(datagram)
 
 
-def test_what_is_built_is_read_back() -> None:
+def test_a_built_state_is_read_back() -> None:
     datagram = build([("mid", "-1"), ("mpry", "0,0,0"), ("pitch", "-3"), ("baro", "-18.06")])
     assert datagram == b"mid:-1;mpry:0,0,0;pitch:-3;baro:-18.06;\r\n"
     assert parse(datagram).pitch_deg == -3

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from skyloop.vehicles.tello.wire import LEVEL, READ, Sdk, Stick, answers, decoded, is_error, ports
 
 
-def test_commands_are_written_as_the_guide_has_them() -> None:
+def test_commands_match_the_guide() -> None:
     assert Stick(right=-10, forward=20, up=0, clockwise=100).text == "rc -10 20 0 100"
     assert LEVEL.text == "rc 0 0 0 0"
     assert ports(8891, 11112) == "port 8891 11112"
 
 
-def test_versions_know_what_older_ones_know() -> None:
+def test_versions_include_older_ones() -> None:
     assert Sdk.V3_0.knows(Sdk.V2_0)
     assert Sdk.V1_3.knows(Sdk.V1_3)
     assert not Sdk.V1_3.knows(Sdk.V2_0)
@@ -44,14 +44,14 @@ def test_versions_know_what_older_ones_know() -> None:
         ("forward 10", "out of range"),
     ],
 )
-def test_a_command_takes_answers_of_its_shape_and_errors(command: str, reply: str) -> None:
+def test_a_command_accepts_answers_of_its_shape_and_errors(command: str, reply: str) -> None:
     assert answers(reply, command)
 
 
 @pytest.mark.parametrize(
     ("command", "reply"),
     [
-        ("wifi?", "ok"),  # of a take-off that was answered seconds late
+        ("wifi?", "ok"),  # of a take-off answered seconds late
         ("sn?", "ok"),
         ("sdk?", "12s"),
         ("streamon", "90"),
@@ -60,12 +60,12 @@ def test_a_command_takes_answers_of_its_shape_and_errors(command: str, reply: st
         ("battery?", "pitch:0;roll:-1;yaw:12;"),
     ],
 )
-def test_it_does_not_take_those_of_others(command: str, reply: str) -> None:
+def test_it_ignores_those_of_others(command: str, reply: str) -> None:
     assert not answers(reply, command)
 
 
 @given(st.binary(max_size=400))
-def test_any_bytes_are_a_text_of_one_line_or_none(datagram: bytes) -> None:
+def test_any_bytes_give_one_line_of_text_or_none(datagram: bytes) -> None:
     text = decoded(datagram)
     if text is None:
         return

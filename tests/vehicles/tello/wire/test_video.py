@@ -1,4 +1,4 @@
-"""Datagrams of video to pictures, in any order of losses."""
+"""Pictures from video datagrams, with losses in any order."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from skyloop.drivers.h264 import START, Slice, parse_sequence, parse_slice, unit
 from skyloop.errors import DecodeError
 from skyloop.vehicles.tello.wire import MAX_PICTURE, PIECE, AccessUnit, Assembly, pieces
 
-#: Of a real Tello.
+#: From a real Tello.
 SPS = bytes.fromhex("674d402895a03c05b9")
 PPS = bytes.fromhex("68ee3880")
 
 
 def picture(number: int, size: int, *, key: bool = False) -> bytes:
-    """The beginning of a slice with this frame number, and filling that is no start code."""
+    """Return the beginning of a slice with this frame number, and filling without start codes."""
     bits = f"1{'00110' if not key else '0001000'}1{number % 256:08b}1"  # first macroblock 0, type, parameter set 0
     bits += "1" * (-len(bits) % 8)
     head = bytes([0x65 if key else 0x61]) + int(bits, 2).to_bytes(len(bits) // 8, "big")
@@ -41,7 +41,7 @@ def test_a_real_tellos_parameters() -> None:
     assert parse_slice(units(picture(0, 100, key=True))[2], sequence) == Slice(True, True, True, 0)
 
 
-def test_pictures_come_out_as_they_went_in() -> None:
+def test_pictures_come_out_unchanged() -> None:
     sent = group([30_000, 11_000, 1_000, PIECE + 1, 9_999])
     got = fed(Assembly(), [piece for each in sent for piece in pieces(each)])
     assert [unit.data for unit in got] == sent
@@ -53,17 +53,17 @@ def test_pictures_come_out_as_they_went_in() -> None:
         False,
         False,
         False,
-    ]  # what was before the first is unknown
+    ]  # the time before the first one is unknown
 
 
-def test_a_picture_of_whole_pieces_only_ends_with_the_next() -> None:
+def test_a_picture_of_full_pieces_only_ends_with_the_next() -> None:
     sent = group([5_000, 2 * PIECE, 700])
     got = fed(Assembly(), [piece for each in sent for piece in pieces(each)])
     assert [unit.data for unit in got] == sent
-    assert [unit.whole for unit in got] == [True, False, True]  # it may have lost a piece: nothing tells
+    assert [unit.whole for unit in got] == [True, False, True]  # a lost piece would go unnoticed
 
 
-def test_parameter_sets_may_come_in_datagrams_of_their_own() -> None:
+def test_parameter_sets_may_arrive_in_separate_datagrams() -> None:
     key = picture(0, 4_000, key=True)
     assembly = Assembly()
     head = START + SPS + START + PPS
@@ -73,14 +73,14 @@ def test_parameter_sets_may_come_in_datagrams_of_their_own() -> None:
     assert got[0].arrived_ns == 0
 
 
-def test_a_lost_end_is_seen_at_the_next_beginning() -> None:
+def test_a_lost_end_is_detected_at_the_next_beginning() -> None:
     sent = group([5_000, 5_000, 5_000])
     datagrams = [*pieces(sent[0]), *pieces(sent[1])[:-1], *pieces(sent[2])]
     got = fed(Assembly(), datagrams)
     assert [unit.whole for unit in got] == [True, False, True]
 
 
-def test_a_lost_beginning_leaves_the_rest_out_and_is_told() -> None:
+def test_a_lost_beginning_drops_the_rest_and_is_counted() -> None:
     sent = group([5_000, 5_000, 5_000])
     assembly = Assembly()
     got = fed(assembly, [*pieces(sent[0]), *pieces(sent[1])[1:], *pieces(sent[2])])
@@ -90,7 +90,7 @@ def test_a_lost_beginning_leaves_the_rest_out_and_is_told() -> None:
     assert assembly.missing == 1
 
 
-def test_pictures_that_are_missing_show_in_the_numbers() -> None:
+def test_the_numbers_reveal_missing_pictures() -> None:
     sent = group([2_000] * 300)
     assembly = Assembly()
     kept = [sent[0], sent[1], *sent[5:]]
@@ -114,14 +114,14 @@ def test_broken_parameters_are_refused(unit: bytes) -> None:
 
 
 @given(st.lists(st.binary(max_size=PIECE + 5) | st.binary(max_size=40).map(lambda tail: START + tail), max_size=40))
-def test_any_datagrams_are_taken(datagrams: list[bytes]) -> None:
+def test_any_datagrams_are_survived(datagrams: list[bytes]) -> None:
     assembly = Assembly()
     got = fed(assembly, datagrams)
     assert sum(len(unit.data) for unit in got) + assembly.stray <= sum(map(len, datagrams))
 
 
 @given(st.integers(0, 2**32), st.floats(0.0, 0.6))
-def test_with_any_loss_what_comes_out_is_made_of_what_went_in(seed: int, lost: float) -> None:
+def test_with_any_loss_the_output_consists_of_input_pieces(seed: int, lost: float) -> None:
     chance = random.Random(seed)
     sent = group([chance.randrange(600, 20_000) for _ in range(20)])
     kept = [piece for each in sent for piece in pieces(each) if chance.random() >= lost]

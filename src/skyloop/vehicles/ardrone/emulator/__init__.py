@@ -1,4 +1,4 @@
-"""An AR.Drone 1 or 2, emulated on the network over a simulated vehicle, for any program that flies the real one.
+"""Emulate an AR.Drone 1 or 2 on the network over a simulated vehicle, for any program that flies the real one.
 
 On free ports of this machine, for a test::
 
@@ -9,10 +9,10 @@ On free ports of this machine, for a test::
     host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
     with ArdroneFirmware(host, version=2, ports=Ports.free()) as firmware:
         ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP of version 1), .control (TCP)
-        host.simulation.truth(0).position_m  # what the vehicle really does
+        host.simulation.truth(0).position_m  # the vehicle's true position
 
-``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. With
-``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
+``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` of
+:mod:`skyloop.faults` drops datagrams in both directions.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ if TYPE_CHECKING:
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]
 
 
-REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
+REPORTS_HZ: Final = 125.0  #: the report rate of a world that keeps time
 
 
 def with_ardrones(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are AR.Drones: their identified response, navdata as often as possible.
+    """Return options of a world whose drones are AR.Drones: their identified response, and the highest navdata rate.
 
-    Cameras are the firmware's own, whatever the options say.
+    The firmware brings its own cameras and ignores those of the options.
     """
     return replace(options or SimOptions(), parameters=AR_DRONE, rate_hz=REPORTS_HZ, cameras=())
 
@@ -68,18 +68,18 @@ class Settings:
     torn_start: bool
 
 
-DEMO_HZ: Final = 15.0
+DEMO_HZ: Final = 15.0  #: navdata of the demo mode
 
 
 class RunningFirmware(RunningEmulator):
-    """An AR.Drone that is switched on. The logic, the ports and the lists of clients belong to the loop's thread."""
+    """An AR.Drone that is switched on. Its logic, ports and lists of clients belong to the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
         self._demo_due_ns = 0
-        self._stale = b""  # the picture sent last that needs others before it
+        self._stale = b""  # the last picture that needs earlier ones
         self._navdata_clients, self._video_clients = Listeners(), Listeners()
         self._most_thrust = host.simulation.parameters[drone].most_thrust
         vehicle = SimulatedVehicle(host.simulation, drone)
@@ -129,10 +129,10 @@ class RunningFirmware(RunningEmulator):
 
     def _on_commands(self, datagram: bytes, _sender: Address) -> None:
         self.logic.receive(datagram)
-        self._look_at_video()
+        self._update_video()
 
     def _send_text(self, text: bytes) -> None:
-        self._control_port.accept()  # a client that connected just before its command gets the answer, too
+        self._control_port.accept()  # a client that connected just before its command also gets the answer
         self._control_port.broadcast(text)
 
     def _asked_for_navdata(self, _datagram: bytes, sender: Address) -> None:
@@ -142,8 +142,8 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.logic.supervise(report.believed)
         if self.logic.lost:
-            self._video_clients = Listeners()  # or an AR.Drone 1 would send pictures to nobody for ever
-        self._look_at_video()
+            self._video_clients = Listeners()  # or an AR.Drone 1 would keep sending to clients that have left
+        self._update_video()
         now_ns = monotonic_ns()
         if self.logic.demo or self.logic.bootstrap:
             if now_ns < self._demo_due_ns:
@@ -186,7 +186,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def _seen(self) -> bool:
-        """Whether anybody receives pictures."""
+        """Whether any client receives pictures."""
         if self._video_stream is not None:
             return bool(self._video_stream.outlets)
         return bool(self._video_clients)
@@ -203,8 +203,8 @@ class RunningFirmware(RunningEmulator):
         believed = self._report.believed
         return -believed.pitch_rad, believed.roll_rad, -believed.yaw_rad
 
-    def _look_at_video(self) -> None:
-        """Follow the configuration, on the loop's thread."""
+    def _update_video(self) -> None:
+        """Apply the video configuration. Runs on the loop's thread."""
         wanted = self.logic.video
         if wanted == self._shown:
             return
@@ -222,7 +222,7 @@ class RunningFirmware(RunningEmulator):
         self._video_clients.refresh(sender)
 
     def _encoded(self, piece: Piece) -> None:
-        """Send a picture. On the encoder's thread."""
+        """Send a picture. Runs on the encoder's thread."""
         self._loop.post(lambda: self._send_video(piece))
 
     def _send_video(self, piece: Piece) -> None:
@@ -234,10 +234,10 @@ class RunningFirmware(RunningEmulator):
             for client, _ in self._video_clients.next_sequences():
                 self._video_datagrams.send(piece.data, client)
 
-    # Called by the host, on its threads ------------------------------------------------------------------------
+    # Called by the host on its threads -------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many pictures a second of this camera would be sent to anybody: all or none."""
+        """Return the frame rate for this camera: the full one, or 0 without a client."""
         return super().wanted_fps(camera) if self._seen else 0.0
 
 
@@ -245,27 +245,27 @@ VERSIONS: Final = (1, 2)
 
 
 class ArdroneFirmware(Emulator[RunningFirmware]):
-    """The firmware of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
+    """The firmware of one drone in a host's world. Several can share a host, each with its own drone and ports.
 
     Make the host with :func:`with_ardrones`. Full navdata is sent as often as the host reports
     (:attr:`skyloop.sim.options.SimOptions.rate_hz`), and at most 125 times a second; real drones send 200.
 
     Args:
         host: The simulated world.
-        drone: Its number in it.
+        drone: Its number in that world.
         version: 1 or 2.
         bind: The address of this machine to listen on.
-        ports: To listen on; 0 for any free one.
-        faults: Befall the datagrams of AT commands, navdata and an AR.Drone 1's video, each way.
-        delay_s: By which those datagrams are late, each way.
-        header_size: Of the PaVE headers, 68 bytes or, as early firmware has it, 64.
-        torn_start: Whether a new client of an AR.Drone 2's video first gets the last picture that was sent to somebody
-            before, however old, and then what comes, key frame or not, as from a real drone; otherwise its stream
+        ports: Ports to listen on; 0 for any free one.
+        faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
+        delay_s: Added to those datagrams, in each direction.
+        header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
+        torn_start: Whether a new client of an AR.Drone 2's video first gets the last picture sent to another client,
+            however old, and then the following frames, key frame or not, as from a real drone. Otherwise its stream
             begins with the next key frame.
 
     Raises:
-        UsageError: There is no such version or header, or the delay is out of range.
-        MissingExtraError: What draws or encodes pictures is not installed.
+        UsageError: No such version or header size, or the delay is out of range.
+        MissingExtraError: A library that draws or encodes pictures is not installed.
     """
 
     def __init__(
@@ -282,7 +282,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         torn_start: bool = True,
     ) -> None:
         if version not in VERSIONS:
-            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, and none of version {version!r}")
+            raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, but no version {version!r}")
         if header_size not in (64, 68):
             raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
         if version > 1:
@@ -292,15 +292,15 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        self.settings = replace(self.settings, ports=running.ports)  # kept for a restart
         return running
 
     @property
     def ports(self) -> Ports:
-        """The real ports, where 0 was asked for."""
+        """The real ports; free ones were chosen for 0."""
         return self._started.ports
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The state of the running firmware, for tests; it belongs to its thread."""
+        """The state of the running firmware, for tests; belongs to the loop's thread."""
         return self._started.logic

@@ -1,4 +1,4 @@
-"""The drone's configuration: values of each session, user and application, and the texts that it sends. Pure."""
+"""The drone's configuration: values per session, user and application, and the dumps that it sends. Pure."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from skyloop.vehicles.ardrone.wire.configuration import (
     parse_value,
 )
 
-MOST_CUSTOM: Final = 16  #: sessions, users and applications each; the drone's own number is not known
+MOST_CUSTOM: Final = 16  #: of sessions, users and applications each; the real drone's number is unknown
 
-Ids = tuple[str, str, str]  #: of session, user and application, as ``CONFIG_IDS`` has them
+Ids = tuple[str, str, str]  #: of session, user and application, as in ``CONFIG_IDS``
 
 _ID: Final = re.compile(r"[0-9a-f]{8}")
 _ID_KEYS: Final = {
@@ -34,9 +34,9 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: The limits that exist thrice: those in force, for indoors and for outdoors.
+#: The limits that exist three times: in force, for indoors and for outdoors.
 TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
-#: What differs from the usual defaults in the firmware that is emulated: 2.4.8 and 1.7.4.
+#: Values of the emulated firmware, 2.4.8 and 1.7.4, that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
     1: {
         "general:num_version_soft": "1.7.4",
@@ -53,10 +53,10 @@ _CHANNELS: Final = {1: 4, 2: 2}  # of the camera, or pairs of cameras
 
 
 class Configuration:
-    """All keys of an AR.Drone 1 or 2. Never raises for what it is sent: what makes no sense is ignored.
+    """All keys of an AR.Drone 1 or 2. Never raises for received values: ignores nonsense.
 
-    A number out of range is brought into it, which no source reports of the drone. A key of the category session, user
-    or application has a value for each id; new ids begin with the factory's values.
+    A number out of range is clamped; no source reports what the drone does. A key of the category session, user or
+    application has a value for each id; new ids begin with the factory's values.
     """
 
     def __init__(self, version: int) -> None:
@@ -69,7 +69,7 @@ class Configuration:
         self._ids = dict.fromkeys(Category, DEFAULT_ID)
 
     def __getitem__(self, name: str) -> Value:
-        """Return the value in force of a key."""
+        """Return the current value of a key."""
         category = self._keys[name].category
         return self._values[category][self._ids[category]][name]
 
@@ -78,7 +78,7 @@ class Configuration:
         return name in self._keys
 
     def number(self, name: str) -> float:
-        """Return the value in force of a key that holds a number."""
+        """Return the current value of a numeric key."""
         value = self[name]
         assert isinstance(value, int | float)
         return value
@@ -89,10 +89,10 @@ class Configuration:
         return self._ids[Category.SESSION], self._ids[Category.USER], self._ids[Category.APPLICATION]
 
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
-        """Handle a ``CONFIG``, with the ids that came right before it, if any; return whether it was obeyed.
+        """Handle a ``CONFIG`` with the ids that came right before it, if any; return whether it was obeyed.
 
-        Once a session, user or application of its own is in force, only what comes with its ids is obeyed, except for
-        ``custom:…_id``, or nobody else could ever begin one.
+        With a custom session, user or application in force, only commands with its ids are obeyed. ``custom:…_id``
+        is the exception, or no other client could ever begin one.
         """
         name = name.strip().lower()
         key = self._keys.get(name)
@@ -110,16 +110,16 @@ class Configuration:
         return True
 
     def forget_client(self) -> None:
-        """Put the default session, user and application in force again: the link was lost."""
+        """Restore the default session, user and application after a link loss."""
         self._ids = dict.fromkeys(Category, DEFAULT_ID)
         self._show_ids()
 
     def dump(self) -> bytes:
-        """Return what the control port sends on ``CTRL 4``."""
+        """Return the control port's answer to ``CTRL 4``."""
         return format_dump({name: self[name] for name in self._keys})
 
     def custom_ids(self) -> bytes:
-        """Return what the control port sends on ``CTRL 6``."""
+        """Return the control port's answer to ``CTRL 6``."""
         parts = []
         for category, (title, description) in _DESCRIPTIONS.items():
             parts.append(title)
@@ -165,12 +165,12 @@ class Configuration:
         return True
 
     def _show_ids(self) -> None:
-        """Show the ids in force in the keys that have them, which belong to the session."""
+        """Write the ids in force into their keys, which belong to the session."""
         session = self._values[Category.SESSION][self._ids[Category.SESSION]]
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 
     def _understood(self, key: Key, text: str) -> Value | None:
-        """Return the value that a text stands for, or None."""
+        """Return the value of a text; None if it makes no sense."""
         try:
             value = parse_value(text, _as_number(key.default))
         except DecodeError:
@@ -196,5 +196,5 @@ class Configuration:
 
 
 def _as_number(default: Value) -> Value:
-    """Whole numbers may be sent with a point, which the firmware's C reads as well."""
+    """Accept a decimal point in whole numbers, as the firmware's C does."""
     return float(default) if isinstance(default, int) and not isinstance(default, bool) else default

@@ -1,7 +1,7 @@
-"""The firmware's flight logic: from AT commands, silence and the battery to what the vehicle does. Pure: no clock.
+"""The firmware's flight logic: turns AT commands, silence and battery state into set-points. Pure: no clock.
 
-Follows the Developer Guide where it says how the drone decides. Not modelled: flight animations. They are noted, and a
-flip shows in navdata for as long as it is asked for, but the vehicle goes on with its last command.
+Follows the Developer Guide's description of the drone's decisions. Flight animations are not modelled: they are
+recorded, and navdata shows a flip for its duration, but the vehicle keeps following its last command.
 
 Values of a ``PCMD`` are from -1 to 1 of the configured limits, with the drone's signs: roll > 0 right, pitch < 0 nose
 down, gaz > 0 up, yaw > 0 clockwise.
@@ -25,16 +25,16 @@ from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
-TAKEOFF_ALTITUDE_M: Final = 0.85  #: hovers after a take-off at 0.7 to 1 m
-_LEAST_TURNING_SPEED_M_S: Final = 1.0  # of a coordinated turn: slower ones turn as if this fast
+TAKEOFF_ALTITUDE_M: Final = 0.85  #: real drones hover at 0.7 to 1 m after a take-off
+_LEAST_TURNING_SPEED_M_S: Final = 1.0  # of a coordinated turn; slower turns use this speed
 _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """A ``PCMD`` or ``PCMD_MAG`` as it came.
+    """A ``PCMD`` or ``PCMD_MAG`` as received.
 
-    ``heading`` is that of the remote control, share of 180° from north, clockwise; None in a ``PCMD``.
+    ``heading`` is the remote control's, as a share of 180° from north, clockwise; None in a ``PCMD``.
     """
 
     flags: int
@@ -55,7 +55,7 @@ NO_PROGRESS: Final = Progress(0, 0.0, 0.0, 0.0, 0.0)
 
 
 def limits_of(configuration: Configuration) -> Limits:
-    """Return the vehicle's limits by the configuration, brought within the range of the simulated vehicle."""
+    """Return the vehicle's limits for the configuration, clamped to the range of the simulated vehicle."""
     return Limits(
         tilt_rad=_possible("tilt_rad", configuration.number("control:euler_angle_max")),
         climb_m_s=_possible("climb_m_s", configuration.number("control:control_vz_max") / 1000),
@@ -68,13 +68,13 @@ def limits_of(configuration: Configuration) -> Limits:
 def set_point(
     progress: Progress, configuration: Configuration, *, yaw_rad: float, forward_m_s: float
 ) -> Attitude | Hover:
-    """Return the set-point that a ``PCMD`` asks for, within the configured limits."""
+    """Return the set-point for a ``PCMD``, within the configured limits."""
     if not progress.flags & Pcmd.PROGRESSIVE:
         return Hover()
     most_tilt = configuration.number("control:euler_angle_max")
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        # Meant for a heading that is so much less far clockwise than the drone's.
+        # Relative to the remote control's heading: turn it by the difference from the drone's.
         right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
@@ -92,11 +92,11 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: of silence: Developer Guide, general:com_watchdog (recalled, not read again)
-LOST_AFTER_S: Final = 2.0  #: of silence the link counts as lost
+HOVER_AFTER_S: Final = 0.25  #: of silence: Developer Guide, general:com_watchdog (from memory, not checked)
+LOST_AFTER_S: Final = 2.0  #: of silence until the link counts as lost
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: estimate: no source gives the angle
-BATTERY_RECOVERY_MV: Final = 500  #: estimate; so far above vbat_min a battery does not count as low any more
-CALIBRATION_RATE_RAD_S: Final = 1.5  #: estimate: a turn of the calibration takes about 4 s
+BATTERY_RECOVERY_MV: Final = 500  #: estimate; this far above vbat_min a battery no longer counts as low
+CALIBRATION_RATE_RAD_S: Final = 1.5  #: estimate: the calibration's turn takes about 4 s
 FIRST_FLIP: Final = 16
 LAST_ANIMATION: Final = 19
 
@@ -105,36 +105,36 @@ _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 @dataclass(frozen=True, slots=True)
 class Animation:
-    """A flight animation that was asked for: only this note comes of it."""
+    """A requested flight animation; only recorded."""
 
     number: int
     until_ns: int
 
 
 class FlightControl:
-    """Flies one drone. Times are of the caller's clock [ns]."""
+    """Flies one drone. Times are on the caller's clock [ns]."""
 
     def __init__(self, vehicle: Vehicle, configuration: Configuration, *, version: int) -> None:
         self._vehicle = vehicle
         self._configuration = configuration
         self._version = version
-        self._toggle_ready = True  # the emergency bit was 0 since it last did something
-        self._emergency = State(0)  # why, beside EMERGENCY
+        self._toggle_ready = True  # the emergency bit was 0 since its last effect
+        self._emergency = State(0)  # the reasons, without EMERGENCY itself
         self._calibrating_until_ns = 0
         self._believed: VehicleFeedback | None = None
         self.start = False  #: the take-off bit of the last REF
         self.battery_low = False
-        self.trim_rad = (0.0, 0.0)  #: roll and pitch that FTRIM found, which navdata is relative to
-        self.progress = NO_PROGRESS  #: the last one that made sense
+        self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM; navdata is relative to them
+        self.progress = NO_PROGRESS  #: the last valid one
         self.animation: Animation | None = None
-        self.calibrations = 0  #: of the magnetometer, begun so far
+        self.calibrations = 0  #: calibrations of the magnetometer started so far
 
     # Commands --------------------------------------------------------------------------------------------------
 
     def ref(self, bits: int) -> None:
         """Handle ``REF``: take off, land, toggle the emergency.
 
-        The fixed bits are ignored: some programs leave them out.
+        The fixed bits are ignored, as some programs leave them out.
         """
         self.start = bool(bits & Ref.TAKEOFF)
         if bits & Ref.EMERGENCY:
@@ -151,7 +151,7 @@ class FlightControl:
     def follow(self, progress: Progress, now_ns: int) -> None:
         """Handle ``PCMD`` or ``PCMD_MAG``.
 
-        Ignored where a number is not finite. While the magnetometer is calibrated it is only noted.
+        Ignored if a number is not finite. During a calibration of the magnetometer it is only stored.
         """
         if not progress.makes_sense:
             return
@@ -169,12 +169,12 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: what is measured now is level. Refused in the air."""
+        """Handle ``FTRIM``: take the present attitude as level. Refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
     def calibrate(self, device: int, now_ns: int) -> None:
-        """Handle ``CALIB``: the drone turns on the spot once. Refused on the ground, and by an AR.Drone 1."""
+        """Handle ``CALIB``: turn once on the spot. Refused on the ground, and by an AR.Drone 1."""
         if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
             return
         self.calibrations += 1
@@ -187,17 +187,17 @@ class FlightControl:
             self.animation = Animation(number, now_ns + duration_ms * 1_000_000)
 
     def calibrating(self, now_ns: int) -> bool:
-        """Return whether the drone turns to calibrate its magnetometer."""
+        """Return whether the drone is turning to calibrate its magnetometer."""
         return now_ns < self._calibrating_until_ns
 
     def flipping(self, now_ns: int) -> bool:
-        """Return whether a flip was asked for and its time is not over."""
+        """Return whether a requested flip is still in its time."""
         return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
 
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Watch battery and angles, and the link by how long no command has come. Called regularly."""
+        """Check battery and angles, and the link by the time without commands. Called regularly."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:
@@ -224,7 +224,7 @@ class FlightControl:
         elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
             self._emergency = State(0)
             self._toggle_ready = False
-        # A reset while it still falls is ignored, and works as soon as it lies if the bit is still set then.
+        # A reset in mid-fall is ignored; if the bit is still set when the drone lies on the ground, it works then.
 
     def _watch_battery(self, believed: VehicleFeedback) -> None:
         least_mv = self._configuration.number("general:vbat_min")

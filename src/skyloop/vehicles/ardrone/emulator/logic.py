@@ -1,6 +1,6 @@
-"""The drone's logic: handles AT commands, keeps the link, the configuration and the state bits.
+"""The drone's logic: handle AT commands and keep the link, the configuration and the state bits.
 
-Pure: the clock is an argument, and what it sends is given to a function.
+Pure: the clock is an argument, and output goes to a function.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
-RESTART: Final = 1  #: the sequence number with which a client restarts
+RESTART: Final = 1  #: the sequence number of a client's restart
 
 
 class CommandSequence:
-    """Accepts a command only if its number is greater than that of the last one accepted, or 1, which restarts.
+    """Accepts a command only if its number is greater than that of the last accepted one, or is 1, which restarts.
 
-    After two seconds without an accepted command any number greater than 0 is new again. The Developer Guide asks
-    clients to begin with 1; a drone that insisted on it would never again obey a client whose first datagram got lost,
-    so this one doesn't.
+    After two seconds without an accepted command any number greater than 0 is new again. The Developer Guide tells
+    clients to begin with 1; a drone that insisted on it would never obey a client whose first datagram was lost, so
+    this one does not.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class CommandSequence:
         self._taken_ns: int | None = None
 
     def takes(self, number: int, now_ns: int) -> bool:
-        """Return whether the command with this number, received now, is to be executed."""
+        """Return whether to execute the command with this number, received now."""
         if self._taken_ns is not None and now_ns - self._taken_ns > nanoseconds(SILENCE_RESET_S):
             self._last = 0
         if number != RESTART and number <= self._last:
@@ -63,13 +63,13 @@ _CAMERAS: Final = {
     VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
 }
 _INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
-#: Commands that a real drone accepts and that have no effect here: legacy, and the factory's.
+#: Commands that a real drone accepts and that have no effect here: legacy and factory commands.
 _WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
 
 
 @dataclass(frozen=True, slots=True)
 class VideoSettings:
-    """The video as it is configured."""
+    """The configured video."""
 
     channel: VideoChannel
     codec: VideoCodec
@@ -89,7 +89,7 @@ class VideoSettings:
 
 @dataclass(frozen=True, slots=True)
 class LedAnimation:
-    """The last one asked for; a simulated drone has no lights."""
+    """The last request; a simulated drone has no lights."""
 
     number: int
     frequency_hz: float
@@ -104,17 +104,17 @@ class ArdroneLogic:
         self._send_text = send_text
         self._clock = clock
         self._sequence = CommandSequence()
-        self._received_ns = clock()  # what came last; until something does, the start
-        self._linked = False  # something came since the start, or since the link was lost
+        self._received_ns = clock()  # the last command, or the start before the first one
+        self._linked = False  # a command arrived since the start or the last link loss
         self._watchdog = True
         self._ack = False
-        self.lost = False  #: nothing was received for so long that the link counts as lost
+        self.lost = False  #: the link counts as lost after a long silence
         self._ids: Ids | None = None  # from the command right before
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
-        self.bootstrap = True  #: no options are sent before the mode is configured
+        self.bootstrap = True  #: sends no options until the mode is configured
         self.leds: LedAnimation | None = None
-        self.malformed = 0  #: lines that made no sense, commands that no drone has, and wrong arguments
+        self.malformed = 0  #: nonsense lines, unknown commands and wrong arguments
         self.stale = 0  #: commands whose sequence number was not new
         self._handlers: dict[str, Callable[..., None]] = {
             "REF": self._ref,
@@ -133,10 +133,10 @@ class ArdroneLogic:
         }
         self._apply_limits()
 
-    # Hearing ---------------------------------------------------------------------------------------------------
+    # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Execute the commands of a datagram. Never raises, whatever is in it."""
+        """Execute the commands of a datagram. Never raises for any content."""
         commands, malformed = parse_commands(datagram)
         self.malformed += malformed
         for command in commands:
@@ -149,7 +149,7 @@ class ArdroneLogic:
             self._execute(command, ids)
 
     def supervise(self, believed: VehicleFeedback) -> None:
-        """Run the watchdogs and watch the battery and the angles. Called regularly, with what the vehicle believes."""
+        """Run the watchdogs and check battery and angles. Called regularly, with the vehicle's own estimate."""
         silence_s = self.silence_s
         if silence_s > WATCHDOG_S:
             self._watchdog = True
@@ -159,24 +159,21 @@ class ArdroneLogic:
 
     @property
     def silence_s(self) -> float:
-        """Time since the last command that was accepted, or since the start [s]."""
+        """Time since the last accepted command, or since the start [s]."""
         return seconds(self._clock() - self._received_ns)
 
     def _lose_link(self) -> None:
-        """Reset the link.
-
-        The next client begins with the bootstrap, and with the default session, user and application.
-        """
+        """Reset the link: the next client begins with bootstrap and the default session, user and application."""
         self.lost, self._linked = True, False
         self.bootstrap = True
         self._ack = False
         self.configuration.forget_client()
         self._apply_limits()
 
-    # Telling ---------------------------------------------------------------------------------------------------
+    # Sending ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits; ``video``: whether anybody receives pictures."""
+        """Return the state bits; ``video``: whether any client receives pictures."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,
@@ -198,12 +195,12 @@ class ArdroneLogic:
 
     @property
     def demo(self) -> bool:
-        """Whether navdata comes 15 times a second, with few options."""
+        """Whether navdata is sent 15 times a second with few options."""
         return bool(self.configuration["general:navdata_demo"])
 
     @property
     def video(self) -> VideoSettings:
-        """The video as it is configured now."""
+        """The video as configured now."""
         number, keys = self.configuration.number, self.configuration
         most = number("video:max_bitrate") if "video:max_bitrate" in keys else float("inf")
         return VideoSettings(
@@ -224,7 +221,7 @@ class ArdroneLogic:
             handler = partial(handler, ids)
         try:
             handler(*command.arguments)
-        except (TypeError, ValueError, OverflowError):  # too few or many arguments, or a text for a number
+        except (TypeError, ValueError, OverflowError):  # too few or too many arguments, or text in place of a number
             self.malformed += 1
 
     def _ref(self, bits: int) -> None:
@@ -246,7 +243,7 @@ class ArdroneLogic:
         self._watchdog = False
 
     def _ctrl(self, mode: int, _unused: int = 0) -> None:
-        if mode in (Ctrl.NONE, Ctrl.CLEAR_ACK):  # the guide says 0 and the SDK sends 5
+        if mode in (Ctrl.NONE, Ctrl.CLEAR_ACK):  # the guide says 0, the SDK sends 5
             self._ack = False
         elif mode == Ctrl.GET_CONFIGURATION:
             self._answer(self.configuration.dump())
@@ -267,7 +264,7 @@ class ArdroneLogic:
         self._ids = (str(session).lower(), str(user).lower(), str(application).lower())
 
     def _config(self, ids: Ids | None, name: str, value: str) -> None:
-        self._ack = True  # means that it was received, not that it was obeyed
+        self._ack = True  # acknowledges reception only, not execution
         self._set(str(name), str(value), ids)
 
     def _set(self, name: str, text: str, ids: Ids | None = None) -> None:

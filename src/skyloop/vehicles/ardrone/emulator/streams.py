@@ -1,4 +1,4 @@
-"""A TCP port of the drone: clients are sent bytes, and what they send is thrown away."""
+"""A TCP port of the drone that sends to its clients and discards what it receives."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Final
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE
 from skyloop.vehicles.emulation.datagrams import Address, Loop, bound
 
-MOST: Final = 8
+MOST: Final = 8  #: recipients of datagrams
 
 
 class Listeners:
-    """Addresses that are sent to, each with a sequence of its own.
+    """Addresses of recipients, each with its own sequence.
 
-    As many as :data:`MOST`: a further one replaces the one that has not asked for longest. They never have to ask
-    again, as with the real drone.
+    At most :data:`MOST`; a further one replaces the one with the oldest request. Requests need not be repeated, as
+    with the real drone.
     """
 
     def __init__(self) -> None:
-        self._sequences: dict[Address, int] = {}  # in the order in which they asked last
+        self._sequences: dict[Address, int] = {}  # in the order of their last requests
 
     def refresh(self, address: Address) -> bool:
-        """Add an address that asked. Return whether it is new."""
+        """Add an address that sent a request. Return whether it is new."""
         sequence = self._sequences.pop(address, None)
         self._sequences[address] = FIRST_SEQUENCE if sequence is None else sequence
         if len(self._sequences) > MOST:
@@ -32,7 +32,7 @@ class Listeners:
         return sequence is None
 
     def next_sequences(self) -> list[tuple[Address, int]]:
-        """Return all addresses with the sequence number of what is sent now."""
+        """Return all addresses with the next sequence number for each."""
         now = list(self._sequences.items())
         for address, sequence in now:
             self._sequences[address] = (sequence + 1) & 0xFFFFFFFF
@@ -42,8 +42,8 @@ class Listeners:
         return len(self._sequences)
 
 
-MOST_CLIENTS: Final = 8
-MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client beyond what the system holds
+MOST_CLIENTS: Final = 8  #: of a TCP port
+MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client, beyond the system's buffer
 _SYSTEM_BUFFER: Final = 64 * 1024
 _READ: Final = 4096
 
@@ -51,8 +51,8 @@ _READ: Final = 4096
 class Outlet:
     """One connection.
 
-    A client that reads too slowly gets no part of a stream, but whole pieces left out: from one that does not fit until
-    the next that can be understood without those before.
+    A client that reads too slowly loses whole pieces of the stream, from the first one that does not fit to the next
+    one that can be understood without its predecessors.
     """
 
     def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
@@ -63,14 +63,14 @@ class Outlet:
         self._backlog = 0
         self._writing = False
         self._skipping = False
-        self.dropped = 0  #: pieces left out
+        self.dropped = 0  #: pieces dropped
         connection.setblocking(False)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SYSTEM_BUFFER)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece, unless the client is too slow; ``starts``: a client can begin with it."""
+        """Send a piece, unless the client is too slow; ``starts``: a stream can begin with it."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:
@@ -83,7 +83,7 @@ class Outlet:
             self._write()
 
     def skip_to_start(self) -> None:
-        """Leave out what comes until the next piece that a client can begin with."""
+        """Drop pieces until the next one that a stream can begin with."""
         self._skipping = True
 
     def close(self) -> None:
@@ -122,27 +122,27 @@ class Outlet:
 
 
 class StreamPort:
-    """A listening port with its clients. Used on the loop's thread."""
+    """A listening port and its clients. Used on the loop's thread."""
 
     def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
         self._loop = loop
         self._joined = joined
         self._socket = bound(socket.SOCK_STREAM, bind, name)
         self._socket.listen(MOST_CLIENTS)
-        self.outlets: list[Outlet] = []  #: replaced as a whole: other threads may read it
+        self.outlets: list[Outlet] = []  #: replaced as a whole, as other threads may read it
         loop.watch(self._socket, self.accept)
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The real port; a free one was chosen for 0."""
         return int(self._socket.getsockname()[1])
 
     def accept(self) -> None:
-        """Accept the connections that wait."""
+        """Accept the waiting connections."""
         while True:
             try:
                 connection, _ = self._socket.accept()
-            except OSError:  # nobody waits, or has given up meanwhile
+            except OSError:  # none waiting, or closed meanwhile
                 return
             if len(self.outlets) >= MOST_CLIENTS:
                 connection.close()

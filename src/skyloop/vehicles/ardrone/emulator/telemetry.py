@@ -1,8 +1,8 @@
-"""The options of navdata from what the vehicle believes, in the drone's units, axes and signs. Pure.
+"""Make the options of navdata from the vehicle's own estimate, in the drone's units, axes and signs. Pure.
 
-The drone's body axes are x forward, y right, z down; theta is positive nose up, psi clockwise. What the simulation does
-not have is zero: tags seen by the drone's own vision, optical flow, trackers, the barometer's and the vision's inner
-values, GPS (no receiver plugged in).
+The drone's body axes are x forward, y right, z down; theta is positive nose up, psi clockwise. Values that the
+simulation does not have are zero: tags seen by the drone's own vision, optical flow, trackers, internal values of
+barometer and vision, GPS (no receiver plugged in).
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ _CONTROL_STATES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """All that the options are made from."""
+    """The inputs of all options."""
 
     believed: VehicleFeedback
     state: FlightState
-    time: int  #: as :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time` gives it
-    thrust: float = 0.0  #: of the weight
+    time: int  #: from :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time`
+    thrust: float = 0.0  #: as a share of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that count as level
     progress: Progress = NO_PROGRESS
@@ -70,7 +70,7 @@ class Snapshot:
 
     @property
     def heading_deg(self) -> float:
-        """Heading, clockwise from north, within ±180."""
+        """Heading, clockwise from north, from -180 to 180."""
         return (90.0 - math.degrees(self.believed.yaw_rad) + 180.0) % 360.0 - 180.0
 
     @property
@@ -86,15 +86,15 @@ class Snapshot:
 
 
 def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
-    """Return the options with these tags, in their order."""
+    """Return the options with these tags, in the given order."""
     return [_MAKERS[tag](snapshot) for tag in tags]
 
 
 def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
-    """Return the tags of the options that are sent, ascending, by the mask ``general:navdata_options``.
+    """Return the tags of the options to send, ascending, for the mask ``general:navdata_options``.
 
-    In demo mode those of the usual mask and of the configured one. In full mode those of the configured one; all where
-    it still is the usual one, for that is what drones sent to programs that never configured it.
+    Demo mode sends those of the usual mask and of the configured one. Full mode sends those of the configured mask, or
+    all if it still is the usual one, as real drones do for programs that never configured it.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL
@@ -132,7 +132,7 @@ def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
 
 
 def _raw(s: Snapshot) -> o.RawMeasures:
-    """Scales of the converters are estimates; the battery's voltage is what programs read here."""
+    """Return raw measures. The converters' scales are estimates; programs read the battery's voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
         gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),
@@ -147,7 +147,7 @@ def _physical(s: Snapshot) -> o.PhysMeasures:
 
 
 def _euler_angles(s: Snapshot) -> o.EulerAngles:
-    """By the accelerometers alone: right only while nothing accelerates."""
+    """Return the attitude from the accelerometers alone, which is right only without acceleration."""
     x, y, z = s.believed.acceleration_m_s2
     theta = math.degrees(math.atan2(x, math.hypot(y, z)))
     return o.EulerAngles(theta * 1000, -math.degrees(math.atan2(y, abs(z))) * 1000)
@@ -167,7 +167,7 @@ def _rc_references(s: Snapshot) -> o.RcReferences:
 
 
 def _pwm(s: Snapshot) -> o.Pwm:
-    """In proportion to thrust, the same for all motors."""
+    """Return motor values in proportion to thrust, the same for all motors."""
     motor = _within(255 * s.thrust / s.most_thrust, 0, 255)
     return o.Pwm(motors=(motor,) * 4, saturations=(255 if motor else 0,) * 4, vz_ref=s.progress.gaz)
 

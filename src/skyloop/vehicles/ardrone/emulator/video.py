@@ -1,10 +1,9 @@
-"""The AR.Drones' cameras, clock, formats and codecs: from pictures to what goes out. Pure.
+"""The AR.Drones' cameras, clock, formats and codecs: turn pictures into stream pieces. Pure.
 
-An AR.Drone 1 encodes in UVLC. The format, and what is known about it from where, stands at the decoder,
-:mod:`skyloop.vehicles.ardrone.wire.uvlc`, with which the encoder shares the tables and nothing else. As the Parrot
-SDK's encoder does, it sends complete pictures only, codes every macroblock, cuts levels towards zero, writes levels
-beyond 127, the last in the Developer Guide's table, by the rule of that table, and ends a picture with zeros up to a
-whole word.
+An AR.Drone 1 encodes in UVLC. The decoder, :mod:`skyloop.vehicles.ardrone.wire.uvlc`, documents the format and its
+sources; the encoder shares only the tables with it. Like the Parrot SDK's encoder, it sends complete pictures only,
+codes every macroblock, truncates levels towards zero, extends the Developer Guide's table of levels, which ends at 127,
+by its own rule, and pads a picture with zeros to a whole word.
 """
 
 from __future__ import annotations
@@ -56,17 +55,17 @@ _MICROSECOND_BITS: Final = 21
 
 @dataclass(frozen=True, slots=True)
 class DroneClock:
-    """Counts from when the drone was switched on. Arguments are times of this host's monotonic clock [ns]."""
+    """Time since the drone was switched on. Arguments are times of this host's monotonic clock [ns]."""
 
     booted_ns: int
 
     def navdata_time(self, at_ns: int) -> int:
-        """Return seconds in the upper 11 bits and microseconds in the lower 21: wraps after 2048 s."""
+        """Return seconds in the upper 11 bits and microseconds in the lower 21; wraps after 2048 s."""
         s, us = divmod((at_ns - self.booted_ns) // _NS_PER_US, _US_PER_S)
         return s % (1 << _SECOND_BITS) << _MICROSECOND_BITS | us
 
     def milliseconds(self, at_ns: int) -> int:
-        """Return milliseconds, as the video's headers have them."""
+        """Return milliseconds, as in the video's headers."""
         return (at_ns - self.booted_ns) // _NS_PER_MS
 
 
@@ -83,7 +82,7 @@ FRONT_2: Final = replace(
     cy=190.144373,
     distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0),
 )
-#: The picture that the drone sends, which is the middle of its sensor's 320×240 at twice the size.
+#: The transmitted picture: the middle of the sensor's 320×240 at twice the size.
 BOTTOM_2_SENT: Final = replace(
     BOTTOM_CAMERA, width=640, height=360, fx=686.994766, fy=688.195055, cx=329.323208, cy=159.323007
 )
@@ -100,7 +99,7 @@ _PAVE: Final = {"h264": Codec.MPEG4_AVC, "mpeg4": Codec.MPEG4_VISUAL}  #: the co
 MP4_360P: Final = Format("mpeg4", 640, 360, 0)
 H264_360P: Final = Format("h264", 640, 360, 1)
 H264_720P: Final = Format("h264", 1280, 720, 2)
-#: What is sent live for each value of ``video:video_codec``.
+#: Live format for each value of ``video:video_codec``.
 FORMATS: Final = {
     VideoCodec.MP4_360P: MP4_360P,
     VideoCodec.H264_360P: H264_360P,
@@ -115,7 +114,7 @@ FORMATS: Final = {
 
 
 class PavePacker:
-    """Packs pictures of an AR.Drone 2: a PaVE header, and a picture in H.264 or MPEG-4."""
+    """Packs pictures of an AR.Drone 2: a PaVE header and a picture in H.264 or MPEG-4."""
 
     def __init__(self, clock: DroneClock, header_size: int, attitude: Callable[[], tuple[float, float, float]]) -> None:
         self._clock = clock
@@ -126,7 +125,7 @@ class PavePacker:
         self._position = 0
 
     def pack(self, picture: NDArray[np.uint8], settings: VideoSettings, captured_ns: int) -> Piece | None:
-        """Encode a picture, with its header; None if the encoder gave nothing."""
+        """Encode a picture with its header; None if the encoder returned nothing."""
         form = FORMATS[settings.codec]
         wanted = form, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -155,7 +154,7 @@ class PavePacker:
 
 
 class UvlcPacker:
-    """Packs pictures of an AR.Drone 1: one picture in a datagram, each on its own."""
+    """Packs pictures of an AR.Drone 1: one complete picture per datagram."""
 
     def __init__(self) -> None:
         self._number = 0
@@ -168,7 +167,7 @@ class UvlcPacker:
 
 MAX_DATAGRAM: Final = 65_507  #: bytes of a UDP datagram over IPv4
 _COARSER: Final = (4, 8, 16, COARSEST_QUANT)  # quantisers to fall back on for a picture that is too busy
-_END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code that is no level
+_END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code reserved for the end
 _CODES: Final = {size: code for code, size in SIZES.items()}
 
 # YCbCr of BGR: BT.601, full range.
@@ -184,17 +183,17 @@ def encode(
 ) -> bytes:
     """Return one datagram with a picture.
 
-    Macroblocks that would stand half outside are left out, as the format has it.
+    Macroblocks that would lie half outside the picture are left out, as the format requires.
 
     Args:
-        picture: BGR, uint8, shape (height, width, 3), of a size that the format has.
+        picture: BGR, uint8, shape (height, width, 3), of a size in the format.
         number: The picture's.
-        quant: 1 (finest) to 30, or 31, which is like 2 and what real drones send.
+        quant: 1 (finest) to 30, or 31, which is like 2 and used by real drones.
         max_bytes: A picture that would take more is coded coarser.
 
     Raises:
         UsageError: Another size or type, a number or quantiser out of range, or a picture too busy even for the
-            coarsest.
+            coarsest quantiser.
     """
     _check(picture, number, quant)
     height, width = picture.shape[:2]
@@ -220,7 +219,7 @@ def _check(picture: NDArray[np.uint8], number: int, quant: int) -> None:
 
 
 def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the transformed macroblocks of a picture in the order of the stream. Shape (groups, columns, 6, 64)."""
+    """Return a picture's transformed macroblocks in the order of the stream. Shape (groups, columns, 6, 64)."""
     groups, columns = picture.shape[0] // MACROBLOCK, picture.shape[1] // MACROBLOCK
     pixels = picture[: groups * MACROBLOCK, : columns * MACROBLOCK].astype(np.float32)
     luma = pixels @ _LUMA
@@ -241,7 +240,7 @@ def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _quantised(coefficients: NDArray[np.float32], quant: int) -> Ints:
     levels: Ints = (coefficients / STEPS[quant].astype(np.float32)).astype(np.int64)
-    # The mean is rounded, as cutting it would darken the picture; and never 0, as from the Parrot SDK.
+    # The mean is rounded, as truncating it would darken the picture; it is never 0, as in the Parrot SDK.
     mean = np.rint(coefficients[..., 0] / STEPS[quant][0])
     levels[..., 0] = np.clip(mean, 1, (1 << DC_BITS) - 1)
     return levels
@@ -270,12 +269,12 @@ def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
 
 
 def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
-    """Return the codes of a group's macroblocks (columns, 6, 64) one after the other, and the bits of each."""
+    """Return the consecutive codes of a group's macroblocks (columns, 6, 64), and the bits of each."""
     blocks = levels.reshape(-1, COEFFICIENTS)
     values, widths, block_of_pair = _pair_codes(blocks)
     pairs = np.bincount(block_of_pair, minlength=len(blocks))
     described = 0x80 | ((pairs > 0).reshape(-1, BLOCKS) << np.arange(BLOCKS)).sum(axis=1)
-    # Where each block's mean stands: after its macroblock's description if it is the first of it, before its pairs.
+    # Position of each block's mean: before its pairs, and after the macroblock's description if the block is the first.
     is_first = np.arange(len(blocks)) % BLOCKS == 0
     ends = np.cumsum(1 + is_first + pairs)
     means = ends - pairs - 1
@@ -283,16 +282,16 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
     is_pair = np.ones(ends[-1], bool)
     is_pair[means] = is_pair[descriptions] = False
     all_values, all_widths = np.empty((2, ends[-1]), np.int64)
-    all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # after the bit for "coded", 0
+    all_values[descriptions], all_widths[descriptions] = described, 1 + 8  # after the 0 bit for "coded"
     all_values[means], all_widths[means] = blocks[:, 0], DC_BITS
     all_values[is_pair], all_widths[is_pair] = values, widths
     return all_values, all_widths
 
 
 def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the codes of the coefficients that aren't zero, the bits of each, and the block of each.
+    """Return the codes of the nonzero coefficients, the bits of each, and the block of each.
 
-    A code has the zeros before its coefficient, and the last one of a block has the block's end.
+    A code includes the zeros before its coefficient; the last code of a block includes the block's end.
     """
     block, place = np.nonzero(blocks[:, 1:])
     level = blocks[block, place + 1]
@@ -301,7 +300,7 @@ def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
     before = np.where(starts, -1, np.roll(place, 1))
     run_value, run_width = _prefixed(place - before - 1)
     level_value, level_width = _prefixed(np.abs(level))
-    # A level of 1 has no zero before its one, unlike a run of 1.
+    # A level of 1 has no zero before its one bit, unlike a run of 1.
     level_width -= np.abs(level) == 1
     value = (run_value << level_width | level_value) << 1 | (level < 0)
     width = run_width + level_width + 1
@@ -312,7 +311,7 @@ def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
 def _prefixed(number: Ints) -> tuple[Ints, Ints]:
     """Return the codes of numbers, and the bits of each.
 
-    As many zeros as the number has bits and then those; a one for 0.
+    A number is coded as one zero for each of its bits, then those bits; 0 is coded as a one.
     """
     size = np.frexp(number.astype(np.float64))[1].astype(np.int64)
     tail = np.maximum(size - 1, 0)
@@ -320,7 +319,7 @@ def _prefixed(number: Ints) -> tuple[Ints, Ints]:
 
 
 def _bits(values: Ints, widths: Ints) -> NDArray[np.uint8]:
-    """Return the bits of numbers one after the other, each from its most significant on."""
+    """Return the bits of consecutive numbers, each from its most significant bit on."""
     ends = np.cumsum(widths)
     down = np.repeat(ends, widths) - np.arange(ends[-1]) - 1
     return (np.repeat(values, widths) >> down & 1).astype(np.uint8)

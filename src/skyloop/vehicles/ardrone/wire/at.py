@@ -1,8 +1,8 @@
 """AT commands of the AR.Drone (UDP port 5556): text lines both ways. Pure.
 
-``AT*NAME=sequence[,argument]*`` and a carriage return; several in a datagram, none across two. Numbers are signed
-decimals, texts stand in double quotes, and a float is sent as the signed integer that has the same 32 bits. Source:
-Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` of the AR.Drone SDK 2.0.1.
+``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several commands, and none spans two.
+Numbers are signed decimals, texts stand in double quotes, and a float is sent as the signed integer with the same 32
+bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` of the AR.Drone SDK 2.0.1.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Final, TypeAlias
 from skyloop.errors import UsageError
 
 PORT: Final = 5556
-MAX_LINE: Final = 1024  #: characters; the drone drops a longer one whole
-SILENCE_RESET_S: Final = 2.0  #: after so long without a command the drone expects the sequence from 1 again
+MAX_LINE: Final = 1024  #: characters; the drone drops longer lines
+SILENCE_RESET_S: Final = 2.0  #: after this silence the drone expects the sequence to restart at 1
 
 Argument: TypeAlias = int | float | str
 #: A command's name and its arguments after the sequence.
@@ -30,7 +30,7 @@ class Ref(IntFlag):
 
     EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors, or ends the emergency
     TAKEOFF = 1 << 9  #: 1 take off and stay in the air, 0 land and stay on the ground
-    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, which the guide asks for and no drone misses
+    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, required by the guide, not missed by any drone
 
 
 class Pcmd(IntFlag):
@@ -56,7 +56,7 @@ class Ctrl(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class AtCommand:
-    """One line as it came. ``arguments`` are integers (floats still as their bits, see :func:`to_float`) and texts."""
+    """One line as received; ``arguments`` are texts and integers (floats still as their bits: :func:`to_float`)."""
 
     name: str
     sequence: int
@@ -64,7 +64,7 @@ class AtCommand:
 
 
 def format_command(name: str, sequence: int, *arguments: Argument) -> bytes:
-    """One line. Raises :class:`UsageError` for a float that is not finite, a quote in a text, or too long a line."""
+    """Return one line. Raises :class:`UsageError` for a float that is not finite, a quote in a text or a long line."""
     words = [str(sequence), *(_word(argument) for argument in arguments)]
     line = f"AT*{name}={','.join(words)}\r".encode("latin-1", "replace")
     if len(line) > MAX_LINE:
@@ -73,12 +73,12 @@ def format_command(name: str, sequence: int, *arguments: Argument) -> bytes:
 
 
 def to_bits(value: float) -> int:
-    """The signed integer with the same 32 bits as this float: 0.5 is 1056964608."""
+    """Return the signed integer with the same 32 bits as this float: 0.5 is 1056964608."""
     return int(struct.unpack("<i", struct.pack("<f", value))[0])
 
 
 def to_float(bits: int) -> float:
-    """Back again. Bits beyond 32 are cut off."""
+    """Return the float with these 32 bits; higher bits are cut off."""
     return float(struct.unpack("<f", struct.pack("<I", bits & 0xFFFFFFFF))[0])
 
 
@@ -87,7 +87,7 @@ _ARGUMENT: Final = re.compile(rb",(?:(-?\d+)|\"([^\"]*)\")")
 
 
 def parse_commands(datagram: bytes) -> tuple[list[AtCommand], int]:
-    """The commands of a datagram, and how many lines made no sense, which a drone ignores. Never raises."""
+    """Return a datagram's commands and the number of nonsense lines, which a drone ignores. Never raises."""
     commands, malformed = [], 0
     for line in re.split(rb"[\r\n]+", datagram.rstrip(b"\0")):
         if not line:
@@ -106,7 +106,7 @@ def parse_commands(datagram: bytes) -> tuple[list[AtCommand], int]:
 def _word(argument: Argument) -> str:
     if isinstance(argument, str):
         if '"' in argument or "\r" in argument or "\n" in argument:
-            raise UsageError(f"{argument!r} can't be sent to the drone: it holds a quote or a line break")
+            raise UsageError(f"{argument!r} can't be sent to the drone: it contains a quote or a line break")
         return f'"{argument}"'
     if isinstance(argument, float):
         if not math.isfinite(argument):

@@ -1,12 +1,12 @@
-"""The configuration of the AR.Drone: its keys, how their values are written, and the dump on TCP port 5559. Pure.
+"""The configuration of the AR.Drone: its keys, the text form of their values, and the dump on TCP port 5559. Pure.
 
-A key is set by ``AT*CONFIG`` with its value as text. The drone sends all of them, one ``section:key = value`` a line
-and a zero byte at the end.
+``AT*CONFIG`` sets a key to a value given as text. The drone sends all keys as lines of ``section:key = value`` with a
+zero byte at the end.
 
 Sources: AR.Drone SDK 2.0.1 (``ardrone_tool/Control``) and a dump of an AR.Drone 1 with firmware 1.7.4. Names,
-categories and most defaults of the keys: ``config_keys.h`` of that SDK; keys that only the AR.Drone 1 has: that dump;
+categories and most defaults of the keys: ``config_keys.h`` of that SDK; keys of the AR.Drone 1 only: that dump;
 ranges: the Parrot AR.Drone Developer Guide, chapter 8, where it gives any. Names and order of the animations:
-``ardrone_api.h``; their durations: what the SDK's applications ask for.
+``ardrone_api.h``; their durations: the requests of the SDK's applications.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from skyloop.errors import DecodeError
 
 PORT: Final = 5559
 END_OF_DUMP: Final = b"\0"
-DEFAULT_ID: Final = "00000000"  #: of the session, user and application that everybody shares
+DEFAULT_ID: Final = "00000000"  #: of the shared session, user and application
 
 
 def format_value(value: Value) -> str:
-    """As the drone writes it: ``TRUE``, ``3000``, ``2.094395e-01``, ``{ 1.0e+00 2.0e+00 }``."""
+    """Return the drone's text for a value: ``TRUE``, ``3000``, ``2.094395e-01``, ``{ 1.0e+00 2.0e+00 }``."""
     if isinstance(value, bool):
         return "TRUE" if value else "FALSE"
     if isinstance(value, float):
@@ -35,7 +35,7 @@ def format_value(value: Value) -> str:
 
 
 def parse_value(text: str, like: Value) -> Value:
-    """A value of the same type as ``like``. Raises :class:`DecodeError` for a text that can't be one."""
+    """Return a text's value with the type of ``like``. Raises :class:`DecodeError` for a text of another type."""
     text = text.strip()
     try:
         if isinstance(like, bool):
@@ -47,18 +47,18 @@ def parse_value(text: str, like: Value) -> Value:
         if isinstance(like, tuple):
             return tuple(_finite(each) for each in text.strip("{}").split())
     except (KeyError, ValueError):
-        raise DecodeError(f"{text!r} is no {type(like).__name__}") from None
+        raise DecodeError(f"{text!r} is not a valid {type(like).__name__}") from None
     return text
 
 
 def format_dump(values: dict[str, Value]) -> bytes:
-    """All keys as the drone sends them."""
+    """Return the drone's dump of all keys."""
     lines = "".join(f"{name} = {format_value(value)}\n" for name, value in values.items())
     return lines.encode("latin-1", "replace") + END_OF_DUMP
 
 
 def parse_dump(dump: bytes) -> dict[str, str]:
-    """The texts of all keys. Lines that say nothing are left out, of a key that stands twice the last line counts."""
+    """Return the texts of all keys. Meaningless lines are skipped; of a repeated key the last line counts."""
     values = {}
     for line in dump.split(END_OF_DUMP, 1)[0].decode("latin-1").splitlines():
         name, equals, value = line.partition("=")
@@ -78,7 +78,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 
 
 class Category(Enum):
-    """Who a key belongs to when several sessions, users and applications are distinguished (AR.Drone 2)."""
+    """The owner of a key when sessions, users and applications are distinguished (AR.Drone 2)."""
 
     COMMON = "common"
     APPLICATION = "application"
@@ -105,7 +105,7 @@ class VideoCodec(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key. ``default``'s type is the key's. Units are the drone's own; angles are in radians, lengths in mm."""
+    """One key. ``default`` has the key's type. Units are the drone's own; angles are in radians, lengths in mm."""
 
     name: str  #: ``section:key``
     default: Value
@@ -129,7 +129,7 @@ class VideoChannel(IntEnum):
     NEXT = 4
 
 
-NAVDATA_OPTIONS_USUAL: Final = 0x10001  #: a bit a tag: DEMO and VISION_DETECT
+NAVDATA_OPTIONS_USUAL: Final = 0x10001  #: one bit per tag: DEMO and VISION_DETECT
 NO_CEILING_MM: Final = 100_000
 _INVALID_GPS: Final = 500.0
 
@@ -146,9 +146,9 @@ _GENERAL: Final = (
         for what in ("soft", "hard", "supplier")
     ),
     Key("general:ardrone_name", "My ARDrone", text="the drone's name"),
-    Key("general:flying_time", 0, unit="s", read_only=True, text="all its time in the air"),
+    Key("general:flying_time", 0, unit="s", read_only=True, text="total time in the air"),
     Key("general:navdata_demo", False, text="send only the options of the demo mode, 15 times a second"),
-    Key("general:navdata_options", NAVDATA_OPTIONS_USUAL, Category.APPLICATION, text="options to send: a bit a tag"),
+    Key("general:navdata_options", NAVDATA_OPTIONS_USUAL, Category.APPLICATION, text="options to send: bits by tag"),
     Key("general:com_watchdog", 2, unit="s", low=0, high=600, text="silence after which the drone lands by itself"),
     Key("general:video_enable", True, text="reserved"),
     Key("general:vision_enable", True, text="reserved"),
@@ -261,8 +261,8 @@ _NETWORK: Final = (
 _VIDEO: Final = (
     Key("video:camif_fps", 30, unit="1/s", read_only=True, text="pictures a second of the sensor"),
     Key("video:camif_buffers", 2, read_only=True),
-    Key("video:num_trackers", 12, read_only=True, text="points that the vision follows"),
-    Key("video:video_on_usb", True, text="record to a stick where there is one", versions=(2,)),
+    Key("video:num_trackers", 12, read_only=True, text="points tracked by the vision"),
+    Key("video:video_on_usb", True, text="record to a USB stick if present", versions=(2,)),
     Key("video:video_file_index", 1, text="number of the next recording", versions=(2,)),
     Key("video:bitrate", 1000, Category.APPLICATION, unit="kbit/s", low=250, high=4000, text="when set by hand"),
     Key("video:bitrate_ctrl_mode", 0, Category.APPLICATION, choices=(0, 1, 2), text="0 constant, 1 dynamic, 2 by hand"),
@@ -304,7 +304,7 @@ KEYS: Final = {key.name: key for key in (*_GENERAL, *_CONTROL, *_NETWORK, *_VIDE
 
 
 def keys_of(version: int) -> dict[str, Key]:
-    """The keys of an AR.Drone 1 or 2."""
+    """Return the keys of an AR.Drone 1 or 2."""
     return {name: key for name, key in KEYS.items() if version in key.versions}
 
 

@@ -1,7 +1,7 @@
 """Navdata of the AR.Drone (UDP port 5554): datagrams of a header, options and a checksum, both ways. Pure.
 
 Little-endian: ``u32 0x55667788, u32 state, u32 sequence, u32 vision defined``, then options of ``u16 tag, u16 size``
-(these four bytes included) and their data, the last of which is the checksum: the plain sum of all bytes before it.
+(including these four bytes) and data. The last option is the checksum, the plain sum of all bytes before it.
 Source: ``navdata_common.h`` of the AR.Drone SDK 2.0.1, its sizes checked against a datagram of a real AR.Drone 2.
 """
 
@@ -89,18 +89,18 @@ class Navdata:
     sequence: int
     vision_defined: int
     options: dict[type[Option], Option]  #: by their type
-    unknown: tuple[tuple[int, int], ...]  #: tag and size of options that nothing is known of
+    unknown: tuple[tuple[int, int], ...]  #: tag and size of unknown options
 
     def get(self, kind: type[_Kind]) -> _Kind | None:
-        """The option of this type, or None where the datagram has none."""
+        """Return the option of this type, or None if the datagram lacks it."""
         return cast("_Kind | None", cast("dict[Any, Any]", self.options).get(kind))
 
 
 def decode(datagram: bytes | memoryview) -> Navdata:
-    """Raises :class:`DecodeError` for what is not a whole, undamaged datagram; options not known are only listed."""
+    """Return a datagram's content. Raises :class:`DecodeError` if it is damaged; unknown options are only listed."""
     end = len(datagram) - _CHECKSUM.size
     if not _HEADER.size <= end <= MAX_DATAGRAM - _CHECKSUM.size:
-        raise DecodeError(f"{len(datagram)} bytes are no navdata")
+        raise DecodeError(f"{len(datagram)} bytes are not navdata")
     signature, state, sequence, vision_defined = _HEADER.unpack_from(datagram)
     if signature != SIGNATURE:
         raise DecodeError(f"navdata begins with {SIGNATURE:#x}, not with {signature:#x}")
@@ -114,7 +114,7 @@ def decode(datagram: bytes | memoryview) -> Navdata:
 
 
 def encode(state: int, sequence: int, options: Iterable[Option] = (), vision_defined: int = 0) -> bytes:
-    """A datagram of these options, in their order. Raises :class:`struct.error` for numbers out of range."""
+    """Return a datagram of these options in their order. Raises :class:`struct.error` for numbers out of range."""
     parts = [_HEADER.pack(SIGNATURE, state, sequence, vision_defined)]
     for option in options:
         layout = LAYOUTS[type(option)]
@@ -147,7 +147,7 @@ VIDEO: Final = 5555
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The drone's; 0 stands for any free one, where there is a choice."""
+    """The drone's ports; 0 stands for any free one, where there is a choice."""
 
     navdata: int = PORT  #: UDP
     video: int = VIDEO  #: UDP of an AR.Drone 1, TCP of an AR.Drone 2
@@ -156,7 +156,7 @@ class Ports:
 
     @classmethod
     def free(cls) -> Ports:
-        """Any free ones."""
+        """Return any free ones."""
         return cls(0, 0, 0, 0)
 
 

@@ -1,8 +1,8 @@
 """The options of navdata as typed structures, and their layouts.
 
 Names, types and order: ``navdata_common.h`` of the AR.Drone SDK 2.0.1, whose structures are packed without alignment.
-Units are the drone's own: millidegrees, mm/s, mm, mV. ``Gps`` is what firmware 2.4 sends under the tag that was
-``Zimmu3000`` before.
+Units are the drone's own: millidegrees, mm/s, mm, mV. Firmware 2.4 sends ``Gps`` under the former tag of
+``Zimmu3000``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Ints: TypeAlias = tuple[int, ...]
 
 
 class Layout:
-    """How one option lies in memory: a struct format with one word a field, ``3f`` being one field of three floats."""
+    """The memory layout of one option: a struct format with one word per field; ``3f`` is one field of three floats."""
 
     def __init__(self, tag: int, kind: type[Any], form: str) -> None:
         self.tag = tag
@@ -39,12 +39,12 @@ class Layout:
         return self._struct.size
 
     def unpack(self, data: bytes | memoryview, at: int) -> Any:
-        """The structure that begins here."""
+        """Return the structure that begins here."""
         values = self._struct.unpack_from(data, at)
         return self.kind(*values) if self._plain else self.kind(*[values[cut] for cut in self._cuts])
 
     def pack(self, option: Any) -> bytes:
-        """Its bytes. Raises :class:`struct.error` for a value out of its field's range."""
+        """Return a structure's bytes. Raises :class:`struct.error` for a value out of its field's range."""
         if self._plain:
             return self._struct.pack(*option)
         values: list[float] = []
@@ -70,7 +70,7 @@ def _option(tag: int, form: str) -> Callable[[_Kind], _Kind]:
 
 @_option(0, "I I f f f i f f f I 9f 3f I I 9f 3f")
 class Demo(NamedTuple):
-    """What an application needs: attitude [millidegree], altitude [mm], velocity [mm/s], battery [%]."""
+    """The main state: attitude [millidegree], altitude [mm], velocity [mm/s], battery [%]."""
 
     ctrl_state: int = 0
     battery: int = 0
@@ -99,7 +99,7 @@ class Time(NamedTuple):
 
 @_option(2, "3H 3h 2h I H H H H H H H H H I i h")
 class RawMeasures(NamedTuple):
-    """What the converters read; ``vbat_raw`` in mV."""
+    """The converters' readings; ``vbat_raw`` in mV."""
 
     accs: Ints = (0,) * 3
     gyros: Ints = (0,) * 3
@@ -149,7 +149,7 @@ class EulerAngles(NamedTuple):
 
 @_option(6, "i i i i i i i i f f f f f f I f f f f f i")
 class References(NamedTuple):
-    """What the control loops are asked for."""
+    """The targets of the control loops."""
 
     theta: int = 0
     phi: int = 0
@@ -176,7 +176,7 @@ class References(NamedTuple):
 
 @_option(7, "f f f")
 class Trims(NamedTuple):
-    """Trims found by the flat trim."""
+    """Trims from the flat trim."""
 
     angular_rates_r: float = 0.0
     euler_angles_theta: float = 0.0
@@ -185,7 +185,7 @@ class Trims(NamedTuple):
 
 @_option(8, "i i i i i")
 class RcReferences(NamedTuple):
-    """What the last ``PCMD`` asked for."""
+    """Values from the last ``PCMD``."""
 
     pitch: int = 0
     roll: int = 0
@@ -219,7 +219,7 @@ class Pwm(NamedTuple):
 
 @_option(10, "i f i i f f 3f I 2f I")
 class Altitude(NamedTuple):
-    """The estimation of altitude [mm]."""
+    """The altitude estimate [mm]."""
 
     vision: int = 0
     vz: float = 0.0
@@ -252,7 +252,7 @@ class VisionOpticalFlow(NamedTuple):
 
 @_option(13, "I i f f f f i f f f i I 3f f f f I I f f")
 class Vision(NamedTuple):
-    """What the estimation of velocity by vision works with."""
+    """The inputs of the velocity estimate by vision."""
 
     state: int = 0
     misc: int = 0
@@ -278,7 +278,7 @@ class Vision(NamedTuple):
 
 @_option(14, "f f f f f f 20f")
 class VisionPerf(NamedTuple):
-    """Times that the vision takes [ms]."""
+    """Durations of the vision's steps [ms]."""
 
     szo: float = 0.0
     corners: float = 0.0
@@ -291,7 +291,7 @@ class VisionPerf(NamedTuple):
 
 @_option(15, "30i 60i")
 class TrackersSend(NamedTuple):
-    """Points followed from picture to picture: whether each is locked, then x and y of each."""
+    """Points tracked across pictures: whether each is locked, then x and y of each."""
 
     locked: Ints = (0,) * 30
     points: Ints = (0,) * 60
@@ -331,7 +331,7 @@ class AdcDataFrame(NamedTuple):
 
 @_option(19, "B I I I I f I I I 5i I I")
 class VideoStream(NamedTuple):
-    """The video encoder at work."""
+    """The state of the video encoder."""
 
     quant: int = 0
     frame_size: int = 0
@@ -387,7 +387,7 @@ class Magneto(NamedTuple):
 
 @_option(23, "f f f f 6f 3f")
 class WindSpeed(NamedTuple):
-    """The wind estimated: speed [m/s], angle [rad]."""
+    """The estimated wind: speed [m/s], angle [rad]."""
 
     speed: float = 0.0
     angle: float = 0.0
@@ -399,7 +399,7 @@ class WindSpeed(NamedTuple):
 
 @_option(24, "f f f f f f f f f f i f i f f i i")
 class KalmanPressure(NamedTuple):
-    """The filter of the barometer."""
+    """The barometer's filter."""
 
     pressure_offset: float = 0.0
     est_z: float = 0.0
@@ -422,7 +422,7 @@ class KalmanPressure(NamedTuple):
 
 @_option(25, "I I I I I I I")
 class HdVideo(NamedTuple):
-    """The recording of high-definition video."""
+    """The high-definition recording."""
 
     state: int = 0
     fifo_packets: int = 0
@@ -442,7 +442,7 @@ class Wifi(NamedTuple):
 
 @_option(27, "i f")
 class Zimmu3000(NamedTuple):
-    """Another estimation of vertical speed, sent up to firmware 2.2."""
+    """Another estimate of vertical speed, sent up to firmware 2.2."""
 
     lsb: int = 0
     find: float = 0.0

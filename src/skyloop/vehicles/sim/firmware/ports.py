@@ -1,11 +1,11 @@
-"""Ports of several firmwares on one computer: which are free, and a network of its own for one whose ports are fixed.
+"""Ports of several firmwares on one computer: find free ones, and isolate firmware with fixed ports in a network.
 
-Such networks are Linux's only. A socket belongs to the network in which it was made, whoever has it. So the firmware's
-keeper leaves the computer's network before it starts the firmware, makes the socket that speaks to the firmware by
-datagrams, and passes it on. The bytes of the firmware's TCP port it carries itself, to and from a listener that it was
-given.
+Such separate networks exist on Linux only. A socket belongs to the network of its creation, whichever process holds it.
+The firmware's keeper therefore leaves the computer's network before it starts the firmware, creates the datagram socket
+for the firmware there, and passes it on. It relays the bytes of the firmware's TCP port itself, to and from an
+inherited listener.
 
-``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 where a network of one's own can be had.
+``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 if separate networks are possible.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _reserved: set[tuple[str, int]] = set()  # instances of this process that may no
 
 
 def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
-    """Return a socket that is bound to a port of this computer alone; 0: any free one."""
+    """Return a socket bound to a port on this computer's loopback; 0: any free one."""
     made = socket.socket(socket.AF_INET, kind)
     try:
         if kind is socket.SOCK_STREAM:
@@ -44,14 +44,14 @@ def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
 
 
 def free_udp_port() -> int:
-    """Return a UDP port that nobody has now."""
+    """Return a free UDP port."""
     with bound(socket.SOCK_DGRAM) as probe:
         port: int = probe.getsockname()[1]
         return port
 
 
 def is_free(kind: socket.SocketKind, port: int) -> bool:
-    """Return whether a port can be opened on all addresses of this computer, as firmware opens its own."""
+    """Return whether a port can be opened on all addresses of this computer, as firmware does."""
     with socket.socket(socket.AF_INET, kind) as probe:
         if kind is socket.SOCK_STREAM:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -68,16 +68,16 @@ def reserve_instance(
     ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
     runs: Callable[[int], bool] = lambda _: False,
 ) -> int:
-    """Return the first instance number that is free, and reserve it within this process.
+    """Return the first free instance number, and reserve it within this process.
 
     Args:
         firmware: Its name.
         most: How many instances its ports allow on a computer.
-        ports: The ports of an instance.
-        runs: Whether an instance runs that may not have opened its ports.
+        ports: Returns the ports of an instance.
+        runs: Returns whether an instance runs that may not have opened its ports.
 
     Raises:
-        UsageError: There is none.
+        UsageError: None is free.
     """
     with _lock:
         for instance in range(most):
@@ -90,7 +90,7 @@ def reserve_instance(
 
 
 def release_instance(firmware: str, instance: int) -> None:
-    """Give a number back that :func:`reserve_instance` returned."""
+    """Free a number from :func:`reserve_instance`."""
     with _lock:
         _reserved.discard((firmware, instance))
 
@@ -104,14 +104,14 @@ _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 
 
 class Apart:
-    """Our side: what a firmware in a network of its own is reached by.
+    """The parent's side of the connection to a firmware in a separate network.
 
     Attributes:
-        port: TCP on this computer; what comes here reaches the firmware's TCP port.
+        port: TCP port on this computer that leads to the firmware's TCP port.
     """
 
     def __init__(self, udp_port: int, tcp_port: int) -> None:
-        """Open what the keepers are given. ``udp_port`` is ours in the firmware's network, ``tcp_port`` its own."""
+        """Open the keepers' sockets. ``udp_port`` is ours in the firmware's network, ``tcp_port`` the firmware's."""
         self._listener = socket.create_server((LOOPBACK, 0))
         self._ours, self._keepers = socket.socketpair()
         self._ours.setblocking(False)
@@ -120,16 +120,16 @@ class Apart:
 
     @property
     def descriptors(self) -> tuple[int, int]:
-        """What each keeper inherits."""
+        """File descriptors that each keeper inherits."""
         return self._listener.fileno(), self._keepers.fileno()
 
     @property
     def option(self) -> str:
-        """What each keeper is told."""
+        """Command-line option for each keeper."""
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the UDP socket that the newest keeper made; the caller closes it. OSError: there is no new one."""
+        """Return the newest keeper's UDP socket, which the caller closes. Raises OSError without a new one."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
@@ -141,13 +141,13 @@ class Apart:
         return newest
 
     def close(self) -> None:
-        """Close everything; the sockets that were received stay. Idempotent."""
+        """Close everything except the received sockets. Idempotent."""
         for each in (self._listener, self._ours, self._keepers):
             each.close()
 
 
 class Relay:
-    """The keeper's side. Made while there is but one thread: this process leaves the computer's network.
+    """The keeper's side. Create it while there is only one thread: this process leaves the computer's network.
 
     Raises:
         OSError: That is not allowed.
@@ -161,7 +161,7 @@ class Relay:
             socket.send_fds(keepers, [b"."], [made.fileno()])
 
     def start(self) -> None:
-        """Carry bytes from now on, on threads."""
+        """Relay bytes from now on, on threads."""
         threading.Thread(target=self._serve, name="skyloop-relay", daemon=True).start()
 
     def _serve(self) -> None:
@@ -170,7 +170,7 @@ class Relay:
             try:
                 inside = socket.create_connection((LOOPBACK, self._tcp_port), CONNECT_S)
             except OSError:
-                outside.close()  # nobody listens yet
+                outside.close()  # no listener yet
                 continue
             inside.settimeout(None)
             for ends in ((outside, inside), (inside, outside)):
@@ -188,12 +188,12 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 
 
 def leave_network() -> None:
-    """Move this process into a new network that has nothing but a loopback.
+    """Move this process into a new network that has only a loopback.
 
-    That takes root, or a kernel that lets everybody make user namespaces: else it raises OSError.
+    This needs root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
     """
     if sys.platform != "linux":
-        raise OSError("there are networks of one's own on Linux only")
+        raise OSError("separate networks exist on Linux only")
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.unshare(_CLONE_NEWNET) and libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
         error = ctypes.get_errno()
@@ -203,7 +203,7 @@ def leave_network() -> None:
 
 
 def is_possible() -> bool:
-    """Whether a network of one's own can be had here. Asks another process, which takes a moment."""
+    """Return whether separate networks are possible here. Asks another process, which takes a moment."""
     command: Sequence[str] = (sys.executable, "-m", "skyloop.vehicles.sim.firmware.ports")
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 

@@ -1,4 +1,4 @@
-"""A flight firmware as a child process: found, started in a folder of its own, watched, started again, ended."""
+"""A flight firmware as a child process: find it, start it in its own folder, watch it, restart it, end it."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from skyloop.errors import SkyloopError, UsageError
 from skyloop.vehicles.sim.firmware.keeper import PROMPT
 from skyloop.vehicles.sim.firmware.ports import Apart
 
-RESTART_S: Final = 1.0  #: from the firmware's death to its next start; doubled each time that it dies soon
+RESTART_S: Final = 1.0  #: from the firmware's end to its next start; doubled after each early end
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0
-AT_ONCE: Final = 5  #: starts in vain in a row that are tried again without a pause
+SOON_S: Final = 10.0  #: a process that ends within this time ended early
+AT_ONCE: Final = 5  #: consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
 _LAST_BYTES: Final = 2000
 
 
 class FirmwareEventKind(StrEnum):
-    """What can happen to a firmware."""
+    """Events of a firmware."""
 
     STARTED = "started"  #: its process runs
     ANSWERS = "answers"  #: it controls the rotors, for the first time or again
-    SILENT = "silent"  #: it has not answered for a while, and the rotors stand
-    DIED = "died"  #: its process ended; it is started again
-    FAILED = "failed"  #: it could not be started; that is tried again
-    DEAF = "deaf"  #: its process ran and did not answer; another is started at once
+    SILENT = "silent"  #: it has not answered for a while, and the rotors stop
+    DIED = "died"  #: its process ended and is restarted
+    FAILED = "failed"  #: it could not be started; the start is retried
+    DEAF = "deaf"  #: its process ran and did not answer; another one starts at once
 
 
 class StartedInVainError(OSError):
-    """Its process runs, and will never answer: it is ended, and started again at once."""
+    """The process runs but will never answer: end it, and restart it at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class FirmwareEvent:
-    """Something that happened to a firmware. ``text`` is for people."""
+    """An event of a firmware. ``text`` is for people."""
 
     kind: FirmwareEventKind
     text: str
@@ -55,27 +55,27 @@ class FirmwareEvent:
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """How a firmware is started."""
+    """A firmware's command and environment."""
 
     command: Sequence[str]
-    environment: Mapping[str, str] = field(default_factory=dict)  #: what it has besides this process's
+    environment: Mapping[str, str] = field(default_factory=dict)  #: in addition to this process's
     prompt: bool = (
-        False  #: whether it must be woken on time; see :func:`~skyloop.vehicles.sim.firmware.keeper.become_prompt`
+        False  #: whether it needs prompt wake-ups; see :func:`~skyloop.vehicles.sim.firmware.keeper.become_prompt`
     )
-    apart: Apart | None = None  #: of one in a network of its own
+    apart: Apart | None = None  #: for a separate network
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
-        """Start it in a folder, by a keeper."""
+        """Start it in a folder, under a keeper."""
         descriptors = () if self.apart is None else self.apart.descriptors
         return ChildProcess(keeper_command(self, folder, log), inherited=descriptors)
 
 
 class Program:
-    """A firmware's process. It is started again after it ended, until :meth:`close`.
+    """A firmware's process, restarted whenever it ends, until :meth:`close`.
 
     Attributes:
-        name: Of the firmware, for people.
-        starts: How often it was started.
+        name: The firmware's name in messages.
+        starts: Number of starts.
         pid: Its process id; 0 while it does not run.
     """
 
@@ -89,17 +89,17 @@ class Program:
         folder: Path | None = None,
         restart_s: float = RESTART_S,
     ) -> None:
-        """Store how it is started; :meth:`start` does it.
+        """Store the arguments; :meth:`start` starts it.
 
         Args:
-            name: Of the firmware, for people.
-            prepare: Called before each start with the folder it will run in; writes what it reads there. Raises
-                :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
+            name: The firmware's name in messages.
+            prepare: Called before each start with the working folder; writes the files that the firmware reads there.
+                Raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
             report: Called with each event, on a thread of this object.
-            verify: Called when its process runs, before that is reported; raises ``OSError`` for one that was started
-                in vain: it is ended, and started again; :class:`StartedInVainError`: at once. None: none is.
-            folder: Where it runs and keeps its settings; None: a new one, which is removed at the end.
-            restart_s: From its death to its next start [s].
+            verify: Called once its process runs, before the start is reported; raises ``OSError`` for a failed start,
+                which is then ended and retried; :class:`StartedInVainError`: at once. None: no check.
+            folder: Working folder with its settings; None: a new one, removed at the end.
+            restart_s: Time from its end to its next start [s].
         """
         self.name = name
         self.starts = 0
@@ -120,7 +120,7 @@ class Program:
         return self.pid != 0
 
     def start(self) -> None:
-        """Start it, on a thread that watches it from then on."""
+        """Start it, on a thread that then watches it."""
         self._thread = threading.Thread(target=self._run, name="skyloop-firmware", daemon=True)
         self._thread.start()
 
@@ -165,7 +165,7 @@ class Program:
             pause_s = min(2 * pause_s, LONGEST_RESTART_S) if soon else self._restart_s
 
     def _run_once(self, folder: Path) -> str:
-        """Run it until it ends; return how, for people."""
+        """Run it until it ends; return a description of its end."""
         launch = self._prepare(folder)
         with self._lock:
             if self._ending.is_set():
@@ -183,7 +183,7 @@ class Program:
                     self._verify()
             except StartedInVainError:
                 if child.code is None:
-                    raise  # else it died, which is told with its output
+                    raise  # otherwise it died, which is reported with its output
             self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
             child.wait()
             return _ending(child.code)
@@ -195,7 +195,7 @@ class Program:
 
 
 def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
-    """Return how a firmware is run in a folder, as a :class:`~skyloop.child_process.ChildProcess`."""
+    """Return the command that runs a firmware in a folder, for a :class:`~skyloop.child_process.ChildProcess`."""
     settings = [PROMPT] if launch.prompt else []
     settings += [launch.apart.option] if launch.apart is not None else []
     settings += [f"{name}={value}" for name, value in launch.environment.items()]
@@ -204,12 +204,12 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
-    """Return the path of a firmware's program: what the variable names, or one of these names on the search path."""
+    """Return the path of a firmware's program: the variable's value, or one of these names on the search path."""
     given = os.environ.get(variable)
     if given:
         path = Path(given).expanduser()
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise UsageError(f"{variable} is {given!r}, which is no program: it must be the path of {what}'s")
+            raise UsageError(f"{variable} is {given!r}, which is not a program: it must be the path of {what}'s")
         return str(path.resolve())
     for name in names:
         found = shutil.which(name)
@@ -219,7 +219,7 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
 
 
 def _ending(code: int | None) -> str:
-    with suppress(ValueError, TypeError):  # 255 and the like are a program's own, as -1 is
+    with suppress(ValueError, TypeError):  # 255 is a program's own exit code, as is -1
         return f"was killed by {signal.Signals((code or 0) - 128).name}"
     return f"ended with exit code {code}"
 

@@ -1,7 +1,7 @@
-"""PX4 in the simulated world, by MAVLink's messages for hardware in the loop and in step with it.
+"""PX4 in the simulated world, through MAVLink's messages for hardware in the loop and in step with it.
 
-PX4 connects to a TCP server, port 4560 and one more for each further vehicle. ``HIL_SENSOR`` is its clock: it answers
-each with ``HIL_ACTUATOR_CONTROLS`` once its startup has come so far that motors are driven.
+PX4 connects to a TCP server, port 4560 plus one for each further vehicle. ``HIL_SENSOR`` is its clock: it answers
+each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """
 
@@ -31,32 +31,32 @@ VARIABLE: Final = "SKYLOOP_PX4"
 WHERE: Final = (
     "How to get it: https://docs.px4.io/main/en/dev_setup/building_px4.html (px4_sitl); it is bin/px4 of the build"
 )
-MODEL: Final = "none_iris"  #: PX4's quadrotor for a simulator that it does not start itself
+MODEL: Final = "none_iris"  #: PX4's quadrotor for an external simulator
 AIRFRAME: Final = "10016"
 SIMULATOR_PORT = 4560  # each of these ports plus the number of the instance
 TELEMETRY_PORT = 14540
 COMPANION_PORT = 14580
 STATION_PORT = 18570
-MOST_INSTANCES: Final = 10  #: beyond, PX4 sends all vehicles to one port
-STEPS: Final = 4  #: of the plant for one of PX4: 250 Hz, which its startup for such simulators expects
+MOST_INSTANCES: Final = 10  #: with more, PX4 would use one port for all further vehicles
+STEPS: Final = 4  #: steps of the plant per step of PX4: 250 Hz, as its startup script for such simulators expects
 STEP_US: Final = 4000
-TRUTH_EVERY: Final = 5  #: of its steps
+TRUTH_EVERY: Final = 5  #: period in its steps
 RANGE_EVERY: Final = 10
-PROBE_EVERY: Final = 25  #: of its steps, while it is silent
+PROBE_EVERY: Final = 25  #: period in its steps, while it is silent
 LOCK_FILE = "/tmp/px4_lock"
-MAX_BACKLOG: Final = 4096  #: bytes that wait to be sent; PX4 does not read any more then
+MAX_BACKLOG: Final = 4096  #: unsent bytes that mean PX4 has stopped reading
 MAX_READ: Final = 65536
-#: What PX4 must know of this vehicle; and without a remote control it is to hold its place when set-points stop.
+#: Parameters of this vehicle; without a remote control it must hold its position when set-points stop.
 PARAMETERS: Final = {
     "MPC_THR_HOVER": "0.7",
-    "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that begins at an eighth of the full one
+    "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that starts at an eighth of full speed
     "COM_OBL_RC_ACT": "5",
 }
-#: By how much fixes are late [ms]: the name until early 2026, and since; each version ignores the other's. PX4's
-#: startup for simulators sets 10. Fixes that are later than it takes them for turn its heading, as long as it flies
-#: round in one direction: its velocity was another then.
+#: Names of the parameter for the delay of fixes [ms], before and since early 2026; each version ignores the other one.
+#: PX4's startup for simulators sets 10. An underestimated delay turns PX4's heading while it flies circles in one
+#: direction, because each fix has an outdated velocity.
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
-_EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings but the differential pressure are new
+_EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings except the differential pressure are new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
 _SYSTEM, _COMPONENT = 1, 200
 _DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
@@ -74,7 +74,7 @@ class Px4(CoupledFirmware):
         on_event: Callable[[FirmwareEvent], None],
         *,
         folder: Path | None = None,
-        instruments: InstrumentParameters = InstrumentParameters(),  # noqa: B008  it never changes
+        instruments: InstrumentParameters = InstrumentParameters(),  # noqa: B008  immutable
     ) -> None:
         from skyloop.vehicles.mavlink.wire.codec import Codec
 
@@ -90,12 +90,12 @@ class Px4(CoupledFirmware):
         self._sent = 0  # states
         self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer since the last state
         self._fix: GpsFix | None = None
-        self._own_us = STEP_US  # PX4's time: stands still while it is silent
-        self._wanted_us = 0  # commands older than this answer something else
+        self._own_us = STEP_US  # PX4's time, which pauses while it is silent
+        self._wanted_us = 0  # commands older than this answer an earlier state
 
     @property
     def address(self) -> str:
-        """Where it sends MAVLink to. A ground station on this computer that listens to UDP port 14550 finds it too."""
+        """Address of its MAVLink. A ground station on UDP port 14550 of this computer finds it as well."""
         i = self._instance
         assert i is not None, "not started"
         peer = f"peer={LOOPBACK}:{COMPANION_PORT + i}"
@@ -112,7 +112,7 @@ class Px4(CoupledFirmware):
         self._server.setblocking(False)
 
     def _files(self) -> Path:
-        """Return the folder of PX4's startup scripts, beside the program's."""
+        """Return the folder of PX4's startup scripts, next to the program's."""
         return Path(self._program).resolve().parent.parent / "etc"
 
     def _close(self) -> None:
@@ -124,7 +124,7 @@ class Px4(CoupledFirmware):
             release_instance(self.NAME, self._instance)
             self._instance = None
 
-    def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  it keeps its parameters where it runs
+    def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  its parameters are in its working folder
         environment = {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": AIRFRAME, "PX4_SIM_HOSTNAME": LOOPBACK}
         parameters = {**PARAMETERS, **dict.fromkeys(GPS_DELAYS, str(self._gps_delay_ms))}
         if not self.keeps_folder:
@@ -200,7 +200,7 @@ class Px4(CoupledFirmware):
         if self._link is None:
             return
         if self._owed and not self._patient and self._answered_s is not None and self._step % (STEPS * PROBE_EVERY):
-            return  # it hangs: what it would be told now is old when it reads again
+            return  # it hangs: data sent now would be outdated when it reads again
         messages = [*self._due(readings), self._sensor(readings, inertial)]
         self._transmit(b"".join(self._codec.encode(message) for message in messages))
         self._wanted_us = self._own_us if self._patient else 0
@@ -209,7 +209,7 @@ class Px4(CoupledFirmware):
         self._owed = True
 
     def _due(self, readings: Readings) -> list[Any]:
-        """Return what PX4 gets at lower rates, before the message that makes its clock go on."""
+        """Return the messages due at lower rates, which go before the message that advances PX4's clock."""
         due = []
         if self._fix is not None:
             due.append(self._gps(self._fix))
@@ -302,7 +302,7 @@ class Px4(CoupledFirmware):
 
 
 def _commands(controls: list[float]) -> Commands | None:
-    """Return rotor commands in the simulation's order; None for what is no command. PX4's X has ArduCopter's order."""
+    """Return rotor commands in the simulation's order, or None without any. PX4's X has ArduCopter's order."""
     motors = controls[:4]
     if not all(map(math.isfinite, motors)):
         return None
@@ -311,20 +311,20 @@ def _commands(controls: list[float]) -> Commands | None:
 
 
 def _runs(instance: int) -> bool:
-    """Return whether a PX4 has the lock of this instance: another one would end at once, whatever its ports are."""
+    """Return whether a PX4 holds the lock of this instance: another one would end at once, even with free ports."""
     if sys.platform != "linux":
         return False
-    asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock: all of the file
+    asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock: the whole file
     try:
         with Path(f"{LOCK_FILE}-{instance}").open("rb") as file:
             answer = fcntl.fcntl(file, fcntl.F_GETLK, asked)
     except OSError:
-        return False  # there is none
+        return False  # no lock file
     return int(struct.unpack("hhqqi", answer)[0]) != fcntl.F_UNLCK
 
 
 def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
-    """Return the ports of an instance: the simulator's; PX4's own; and the one that it sends telemetry to."""
+    """Return the ports of an instance: the simulator's, PX4's own, and the recipient port of its telemetry."""
     return [
         (socket.SOCK_STREAM, SIMULATOR_PORT + instance),
         (socket.SOCK_DGRAM, COMPANION_PORT + instance),

@@ -1,4 +1,4 @@
-"""A Ryze Tello, emulated on the network over a simulated vehicle, for any program that flies the real one.
+"""Emulate a Ryze Tello on the network over a simulated vehicle, for any program that flies the real one.
 
 At an address of this machine, for a test::
 
@@ -9,10 +9,10 @@ At an address of this machine, for a test::
     host = SimHost(with_tellos(SimOptions(world="room", seed=1)))
     with TelloFirmware(host, bind="127.0.0.1", port=0) as firmware:
         firmware.port  # UDP, where it takes commands
-        host.simulation.truth(0).position_m  # what the vehicle really does
+        host.simulation.truth(0).position_m  # the vehicle's true position
 
-State and video go to ports 8890 and 11111 of the sender of ``command``, or to those set by ``port`` (SDK 3.0). With
-``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
+State and video go to ports 8890 and 11111 of the sender of ``command``, or to those set by ``port`` (SDK 3.0).
+``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` drops datagrams in both directions.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
 
 REPORTS_HZ: Final = 50.0
-TAKEOFF_ALTITUDE_M: Final = 0.8  #: of a recorded flight
+TAKEOFF_ALTITUDE_M: Final = 0.8  #: as in a recorded flight
 
-#: Small and light. Mass, size and time of flight: Ryze, Tello specifications; rotors of 3 inches. What is not named is
-#: the simulator's own vehicle.
+#: Small and light. Mass, size and time of flight: Ryze, Tello specifications; rotors of 3 inches. The rest is the
+#: simulator's own vehicle.
 TELLO: Final = VehicleParameters(
     mass_kg=0.087,
     radius_m=0.1,
     half_height_m=0.02,
     rotor_radius_m=0.038,
     rotor_height_m=0.03,
-    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s between leaving the ground and hovering, of a recorded flight
+    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s between leaving the ground and hovering, in a recorded flight
     battery_full_v=4.35,
     battery_empty_v=3.3,
     battery_charge_c=3960.0,  # 1100 mAh
@@ -73,7 +73,7 @@ LIMITS: Final = Limits(
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
-#: Calibration of one such drone as published with tello_ros, for its pictures of 960×720.
+#: Calibration of one drone, published with tello_ros, for pictures of 960×720.
 FRONT: Final = replace(
     FRONT_CAMERA,
     width=960,
@@ -90,7 +90,7 @@ BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: its 
 
 
 def with_tellos(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are Tellos. Cameras are the firmware's own, whatever the options say."""
+    """Return options of a world whose drones are Tellos. The firmware brings its own cameras and ignores others."""
     return replace(options or SimOptions(), parameters=TELLO, rate_hz=REPORTS_HZ, cameras=())
 
 
@@ -107,26 +107,26 @@ class Settings:
 
 
 STATE_HZ: Final = 10.0
-GROUP: Final = 30  #: pictures from one key to the next
+GROUP: Final = 30  #: pictures between keys
 FULL_KBPS: Final = 2500  #: pictures of 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
 
 
 def automatic_kbps(loss: float) -> int:
-    """Return the bitrate for a share of lost datagrams. An estimate: that a Tello adapts is known, and not how."""
+    """Return the bitrate for a share of lost datagrams. An estimate: a Tello adapts its bitrate, by an unknown rule."""
     return max(LEAST_KBPS, round(FULL_KBPS * (1 - 9 * loss)))
 
 
 class TelloPacker:
-    """Packs pictures to H.264 as a Tello sends it."""
+    """Packs pictures to H.264 as a Tello does."""
 
     def __init__(self) -> None:
         self._made: tuple[tuple[int, int, float, int], Encoder] | None = None
         self.size = (FRONT.width, FRONT.height)
 
     def pack(self, picture: NDArray[np.uint8], settings: OneCamera, _captured_ns: int) -> Piece | None:
-        """Encode a picture; None if the encoder gave nothing."""
+        """Encode a picture; None if the encoder returned nothing."""
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -138,7 +138,7 @@ class TelloPacker:
 
 
 class RunningFirmware(RunningEmulator):
-    """A Tello that is switched on. The logic and the ports belong to the loop's thread."""
+    """A Tello that is switched on. Its logic and ports belong to the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
         super().__init__(host, drone, "skyloop-tello")
@@ -172,7 +172,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The real UDP port that takes commands."""
+        """The real UDP port for commands."""
         return self._commands.port
 
     def _datagrams(self, name: str, port: int) -> DatagramPort:
@@ -188,7 +188,7 @@ class RunningFirmware(RunningEmulator):
 
     def _on_datagram(self, datagram: bytes, sender: Address) -> None:
         self.logic.receive(datagram, sender)
-        self._look_at_video()
+        self._update_video()
 
     def _answer(self, text: str, to: Address) -> None:
         self._commands.send(text.encode("ascii"), to)
@@ -207,8 +207,8 @@ class RunningFirmware(RunningEmulator):
         kbps = logic.bitrate_mbps * 1000 or automatic_kbps(self._settings.faults.drop)
         return OneCamera("bottom" if logic.looks_down else "front", logic.fps, kbps)
 
-    def _look_at_video(self) -> None:
-        """Follow the configuration."""
+    def _update_video(self) -> None:
+        """Apply the video configuration."""
         logic, wanted = self.logic, self._wanted_video()
         self._packer.size = (BOTTOM.width, BOTTOM.height) if logic.looks_down else logic.size
         if wanted == self._shown:
@@ -218,7 +218,7 @@ class RunningFirmware(RunningEmulator):
             camera.model = replace(camera.model, fps=wanted.fps)
 
     def _encoded(self, piece: Piece) -> None:
-        """Send a picture. On the encoder's thread."""
+        """Send a picture. Runs on the encoder's thread."""
         self._loop.post(lambda: self._send_video(piece))
 
     def _send_video(self, piece: Piece) -> None:
@@ -228,31 +228,31 @@ class RunningFirmware(RunningEmulator):
         for datagram in pieces(piece.data):
             self._video_port.send(datagram, (logic.client, logic.video_port))
 
-    # Called by the host, on its threads --------------------------------------------------------------------------
+    # Called by the host on its threads ---------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many pictures a second of this camera would be sent to anybody: all or none."""
+        """Return the frame rate for this camera: the full one, or 0 without a client."""
         return super().wanted_fps(camera) if self.logic.streaming and self.logic.client is not None else 0.0
 
 
 class TelloFirmware(Emulator[RunningFirmware]):
-    """The firmware of one drone of a host's world. Several may share a host, each with a drone and an address.
+    """The firmware of one drone in a host's world. Several can share a host, each with its own drone and address.
 
     Make the host with :func:`with_tellos`.
 
     Args:
         host: The simulated world.
-        drone: Its number in it.
+        drone: Its number in that world.
         sdk: 1.3, 2.0 or 3.0.
         bind: The address of this machine to listen on.
         port: UDP, for commands; 0 for any free one.
-        faults: Befall all datagrams, each way.
-        delay_s: By which all datagrams are late, each way.
-        pads: Mission pads that lie on the floor, by their number from 1 to 8: x and y in world axes [m].
+        faults: Injected into all datagrams, in both directions.
+        delay_s: Added to all datagrams, in each direction.
+        pads: Mission pads on the floor, by their number from 1 to 8: x and y in world axes [m].
 
     Raises:
-        UsageError: An argument makes no sense.
-        MissingExtraError: What draws or encodes pictures is not installed.
+        UsageError: An argument is invalid.
+        MissingExtraError: A library that draws or encodes pictures is not installed.
     """
 
     def __init__(
@@ -278,15 +278,15 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, port=running.port)  # found again after a restart
+        self.settings = replace(self.settings, port=running.port)  # kept for a restart
         return running
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The real port; a free one was chosen for 0."""
         return self._started.port
 
     @property
     def logic(self) -> TelloLogic:
-        """The state of the running firmware, for tests; it belongs to its thread."""
+        """The state of the running firmware, for tests; belongs to the loop's thread."""
         return self._started.logic

@@ -1,4 +1,4 @@
-"""Commands of a Tello that take a while, and are answered when they are done. Pure: fed with reports."""
+"""Commands of a Tello that take time and are answered at their end. Pure: driven by reports."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from skyloop.sim.world import Vec3
 
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: before a take-off leaves the ground; airborne after 1.1 s in a recorded flight
-RISES_WITHIN_S: Final = 0.5  #: of simulated time, or it was refused: a battery that is too low
-TAKEOFF_ANSWER_S: Final = 8.7  #: after the command, of the same flight, though it hovers long before
+RISES_WITHIN_S: Final = 0.5  #: of simulated time; otherwise the take-off was refused for a low battery
+TAKEOFF_ANSWER_S: Final = 8.7  #: after the command in the same flight, though it hovers long before
 FLIP_S: Final = 1.5  #: estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: estimate
-PATIENCE_S: Final = 30.0  #: what takes longer has failed
-_NEAR_M: Final = 0.06
-_SLOW_M_S: Final = 0.12
-_NEAR_RAD: Final = 0.03
+PATIENCE_S: Final = 30.0  #: a command that takes longer has failed
+_NEAR_M: Final = 0.06  # distance at the end of a move
+_SLOW_M_S: Final = 0.12  # speed at the end of a move
+_NEAR_RAD: Final = 0.03  # remaining angle at the end of a turn
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
-#: What the vehicle is commanded now, and the answer if the job is over.
+#: The vehicle's next command, and the answer if the job is over.
 Step = tuple[AnyAction | None, str | None]
 
 
@@ -41,7 +41,7 @@ class Rising:
         self._commanded_s: float | None = None
 
     def step(self, report: Report) -> Step:
-        """Return what to command now, and the answer once it is done."""
+        """Return the next command, and the answer at the end."""
         now_s, state = report.truth.time_s, report.truth.state
         elapsed_s = now_s - self._begun_s
         if self._commanded_s is None:
@@ -50,29 +50,29 @@ class Rising:
             self._commanded_s = now_s
             return Takeoff(), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
-            # From the command on: a step may come late, on a busy machine.
+            # Counted from the command: on a busy machine this step may run late.
             return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
 
 
 class Landing:
-    """``land``, and what a Tello does that receives no commands."""
+    """``land``, and the Tello's landing when it receives no commands."""
 
     def step(self, report: Report) -> Step:
-        """Return what to command now, and the answer once it is done."""
+        """Return the next command, and the answer at the end."""
         if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
             return None, OK
         return (None if report.truth.state is FlightState.LANDING else Land()), None
 
 
 class Flipping:
-    """``flip``, of which only its time is simulated."""
+    """``flip``; only its duration is simulated."""
 
     def __init__(self, report: Report) -> None:
         self._until_s = report.truth.time_s + FLIP_S
 
     def step(self, report: Report) -> Step:
-        """Return the answer once it is done."""
+        """Return the answer at the end."""
         return None, OK if report.truth.time_s >= self._until_s else None
 
 
@@ -89,7 +89,7 @@ class Turning:
         self._yaw_rad = report.truth.yaw_rad
 
     def step(self, report: Report) -> Step:
-        """Return what to command now, and the answer once it is done."""
+        """Return the next command, and the answer at the end."""
         self._left_rad -= wrap_angle(report.truth.yaw_rad - self._yaw_rad)
         self._yaw_rad = report.truth.yaw_rad
         if abs(self._left_rad) < _NEAR_RAD:
@@ -102,8 +102,8 @@ class Going:
 
     Args:
         report: The present one.
-        places: To go through, in world axes [m].
-        speed_m_s: On the way.
+        places: Waypoints in world axes [m].
+        speed_m_s: Speed along the way.
     """
 
     def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
@@ -112,7 +112,7 @@ class Going:
         self._until_s = report.truth.time_s + PATIENCE_S
 
     def step(self, report: Report) -> Step:
-        """Return what to command now, and the answer once it is done."""
+        """Return the next command, and the answer at the end."""
         truth = report.truth
         if truth.time_s > self._until_s:
             return Hover(), "error"

@@ -1,4 +1,4 @@
-"""A Tello's state strings, its answers to questions, and the mission pads on the floor that it sees. Pure."""
+"""A Tello's state strings, its answers to questions, and its view of mission pads on the floor. Pure."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from skyloop.sim.reports import VehicleTruth
 from skyloop.vehicles.tello.wire import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
 
 MOST: Final = 8
-LOWEST_M: Final = 0.3  #: between these heights a pad is recognised; estimates
+LOWEST_M: Final = 0.3  #: pads are recognised between these heights; estimates
 HIGHEST_M: Final = 1.2
-_VIEW: Final = 0.5  # of the height: how far aside the camera that looks down still sees one; estimate
+_VIEW: Final = 0.5  # as a share of the height: horizontal reach of the camera that looks down; estimate
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A pad below, and where the drone is above it: axes of the world, as all pads are aligned with them."""
+    """A pad below and the drone's position above it, in world axes, as all pads are aligned with them."""
 
     number: int
     place_m: tuple[float, float, float]
 
 
 def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighting | None:
-    """Return the nearest pad in view, of those at x and y in world axes [m], by number."""
+    """Return the nearest pad in view by number, from pads at x and y in world axes [m]."""
     x, y, z = truth.position_m
     if not LOWEST_M <= z <= HIGHEST_M:
         return None
@@ -40,9 +40,9 @@ def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighti
     return Sighting(nearest, (x - east, y - north, z))
 
 
-FARTHEST_CM: Final = 400  #: the distance sensor measures no more; estimate
-COLD_C: Final = 60  #: lowest temperature that is reported; a simulated drone does not warm up
-BAROMETER_CM: Final = -6000  #: an arbitrary zero, as with real ones
+FARTHEST_CM: Final = 400  #: range of the distance sensor; estimate
+COLD_C: Final = 60  #: lowest reported temperature; a simulated drone does not warm up
+BAROMETER_CM: Final = -6000  #: an arbitrary zero, as in real drones
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +50,8 @@ class Snapshot:
     """The state of one instant."""
 
     report: Report
-    start_yaw_rad: float  #: when it was switched on
-    start_altitude_m: float  #: where it took off
+    start_yaw_rad: float  #: when switched on
+    start_altitude_m: float  #: at the take-off
     motor_s: int
     pad: Sighting | None = None
 
@@ -87,13 +87,13 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
 
 
 def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
-    """Return the datagram that is sent ten times a second."""
+    """Return the datagram for the state, sent ten times a second."""
     values = list(fields(snapshot).items())
     return build(values if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *values])
 
 
 def answer(question: str, snapshot: Snapshot) -> str:
-    """Return the answer to a question about the state; raises ``KeyError`` for another one."""
+    """Return the answer to a question about the state; raise ``KeyError`` for other questions."""
     values = fields(snapshot)
     answers = {
         "battery?": values["bat"],

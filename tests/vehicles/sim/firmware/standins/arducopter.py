@@ -1,8 +1,8 @@
-"""Stands in for ArduCopter's program: its JSON interface, without anything that flies.
+"""Stand-in for ArduCopter's program: its JSON interface, without flight.
 
-Its rotors get 0.1, 0.2, 0.3 and 0.4 in ArduCopter's order. What it is told goes to ``states.jsonl`` where it runs.
-STANDIN in the environment: ``garbage`` sends other things between, ``dies`` ends after the third state, ``mavlink``
-sends heartbeats and its attitude, and has no power.
+Its rotors get 0.1, 0.2, 0.3 and 0.4 in ArduCopter's order. Received states go to ``states.jsonl`` in the working
+folder. STANDIN in the environment: ``garbage`` also sends other packets, ``dies`` ends after the third state,
+``mavlink`` sends heartbeats and its attitude, and has no power.
 """
 
 import argparse

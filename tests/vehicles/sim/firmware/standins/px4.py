@@ -1,8 +1,7 @@
-"""Stands in for PX4's program: its link to a simulator, without anything that flies.
+"""Stand-in for PX4's program: its link to a simulator, without flight.
 
 It answers from its fifth ``HIL_SENSOR`` on, as PX4 needs some to start. Its rotors get 0.1, 0.2, 0.3 and 0.4 in PX4's
-order. A line for each message goes to ``messages.txt`` where it runs, and the parameters that it is given to
-``parameters.txt``.
+order. Each message adds a line to ``messages.txt`` in the working folder; the parameters go to ``parameters.txt``.
 """
 
 import os
