@@ -77,7 +77,7 @@ def test_tokens_are_read(tmp_path: Path) -> None:
         ("pilot short\n", "16 to 256 characters"),
         ("pilot " + "x" * 257, "16 to 256 characters"),
         ("pilot " + "ä" * 20, "16 to 256 characters of ASCII"),
-        ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is in the file already"),
+        ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is already in the file"),
     ],
 )
 def test_what_is_wrong_with_a_file_of_tokens_is_told(tmp_path: Path, text: str, said: str) -> None:

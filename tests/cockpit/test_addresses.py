@@ -95,7 +95,7 @@ def test_the_addresses_of_the_interfaces_can_be_bound() -> None:
 
 def test_where_there_is_no_network_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     Announcer(None, loopback=False)("http://127.0.0.1:8123/")
-    assert "this machine is in no network" in capsys.readouterr().err
+    assert "this machine has no network" in capsys.readouterr().err
     Announcer(None, loopback=True)("http://127.0.0.1:8123/")
     Announcer(None, loopback=False)("http://[2001:db8::1]:8123/")
     assert capsys.readouterr().err == ""
@@ -130,7 +130,7 @@ def test_an_expired_code_is_replaced(capsys: pytest.CaptureFixture[str]) -> None
     for _ in range(2):
         pairing.expire()
     told, shown = capsys.readouterr().out.splitlines()
-    assert told == "the address to pair with is too old now"
+    assert told == "the pairing address has expired"
     second = shown.rpartition("#pair=")[2]
     assert pairing.person(first, HERE) is None
     assert pairing.person(second, HERE) is not None

@@ -114,7 +114,7 @@ def test_observers_leave_places_for_pilots() -> None:
     assert hall.after(HEADER_S) == [late]
     for number in range(SMALL.known - SMALL.observers):
         hall.open(f"pilot {number}", PILOT)
-    assert "all that this cockpit takes" in hall.admission.requested(hall.open("z"), PILOT, 0)
+    assert "the most that this cockpit accepts" in hall.admission.requested(hall.open("z"), PILOT, 0)
 
 
 def test_one_address_has_so_many_places_and_gets_them_back() -> None:
@@ -218,7 +218,7 @@ def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, ca
     asyncio.run(main())
     assert ended == ["idle"]
     assert [record.message for record in caplog.records if record.name == listening.__name__] == [
-        "no connection can be taken: none left"
+        "can't accept connections: none left"
     ] * 2
 
 

@@ -123,7 +123,7 @@ def test_a_page_that_was_away_meanwhile_flies_no_route(
             until_asked()
             pilot.say("hover", automatic=True)
             pilot.wait("sent", do="hover")
-        assert "the page was away" in pilot.wait("refused", do="route")["why"]
+        assert "the page was silent" in pilot.wait("refused", do="route")["why"]
 
 
 # What nobody decides ----------------------------------------------------------------------------------------------

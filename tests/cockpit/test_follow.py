@@ -154,7 +154,7 @@ def test_it_catches_up_frame_by_frame_before_it_steers(client: TestClient, node:
         ({"camera": "rear"}, "no camera named 'rear'; known: front"),
         ({"box": [4, 4, 2, 12]}, "width=2, height=12 and must be at least 6 pixels"),
         ({"box": [40, 4, 10, 12]}, "at least half of it must be in the image of 32×24"),
-        ({"captured_ns": "17"}, "s old when its box came"),
+        ({"captured_ns": "17"}, "s old when its box arrived"),
         ({"captured_ns": "9" * 18}, "newer than any"),
         ({"mode": "chase"}, "no mode of following named 'chase'"),
         ({"mode": "follow"}, "take control first"),
@@ -196,7 +196,7 @@ def test_what_makes_no_sense_is_no_command(text: str) -> None:
 def test_without_frames_or_a_target_there_is_nothing_to_follow(client: TestClient) -> None:
     with marker(client) as pilot:
         pilot.say("follow", camera="front", captured_ns="5", box=BOX)
-        assert "choose the camera first" in refused(pilot, "follow")
+        assert "select the camera first" in refused(pilot, "follow")
         pilot.say("follow_select", camera="rear")
         assert "no camera named 'rear'" in refused(pilot, "follow_select")
         pilot.take().say("follow_mode", mode="follow")
@@ -207,7 +207,7 @@ def test_without_frames_or_a_target_there_is_nothing_to_follow(client: TestClien
         pilot.say("follow_select", camera=None, n=4)
         pilot.wait("sent", n=4)
         pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX)
-        assert "choose the camera first" in refused(pilot, "follow")
+        assert "select the camera first" in refused(pilot, "follow")
 
 
 def test_without_opencv_the_refusal_names_the_extra(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -457,7 +457,7 @@ def test_a_token_lets_in_as_an_observer_or_a_pilot(
         page.goto(f"{address}#asked")
         page.get_by_label("Token").fill("not a token of this cockpit")
         page.get_by_role("button", name="Enter").click()
-        page.get_by_text("this token is not known here").wait_for()
+        page.get_by_text("this token is unknown here").wait_for()
         page.get_by_label("Token").fill("0123456789abcdefO")
         page.get_by_role("button", name="Enter").click()
         page.get_by_text("You may watch, not fly.").wait_for()

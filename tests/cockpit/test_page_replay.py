@@ -120,7 +120,7 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
     page.page.get_by_role("button", name="More about First flight.mcap").click()
     page.page.get_by_role("button", name="Delete First flight.mcap").click()
     page.page.get_by_role("button", name="Move to the trash").click()
-    page.page.locator(".recordings .note", has_text="end that first").wait_for()
+    page.page.locator(".recordings .note", has_text="end the replay first").wait_for()
     page.page.get_by_role("button", name="End replay").click()
     page.page.get_by_role("button", name="Move to the trash").click()
     page.page.get_by_role("button", name="Undo").wait_for()

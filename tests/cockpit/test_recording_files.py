@@ -75,8 +75,8 @@ def test_a_name_is_refused_or_is_one_file_of_the_folder(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "a name is needed"),
-        (".mcap", "a name is needed"),
+        ("", "the name is empty"),
+        (".mcap", "the name is empty"),
         ("..", "begin with '.'"),
         ("../up", "'/' in it"),
         ("a\\b", "in it"),

@@ -109,7 +109,7 @@ def test_a_recorder_that_can_not_start_says_why(nodes: Nodes, tmp_path: Path) ->
     with serve(nodes, tmp_path / "file" / "below", record=FakeRecorder) as client:
         answer = post(client, "recordings", {"drones": ["alpha"]})
         assert answer.status_code == 400
-        assert "can't be made" in answer.json()["error"]
+        assert "can't be created" in answer.json()["error"]
 
 
 @pytest.mark.parametrize("name", ["gone.mcap", "..%2Fsecret.mcap", "secret.txt", "%2Fetc%2Fpasswd"])

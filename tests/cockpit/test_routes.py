@@ -67,7 +67,7 @@ def test_routes_are_kept_listed_and_deleted(tmp_path: Path) -> None:
 def test_a_name_never_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
     files = RouteFiles(tmp_path)
     for use in (files.load, files.delete, lambda name: files.save(name, route((1, 2, 1)))):
-        with pytest.raises(UsageError, match="is no name of a route"):
+        with pytest.raises(UsageError, match="is not a valid route name"):
             use(name)
     assert list(tmp_path.iterdir()) == []
 

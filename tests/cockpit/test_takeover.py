@@ -236,7 +236,7 @@ def test_who_presses_take_control_in_line_stays_there_unless_it_has_it(client: T
         pilot.say("take", priority=8)
         why = pilot.wait("refused", do="take")["why"]
         assert "demo has control with priority 4" in why
-        assert "you keep your place in line" in why
+        assert "you stay in the queue" in why
         pilot.say("ping")
         pilot.wait("pong")
         assert [told["state"] for told in pilot.told if told["type"] == "authority"][-1] == "queued"

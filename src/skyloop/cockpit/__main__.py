@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
     parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they appear)")
-    parser.add_argument("--port", type=int, help=f"0: any free port (default: {DEFAULT_PORT}, or the next free one)")
+    parser.add_argument("--port", type=int, help=f"0 takes a free one (default: {DEFAULT_PORT}, or the next free one)")
     parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="folder for recordings")
     parser.add_argument("--parent-fd", type=int, help="exit when this descriptor (the reading end of a pipe) is closed")
     given = parser.parse_args(arguments)

@@ -57,7 +57,7 @@ def _bind(address: str, port: int) -> socket.socket:
     except (OSError, OverflowError) as error:
         listening.close()
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        hint = f"is in use{_by(port)}; use port 0 for any free one" if taken else f"can't be used: {error}"
+        hint = f"is in use{_by(port)}; port 0 takes a free one" if taken else f"can't be used: {error}"
         raise UsageError(f"port {port} of {address} {hint}") from error
     return listening
 

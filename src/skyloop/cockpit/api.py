@@ -153,7 +153,7 @@ class Api:
     Args:
         fleet: The drones.
         gate: Decides who is admitted.
-        counts: What was sent to pages.
+        counts: The messages sent to pages.
         scheme: ``http`` or ``https``.
         admission: The open connections.
         authority: PEM certificate of the authority that signed this server's; None if the cockpit made none.
@@ -188,7 +188,7 @@ class Api:
             Route("/api/statistics", self.statistics),
         ]
 
-    # Who asks --------------------------------------------------------------------------------------------------
+    # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
         """Answer with the role of the client; null for strangers, with a hint on how to log in."""
@@ -267,7 +267,7 @@ class Api:
         return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
-        """Answer with counts of what was sent to pages.
+        """Answer with counts of the messages sent to pages.
 
         See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts only the current cameras.
         """

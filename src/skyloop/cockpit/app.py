@@ -4,11 +4,11 @@
 ``/``, ``/static/…``                    the page
 ``/api/…``                              see :mod:`skyloop.cockpit.api` and :mod:`skyloop.cockpit.recordings_api`
 ``/ws/overview``                        to the page: all drones, twice a second
-``/ws/control``                         from the page: commands to all drones; to the page: what became of them
+``/ws/control``                         from the page: commands to all drones; to the page: their outcome
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
-``/ws/drones/NAME/control``             from the page: commands; to the page: what became of them, who has control
+``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, who has control
 ======================================  ==================================================================
 """
 

@@ -65,7 +65,7 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """Return counts of what was sent to its pages: see ``/api/statistics``.
+        """Return counts of the messages sent to its pages: see ``/api/statistics``.
 
         Raises:
             LinkError: The cockpit does not answer.

@@ -238,7 +238,7 @@ class HandWatch:
     """
 
     def __init__(self) -> None:
-        """Begin with sticks nobody has pushed."""
+        """Begin with untouched sticks."""
         self._last: Fly | None = None
         self._moved_s = 0.0
 

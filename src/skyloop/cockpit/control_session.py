@@ -181,7 +181,7 @@ class ControlSession:
             finally:
                 self._station.sessions.discard(self)
 
-    # Messages of the page ----------------------------------------------------------------------------------------
+    # Messages of the page --------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
         """Carry out the page's commands; of stick commands that queued up, only the newest."""
@@ -526,7 +526,7 @@ class ControlSession:
         await self._close_pilot()
         await self._station.pilot_went()
 
-    # Messages to the page -------------------------------------------------------------------------------------
+    # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
         """Send changes of the authority and of the page's open questions, and report completed commands."""

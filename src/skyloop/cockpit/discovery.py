@@ -59,7 +59,7 @@ class LocalFinder:
         self._also.add(name)
 
     def close(self) -> None:
-        """Do nothing: there is nothing to release."""
+        """Do nothing, as nothing was opened."""
 
     def __call__(self) -> list[Found]:
         if sys.platform != "linux":  # proxies run on Linux only

@@ -304,7 +304,7 @@ class FleetSession:
             await station.pilot_went()
 
     async def _land(self, station: Station, subject: Json) -> None:
-        """Take control with the highest priority, land, and give control back."""
+        """Take control with the highest priority, land, and release control."""
         if station.drone.link.application in (LinkState.LOST, LinkState.CLOSED):
             raise LinkError("the link to the proxy is lost")
         station.check_stop()
@@ -316,7 +316,7 @@ class FleetSession:
         pilot = await station.open_pilot(self._app)
         try:
             if seconds(monotonic_ns() - begun_ns) > BEGIN_S:
-                raise LinkError(f"there was no connection within {BEGIN_S:g} s")
+                raise LinkError(f"no connection within {BEGIN_S:g} s")
             await asyncio.to_thread(pilot.acquire, HIGHEST_PRIORITY)
             station.check_stop()
             from_ns = pilot.proxy_now_ns + SETTLED_NS
