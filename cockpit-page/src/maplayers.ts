@@ -1,4 +1,4 @@
-// What the map shows, from below to above: grid, paths, waypoints, drones, names.
+// The layers of the map, from bottom to top: grid, paths, waypoints, drones, names.
 
 import { figure } from "./format.js";
 import { t } from "./language/index.js";
@@ -43,7 +43,7 @@ export function caption({ pen, ink, size }: Omit<Chart, "view" | "at">, text: st
   pen.fillText(text, size.width / 2, size.height / 2);
 }
 
-/** Where the keyboard's cursor is. */
+/** The keyboard's cursor. */
 export function crosshair({ pen, ink, at }: Chart, place: readonly number[]): void {
   const [x, y] = at(place);
   pen.beginPath();

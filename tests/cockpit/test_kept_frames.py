@@ -38,7 +38,11 @@ def test_the_last_seconds_are_kept_and_no_more_bytes_than_allowed() -> None:
 def test_the_frame_of_the_box_is_found_or_the_refusal_says_why_not() -> None:
     frames = kept(*range(1000, 8000, 100))
     assert frames.find(5000 * MS).header.seq == 5000
-    for at_ms, words in ((1000, "6.9 s old when its box arrived, and only the last 3.0 s"), (5050, "did not"), (9000, "newer")):
+    for at_ms, words in (
+        (1000, "6.9 s old when its box arrived, and only the last 3.0 s"),
+        (5050, "did not"),
+        (9000, "newer"),
+    ):
         with pytest.raises(RefusedError, match=words):
             frames.find(at_ms * MS)
     with pytest.raises(RefusedError, match="no frame yet"):

@@ -168,7 +168,7 @@ def test_a_person_who_is_asked_for_control_keeps_it_and_then_hands_it_over(deck:
         "asks", name="survey.py", authority=skyloop.Authority(priority=4, takeover="ask", stay=True, for_s=120)
     ) as drone:
         page.wait_for_text(".asks", "survey.py asks for control")
-        for words in ("Priority 4, yours 8", "Wanted for 2 min", "it has control when the time is over"):
+        for words in ("Priority 4, yours 8", "Wanted for 2 min", "it gets control when the time is up"):
             assert words in page.says(".asks")
         assert 60 < int(page.says(".asks-left b").split()[0]) <= 120
         assert "survey.py asks for control" in (page.pane.locator("[aria-live=assertive]").text_content() or "")
@@ -274,7 +274,7 @@ def test_parameters(deck: Deck) -> None:
         assert "must be at least 0.1" in page.says('[data-parameter="limits.speed"] .answer'), "the drone's own words"
         assert drone.config["limits.speed"] == 1.5
         write("fast")
-        page.wait_for_text('[data-parameter="limits.speed"] .answer', "a number is needed")
+        page.wait_for_text('[data-parameter="limits.speed"] .answer', "enter a number")
 
 
 def test_two_watch_while_one_flies(deck: Deck) -> None:

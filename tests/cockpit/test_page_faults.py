@@ -144,14 +144,14 @@ def test_after_a_proxys_death_and_return_control_is_the_persons_to_take(deck: De
     page = deck.page("returns")
     page.take_control()
     proxy.signal(signal.SIGKILL)
-    page.wait_for_text(".ended", "nobody has control, and what returns does is not known")
+    page.wait_for_text(".ended", "nobody has control, and the state of returns is unknown")
     page.wait_for_text(".holder", "Nobody")
     page.wait_for_text(".pill", "not known")
     assert page.pane.get_attribute("data-old") == "true"
     proxy.end()
     deck.proxy("returns", SMALL)
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is back")
-    page.wait_for_text(".ended", "what returns flew meanwhile is not known")
+    page.wait_for_text(".ended", "what returns did meanwhile is unknown")
     with observe("returns") as drone:
         for _ in range(30):
             assert drone.next_feedback().owner is None

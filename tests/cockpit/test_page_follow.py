@@ -130,7 +130,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
             focused = "(button) => button === document.activeElement"
             return bool(panel.get_by_role("button", name="Follow").evaluate(focused))
 
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         picture(page, "follow-marked")
         assert drone.feedback().state is FlightState.HOVERING, "nothing flies yet"
         page.until(chosen_by_enter, "the panel can be read by now")
@@ -166,7 +166,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.until(hover_over_it, "what is under the mouse is shown")
         picture(page, "follow-detection")
         page.until(chosen, "it is chosen, although the drone still swings")
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         page.until(chosen_by_enter, "the panel can be read by now")
         page.press("Enter")
         page.until(lambda: drone.feedback().state is FlightState.FLYING, "it flies")
@@ -196,7 +196,7 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
 
             sight.draw(put, put, lambda: hand.lift("finger"))
             hand.lift("finger")
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         picture(page, "follow-phone-marked")
         panel = page.pane.get_by_role("region", name="Target")
         tapped_s = -math.inf

@@ -55,7 +55,7 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
     page = deck.page("filmed")
     page.wait_for_new_picture()
     page.page.get_by_role("button", name="Record", exact=True).click()
-    page.page.get_by_role("button", name="Put a mark into the recording of filmed").click()
+    page.page.get_by_role("button", name="Add a mark to the recording of filmed").click()
     with skyloop.connect("filmed", name="up.py") as drone:
         drone.takeoff()
         drone.land(wait=False)
