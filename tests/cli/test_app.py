@@ -78,7 +78,7 @@ def test_without_a_word_help_is_shown(run: Run) -> None:
         (["sim", "--firmware", "foo"], "skyloop sim: --firmware: 'foo' is none of 'ardrone1'"),
         (["fly", "x.py", "--priority", "32"], "skyloop fly: --priority: "),
         (["cockpit", "alpha", "--port", "70000"], "skyloop cockpit: --port: "),
-        (["watch", "a", "b"], "skyloop watch: more words than are needed: b\nUsage: skyloop watch [OPTIONS] NAME\n"),
+        (["watch", "a", "b"], "skyloop watch: too many words: b\nUsage: skyloop watch [OPTIONS] NAME\n"),
         (["log", "inf"], "skyloop log: no command inf; did you mean 'info'?"),
     ],
 )

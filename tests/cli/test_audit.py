@@ -64,7 +64,7 @@ def test_a_file_of_ones_own(start: Start, run: Run, tmp_path: Path) -> None:
         file.write('{"torn')
     ended = run("audit", "--file", str(path))
     assert "alice" in ended.out
-    assert "1 line can't be understood" in ended.err
+    assert "Skipped 1 line that can't be parsed" in ended.err
     assert run("audit", "bravo", "--file", str(path)).out.startswith("The audit trail has no flights yet")
     assert run("audit").out.startswith("The audit trail has no flights yet")
 

@@ -49,7 +49,7 @@ def test_sizes() -> None:
 
 @pytest.mark.parametrize("text", ["", "320", "320x", "0x240", "-1x5", "4000x3000", "axb"])
 def test_sizes_that_are_none(text: str) -> None:
-    with pytest.raises(UsageError, match="no size of frames"):
+    with pytest.raises(UsageError, match="not a frame size"):
         parse_sizes(text)
 
 

@@ -45,7 +45,7 @@ def test_pictures_calibrate(run: Run, tmp_path: Path, pictures: list[str]) -> No
     found = load_calibration(output)
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
     assert (found.views, found.camera) == (9, "front")
-    assert "wall.png: the board is not seen" in ended.err
+    assert "wall.png: the board is not visible" in ended.err
     assert f"fx {found.fx:.1f} ± {found.fx_deviation:.1f}" in ended.out
     assert "RMS over 9 views" in ended.out
     again = run("camera", "calibrate", *pictures, "-o", str(output))

@@ -98,14 +98,14 @@ def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None
         refused = run("stop", "b1")
         assert (refused.code, refused.err) == (
             2,
-            "skyloop: an emergency stop asks before: give --yes where nobody can answer\n",
+            "skyloop: an emergency stop asks first: give --yes if there is no terminal to answer on\n",
         )
         assert one.feedback().state.airborne
         ended = run("stop", "--all", "--yes", "--json")
         assert ended.code == 0
         assert {"name": "b1", "ok": True, "outcome": "motors off"} in json.loads(ended.out)
         eventually(lambda: state("b1") == "emergency", "its motors are off")
-    assert run("land", "--all", "b1").err == "skyloop: --all is every drone: give it alone, or names\n"
+    assert run("land", "--all", "b1").err == "skyloop: --all means every drone: give either --all or names\n"
 
 
 def test_no_drone_at_all_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,7 +113,7 @@ def test_no_drone_at_all_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
     for command in (["land", "--all"], ["stop", "--all", "--yes"]):
         ended = run(*command)
         assert ended.code == 1
-        assert ended.err.startswith("skyloop: no drone is found")
+        assert ended.err.startswith("skyloop: no drone found")
 
 
 def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:

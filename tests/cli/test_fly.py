@@ -138,7 +138,7 @@ def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Pr
     with skyloop.connect("alpha", access="observe") as drone:
         drone.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
-        process.until("other took over: the drone is left to it")
+        process.until("other took over: leaving the drone to it")
         assert process.wait() == 0
         assert "landing" not in process.text
         other.land()

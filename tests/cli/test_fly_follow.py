@@ -26,7 +26,7 @@ from tests.support.processes import Process
         ((), "give --class CLASS, such as person, or --box X,Y,W,H"),
         (("--box", "1,2,3"), "must be X,Y,W,H"),
         (("--box", "1,2,x,4"), "must be X,Y,W,H"),
-        (("--box", "1,2,nan,4"), "must be of finite numbers"),
+        (("--box", "1,2,nan,4"), "must consist of finite numbers"),
         (("--class", "person", "--mode", "folow"), "no mode named 'folow'; did you mean 'follow'?"),
         (("--class", "person", "--side", "behnd"), "no side named 'behnd'; did you mean 'behind'?"),
         (("--class", "person", "--distance", "1"), "must be above nearest_m, which is 2"),

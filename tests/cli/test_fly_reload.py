@@ -139,7 +139,7 @@ def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_mo
             assert set(after[after.index(action) :]) == {action}
 
         load(Second, "reloaded Second", 0.2)
-        load(Broken, "the one before keeps flying", 0.2)
+        load(Broken, "the previous one keeps flying", 0.2)
         load(Failing, "the controller failed: hovering", None)
         load(Listening, "reloaded Listening", 0.1)
         drone.close()
@@ -158,7 +158,7 @@ def test_a_saved_file_takes_over_without_a_command_being_missed(
         process.until("reloaded Mine")
         looker.wait(lambda _: 0.2 in speeds(seen), 20.0)
         save(mine, "def (")
-        process.until("the one before keeps flying")
+        process.until("the previous one keeps flying")
         now = len(seen)
         looker.wait(lambda _: len(seen) > now + 10, 20.0)
         process.signal(signal.SIGINT)

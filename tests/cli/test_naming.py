@@ -53,13 +53,13 @@ def test_a_drone_is_named_by_either(name: str | None, drone: str | None, default
 def test_a_drone_that_is_not_named_or_named_twice_is_refused(run: Run) -> None:
     with pytest.raises(UsageError, match="NAME a and --drone b name two drones"):
         naming.one_drone("a", "b")
-    with pytest.raises(UsageError, match="give its NAME, or --drone NAME; none is running: skyloop sim"):
+    with pytest.raises(UsageError, match="give NAME or --drone NAME; none is running: skyloop sim"):
         naming.one_drone(None, None)
     assert naming.drones(["a", "b"], ["b", "c"]) == ["a", "b", "c"]
     for words in (["watch"], ["teleop"], ["param"], ["record"], ["land"], ["stop", "--yes"], ["camera", "calibrate"]):
         ended = run(*words)
         assert (ended.code, ended.out) == (2, "")
-        assert ended.err.startswith("skyloop: no drone is named: give its NAME, or --drone NAME; none is running")
+        assert ended.err.startswith("skyloop: no drone given: give NAME or --drone NAME; none is running")
 
 
 @pytest.mark.parametrize("words", [["nobody"], ["--drone", "nobody"], ["--drone=nobody"]])

@@ -280,11 +280,11 @@ def test_the_cockpit_says_what_is_wrong(run: Run, alpha: Process) -> None:
 
 def test_the_list_names_the_drones_of_other_users(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.transport.local.names_of_others", lambda: {"mary": ["bravo", "alpha"]})
-    theirs = "mary runs alpha, bravo: a user's proxies are closed to others, but for a group's (SKYLOOP_GROUP)."
+    theirs = "mary runs alpha, bravo: a user's proxies are closed to others, except to a group (SKYLOOP_GROUP)."
     assert run("list").err == f"{theirs}\n"
     assert run("list", "--json").err == ""
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", f"/tmp/skyloop-none-{os.getpid()}")
     start = "Start one: skyloop proxy sim:// --name alpha"
     assert run("list").out == f"No proxy of yours is running on this host. {theirs} {start}\n"
     ours = "No proxy of yours is running on this host."
-    assert run("land", "--all").err == f"skyloop: no drone is found. {ours} {theirs} {start}\n"
+    assert run("land", "--all").err == f"skyloop: no drone found. {ours} {theirs} {start}\n"

@@ -305,7 +305,7 @@ def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus
     assert tokens.feed(b"\x1b\x1b" + focus + b"l") == ["esc", "esc", "l"]
     assert told in tokens.other
     assert tokens.feed(b"\x1b[15~") == []
-    assert tokens.other == "this key is none here"
+    assert tokens.other == "this key has no function here"
     tokens.feed(b"\x1b")
     tokens.flush()
     assert tokens.other == ""
@@ -313,14 +313,18 @@ def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus
 
 def test_a_key_that_does_nothing_says_so() -> None:
     fingers = Fingers()
-    for key, told in (("x", "X is no key here"), ("\n", "Enter is no key here"), ("\x01", "'\\x01' is no key here")):
+    for key, told in (
+        ("x", "X has no function here"),
+        ("\n", "Enter has no function here"),
+        ("\x01", "'\\x01' has no function here"),
+    ):
         assert fingers.press(key) == []
         assert fingers.hands.no_effect == told
     assert fingers.press("w") == [FORWARD]
     assert fingers.hands.no_effect == ""
     assert fingers.press("l") == ["land"]
     assert fingers.press("up", state=LANDING) == []
-    assert fingers.hands.no_effect.startswith("↑ has no effect on a landing, which H ends")
+    assert fingers.hands.no_effect.startswith("↑ has no effect during a landing")
     assert fingers.press("esc", after_s=5.0) == ["hover"]
     assert fingers.press("esc", after_s=0.15) == ["stop"]
     assert fingers.press("t") == []
@@ -570,7 +574,7 @@ def test_l_lands_while_a_stick_key_is_held_and_esc_that_is_held_cuts_nothing(ter
         for _ in range(8):
             terminal.press(b"\x1b")
             time.sleep(0.03)
-        terminal.until("Esc is held")
+        terminal.until("holding Esc")
         for _ in range(4):
             terminal.press(b"\x1bw")
             time.sleep(0.03)

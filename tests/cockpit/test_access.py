@@ -72,11 +72,11 @@ def test_tokens_are_read(tmp_path: Path) -> None:
     [
         ("", "has no token"),
         ("# nothing\n", "has no token"),
-        ("pilot\n", "line 1: ROLE TOKEN"),
-        ("\nadmin 0123456789abcdef\n", "line 2: ROLE TOKEN"),
-        ("pilot short\n", "16 to 256 characters"),
-        ("pilot " + "x" * 257, "16 to 256 characters"),
-        ("pilot " + "ä" * 20, "16 to 256 characters of ASCII"),
+        ("pilot\n", "line 1: expected ROLE TOKEN"),
+        ("\nadmin 0123456789abcdef\n", "line 2: expected ROLE TOKEN"),
+        ("pilot short\n", "16 to 256 ASCII characters"),
+        ("pilot " + "x" * 257, "16 to 256 ASCII characters"),
+        ("pilot " + "ä" * 20, "16 to 256 ASCII characters"),
         ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is already in the file"),
     ],
 )

@@ -153,7 +153,7 @@ def test_a_browser_is_paired(capsys: pytest.CaptureFixture[str]) -> None:
         assert code not in said[1], "the next one is shown"
         client.cookies.clear()
         refused = client.post("/api/login", json={"token": code}, headers=ORIGIN)
-        assert (refused.status_code, "was used" in refused.json()["error"]) == (401, True)
+        assert (refused.status_code, "already used" in refused.json()["error"]) == (401, True)
 
 
 def test_pairing_and_certificates_exclude_each_other() -> None:

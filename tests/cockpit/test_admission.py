@@ -109,7 +109,7 @@ def test_observers_leave_places_for_pilots() -> None:
     for number in range(SMALL.observers):
         hall.open(f"address {number}", OBSERVER)
     late = hall.open("late")
-    assert "observers" in hall.admission.requested(late, OBSERVER, 0)
+    assert "observer connections" in hall.admission.requested(late, OBSERVER, 0)
     assert hall.admission.counts.refused == 1
     assert hall.after(HEADER_S) == [late]
     for number in range(SMALL.known - SMALL.observers):
@@ -121,7 +121,7 @@ def test_one_address_has_so_many_places_and_gets_them_back() -> None:
     hall = Hall()
     open_ = [hall.open("a", OBSERVER) for _ in range(SMALL.known_of_address)]
     more = hall.open("a")
-    assert "4 connections of observers are open from a" in hall.admission.requested(more, OBSERVER, 0)
+    assert "4 observer connections are open from a" in hall.admission.requested(more, OBSERVER, 0)
     assert hall.admission.requested(more, PILOT, 0) == "", "a pilot's are counted by themselves"
     hall.admission.closed(open_[0])
     hall.open("a", OBSERVER)

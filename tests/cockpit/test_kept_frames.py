@@ -45,7 +45,7 @@ def test_the_frame_of_the_box_is_found_or_the_refusal_says_why_not() -> None:
     ):
         with pytest.raises(RefusedError, match=words):
             frames.find(at_ms * MS)
-    with pytest.raises(RefusedError, match="no frame yet"):
+    with pytest.raises(RefusedError, match="no frame has arrived"):
         KeptFrames().find(0)
 
 

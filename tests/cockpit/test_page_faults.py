@@ -106,7 +106,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
         assert page.page.locator(".banner:visible").count() == 1, "one cause is told once, and hides nothing"
         assert page.pane.locator("h2").is_visible()
         with observe("grey") as drone:
-            page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control ran out")
+            page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control expired")
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is heard again")
     page.until(lambda: page.pane.locator(".ended").is_visible(), "it tells that control was lost")
     assert "nobody has control" in page.says(".ended")
@@ -131,7 +131,7 @@ def test_a_stopped_browser_is_a_silent_pilot(open_cockpit: tuple[Browser, str], 
             drone.wait(lambda feedback: not feedback.lease, 5.0)
         page.page.keyboard.up("w")
         page.until(lambda: page.pane.locator(".ended").is_visible(), "it tells that control was lost")
-        assert "control ran out" in page.says(".ended")
+        assert "control expired" in page.says(".ended")
         page.until(lambda: "Nobody" in page.says(".holder"), "it is told who has control now")
         assert not drone.feedback().lease, "it is not taken back by itself"
         page.pane.get_by_role("button", name="Understood").click()

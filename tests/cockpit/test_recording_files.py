@@ -78,8 +78,8 @@ def test_a_name_is_refused_or_is_one_file_of_the_folder(text: str) -> None:
         ("", "the name is empty"),
         (".mcap", "the name is empty"),
         ("..", "begin with '.'"),
-        ("../up", "'/' in it"),
-        ("a\\b", "in it"),
+        ("../up", "contain '/'"),
+        ("a\\b", "contain"),
         ("a\0b", "U+0000"),
         ("a\nb", "U+000A"),
         ("-rf", "begin with '-'"),
@@ -266,7 +266,7 @@ def test_a_replay_is_moved_by_pilots_and_its_file_stays(nodes: Nodes, folder: Pa
         for body, words in (({"position_s": 99.0}, "at most"), ({"speed": 0}, "at least"), ({"paused": 1}, "bool")):
             answer = post(client, "replays/flight", body)
             assert (answer.status_code in (400, 409), words in answer.json()["error"]) == (True, True)
-        assert "is no replay" in post(client, "replays/alpha", {"paused": True}).json()["error"]
+        assert "is not a replay" in post(client, "replays/alpha", {"paused": True}).json()["error"]
         assert post(client, "replays/gone", {"paused": True}).status_code == 404
         for path, more in (("recordings/flight.mcap/delete", {}), ("recordings/flight.mcap/rename", {"name": "x"})):
             answer = post(client, path, more)

@@ -68,7 +68,7 @@ def test_what_does_not_go_together_is_told(tmp_path: Path) -> None:
         ({"tls_cert": one}, "--tls-key"),
         ({"tls_key": one}, "--tls-cert"),
         ({"client_ca": one}, "need TLS"),
-        ({"client_ca": one, "tls_cert": one, "tls_key": one, "token_file": one}, "not from both"),
+        ({"client_ca": one, "tls_cert": one, "tls_key": one, "token_file": one}, "not both"),
     ):
         with pytest.raises(UsageError, match=said):
             Access(**given)  # type: ignore[arg-type]

@@ -93,7 +93,7 @@ def test_a_page_keeps_it_and_says_why(client: TestClient, node: Node) -> None:
             assert drone.authority.state == "queued"
         pilot.wait("asked", questions=[])  # it has left
         pilot.say("answer", id=drone.app_id, grant=True)
-        assert "nobody asks" in pilot.wait("refused", do="answer")["why"]
+        assert "no longer open" in pilot.wait("refused", do="answer")["why"]
         pilot.say("hover")
         pilot.wait("done", do="hover")
 
