@@ -100,9 +100,7 @@ class HeadlessPage:
         except (OSError, InvalidStatus, ConnectionClosed) as error:
             raise LinkError(f"the cockpit at {self._origin} closed the connection: {error}") from error
         except ExceptionGroup as group_of:
-            raise LinkError(
-                f"the cockpit at {self._origin} closed it: {group_of.exceptions[0]}"
-            ) from group_of
+            raise LinkError(f"the cockpit at {self._origin} closed it: {group_of.exceptions[0]}") from group_of
 
     async def _listen(self, socket: ClientConnection) -> None:
         async for message in socket:
