@@ -170,7 +170,7 @@ def test_the_figures_of_a_path(tracer: ModuleType) -> None:
     assert tracer.figures(path) == {"files": 3, "calls": 7, "returns": 2}
     measured = {name: tracer.figures(path) for name in tracer.THREADS if name != "frame"}
     assert tracer.over(measured, {"death": {"files": 3, "returns": 1}}) == [
-        "frame was not seen to its end in any run",
+        "frame was not complete in any run",
         "death: returns are 2, the budget is 1",
     ]
 

@@ -1,4 +1,4 @@
-"""What is sent when: the channels, their periods, and absolute deadlines. Needs the standard library alone."""
+"""The schedule: channels, periods, and absolute deadlines. Needs only the standard library."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKET_PERIOD_S: Final = 0.03125
 FRAME_PERIOD_S: Final = 0.0667
 WARM_UP_S: Final = 0.4  #: at the start of a turn, not counted: threads, slots and discovery of a new connection
 SETTLE_S: Final = 0.3  #: for the last samples of a turn to arrive
-_GOLDEN: Final = 0.618034  # multiples of it, less whole numbers, are spread evenly however many there are
+_GOLDEN: Final = 0.618034  # fractional parts of its multiples are spread evenly for any number of them
 
 
 @dataclass(frozen=True, slots=True)
