@@ -128,7 +128,7 @@ def look(pipe: Pipe, url: str) -> None:
 
 
 def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
-    """Return what the pages get, until something comes through the pipe."""
+    """Return the frames that the pages receive, until a message arrives through the pipe."""
     arrivals: Arrivals = {VIDEO: []}
     seen = [0] * len(pages.clients)
     while not pipe.poll(_LOOK_S):
@@ -145,7 +145,7 @@ def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
 
 
 def recorder_problem() -> str:
-    """Return why nothing can be recorded here; empty if it can."""
+    """Return why recording is impossible here; empty if it is possible."""
     try:
         from skyloop.recording.recorder import check_installed
 
@@ -156,7 +156,7 @@ def recorder_problem() -> str:
 
 
 def view_problem() -> str:
-    """Return why nothing can be viewed in Foxglove here; empty if it can."""
+    """Return why viewing in Foxglove is impossible here; empty if it is possible."""
     missing = [name for name in ("foxglove", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]
     if missing:
         return str(MissingExtraError("viewing in Foxglove", "foxglove", cause=f"no {', '.join(missing)}"))
@@ -164,6 +164,6 @@ def view_problem() -> str:
 
 
 def cockpit_problem() -> str:
-    """Return why no cockpit can be opened here; empty if it can."""
+    """Return why a cockpit can't be opened here; empty if it can."""
     missing = [name for name in ("starlette", "uvicorn", "websockets", "cv2") if find_spec(name) is None]
     return str(MissingExtraError("the cockpit", "cockpit", cause=f"no {', '.join(missing)}")) if missing else ""

@@ -106,7 +106,7 @@ def test_trackers_are_measured(
     tracking.main(["--quick", "--fixtures", str(tmp_path / "none"), "--output", str(tmp_path)])
     results = msgspec.json.decode((tmp_path / "tracking.json").read_bytes(), type=tracking.TrackingResults)
     assert [row.tracker for row in results.rows] == list(ours)
-    assert "only drawn images are used" in capsys.readouterr().out
+    assert "using only drawn images" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", list(RUNS))
