@@ -1,4 +1,4 @@
-"""Tokens, certificates, and whose program is at the other end."""
+"""Tokens, certificates, and the owner of the program at the other end."""
 
 from __future__ import annotations
 
@@ -219,7 +219,7 @@ def test_the_table_of_sockets() -> None:
 
 
 def test_a_socket_that_its_program_has_closed_is_nobodys() -> None:
-    """It stands there as the superuser's: a stranger who sends and hangs up must not pass for that."""
+    """The table lists it as the superuser's: a stranger who sends and hangs up must not pass for that."""
     table = HEAD + entry("0100007F:D431", "0100007F:1F90", 0, inode=0, state="04")
     assert uid_in(table, ("127.0.0.1", 0xD431), ("127.0.0.1", 0x1F90)) is None
 

@@ -1,4 +1,4 @@
-"""The page's port, the addresses that others reach it by, and the code that lets a phone in once."""
+"""The page's port, its addresses for others, and the code that admits a phone once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HERE = "127.0.0.1"
 
 @pytest.fixture
 def ports(monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
-    """The default port and the next of this test: two free ones in a row."""
+    """The default port and the next one in this test: two consecutive free ports."""
     while True:
         with ExitStack() as stack:
             first = stack.enter_context(bind(HERE, 0)).getsockname()[1]

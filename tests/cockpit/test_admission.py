@@ -1,4 +1,4 @@
-"""How many connections the cockpit takes, whose give way, and how long one may say nothing."""
+"""How many connections the cockpit accepts, which ones give way, and how long one may be silent."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SMALL = Places(anonymous=6, anonymous_of_address=3, known=8, known_of_address=4)
 
 
 class Hall:
-    """An admission, with the connections that it has ended."""
+    """An admission, with the connections it has ended."""
 
     def __init__(self, places: Places = SMALL) -> None:
         self.admission = Admission(places)
@@ -69,7 +69,7 @@ def test_the_oldest_stranger_of_an_address_gives_way_to_a_newer_one() -> None:
 
 
 def test_a_guesser_at_the_same_address_does_not_end_the_handshakes_of_people() -> None:
-    """A hundred wrong tokens a second, whose answers wait, ended each connection of the address within 0.3 s."""
+    """A hundred wrong tokens a second with delayed answers ended every connection of the address within 0.3 s."""
     hall = Hall()
     person = hall.open()
     for _ in range(100):
@@ -183,7 +183,7 @@ class Speaker(asyncio.Protocol):
 
 
 def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """No descriptor is left: it is tried again after a while, a stranger's is given up, and little is said."""
+    """Without a free descriptor the cockpit retries after a while, drops a stranger's connection and logs little."""
     monkeypatch.setattr(logging.getLogger(listening.__name__), "filters", [])  # a cockpit that ran here limits repeats
     admission = Admission()
     ended = []

@@ -1,4 +1,4 @@
-"""Which alarms a drone has, as tables."""
+"""The alarms of a drone, as tables."""
 
 from __future__ import annotations
 

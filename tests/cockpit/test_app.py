@@ -1,4 +1,4 @@
-"""The page and its two streams, with a drone that is not there."""
+"""The page and its two streams, with a stand-in for a drone."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_drones_are_listed(client: TestClient) -> None:
 
 
 def follow(socket: WebSocketTestSession, enough: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
-    """The first state that is enough."""
+    """Return the first state that satisfies a condition."""
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline:
         message: dict[str, Any] = socket.receive_json()
@@ -328,7 +328,7 @@ def test_drawings_follow_the_frame_that_they_belong_to(client: TestClient, drone
         drone.draw(Annotation("follow", "front", later.captured_ns, 64, 48, shapes[:1]))
         drone.draw(Annotation("follow", "bottom", later.captured_ns, 64, 48, ()))
         socket.send_json({"ack": head["ack"]})
-        # Never ahead of its frame, and nothing of another camera.
+        # Never ahead of its frame, and none of another camera.
         head, _ = frame(socket.receive_bytes())
         assert head["captured_ns"] == str(later.captured_ns)
         assert len(socket.receive_json()["shapes"]) == 1
@@ -378,7 +378,7 @@ def test_pages_are_counted(client: TestClient, drone: FakeDrone) -> None:
 
 
 def test_everything_is_given_back(drone: FakeDrone) -> None:
-    def threads() -> int:  # but the one that encodes JPEGs, which is the process's
+    def threads() -> int:  # except the one that encodes JPEGs, which belongs to the process
         return sum(not thread.name.startswith("jpeg") for thread in threading.enumerate())
 
     before = threads()

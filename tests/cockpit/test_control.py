@@ -1,4 +1,4 @@
-"""Flying from a page: a real proxy over the memory transport, a vehicle that does what it is told."""
+"""Flying from a page: a real proxy over the memory transport, and an obedient vehicle."""
 
 from __future__ import annotations
 
@@ -165,8 +165,8 @@ def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(client: TestClient, 
             hovers = count(node, Hover())
         until(lambda: count(node, Hover()) > hovers)
         watcher.wait(lambda feedback: feedback.owner is None, 5)
-        watcher.wait("hovering", 5)  # the first sample without an owner may be from before the vehicle heard of it
-        # The proxy's ladder goes on from here: nobody is heard, so it lands.
+        watcher.wait("hovering", 5)  # the first sample without an owner may predate the vehicle's hover
+        # The proxy's ladder then continues: no pilot is heard, so it lands.
         with node.connect("me") as owner:
             owner.config["failsafe.land_after_s"] = 0.1
         watcher.wait("landed", 5)
@@ -216,7 +216,7 @@ def test_flying_to_a_place(client: TestClient, node: Node) -> None:
 def test_what_becomes_of_a_flight_to_a_place_is_told_by_the_number_of_its_command(
     client: TestClient, node: Node
 ) -> None:
-    """The page took what came of an earlier one for the newest's: it hovered, or did not when it was let go."""
+    """The page mistook the result of an earlier one for the newest's: it hovered, or did not when released."""
     with page(client) as pilot:
         pilot.take().take_off()
         with pilot.staying():
@@ -293,7 +293,7 @@ def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClie
 def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, said: str, method: str
 ) -> None:
-    """Its place stayed in force, and nobody watched the flight there any more."""
+    """The place stayed in force, but the page no longer watched the flight there."""
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("goto", x=50, y=0, z=1)
@@ -310,7 +310,7 @@ def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
 
 
 def test_a_way_stays_watched_after_a_command_that_took_nobodys_place(client: TestClient, node: Node) -> None:
-    """What the proxy refused of the way there was taken for older than the newest command, which had flown nothing."""
+    """The proxy's refusal was taken for older than the newest command, which had flown nothing."""
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("goto", x=50, y=0, z=1)
@@ -398,7 +398,7 @@ def test_who_is_pre_empted_is_told_and_gets_it_back(client: TestClient, node: No
 
 
 class Turning(Controller):
-    """Turns all the time, and remembers what it was told."""
+    """Turns all the time, and remembers its notifications."""
 
     def __init__(self, drone: Drone) -> None:
         super().__init__(drone)
@@ -526,7 +526,7 @@ def test_what_was_refused_is_told_once_and_does_not_happen_later(client: TestCli
         watcher.wait("emergency", 5)
         pilot.wait("done", do="stop")
         stops = -1
-        while stops != (stops := count(node, EmergencyStop())):  # a repeat that is still on its way would stop it again
+        while stops != (stops := count(node, EmergencyStop())):  # a repeat still under way would stop it again
             for _ in range(10):
                 watcher.next_feedback()
         pilot.say("takeoff")

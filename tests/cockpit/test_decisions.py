@@ -164,7 +164,7 @@ def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
             node.flyer.others = "RTL"
             watcher.wait(lambda feedback: feedback.others is not None, 5)
             if begin is steer:
-                pilot.say("hover", automatic=True)  # the page's sticks are let go
+                pilot.say("hover", automatic=True)  # the page's sticks are released
                 pilot.wait("sent", do="hover")
             if not leaves:
                 begun_s = time.monotonic()
@@ -214,7 +214,7 @@ def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
 def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
 ) -> None:
-    """The end of a go-to or a route, and the tab that was closed half-way, made it hover until it fell."""
+    """The end of a go-to or a route, or a closing tab, made it hover until its battery was empty."""
     with node.connect("watcher", access="observe") as watcher:
         with page(client) as pilot:
             pilot.take().say("set", name="battery.return", value=0.5)

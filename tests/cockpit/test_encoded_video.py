@@ -1,4 +1,4 @@
-"""H.264 on pages: passed on as it comes, in a form that like panes share; a page that falls behind gets its own."""
+"""H.264 on pages: relayed unchanged, in a form shared by similar panes; a page that falls behind gets its own."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ def test_pictures_follow_one_another_or_begin_with_a_key() -> None:
         stream.encode()
         assert after(first)[0] == [108, 109]
         assert after(0)[0] == [108, 109]
-        stream.seq = 5  # the proxy began anew
+        stream.seq = 5  # the proxy restarted
         stream.encode(key=True)
         assert after(feed.after(0, follows=True)[0][-1].serial - 1)[0] == [6]
         for _ in range(2 * KEPT):
@@ -188,7 +188,7 @@ def test_pictures_follow_one_another_or_begin_with_a_key() -> None:
 
 
 class OnPage:
-    """One camera on one page, with a clock of its own."""
+    """One camera on one page, with its own clock."""
 
     def __init__(self, drone: FakeDrone) -> None:
         self.clock = Clock()
@@ -209,7 +209,7 @@ class OnPage:
 def test_a_page_that_falls_behind_gets_its_own_stream_that_it_acknowledges(drone: FakeDrone) -> None:
     async def watch() -> None:
         page = OnPage(drone)
-        page.clock.now_ns = 0  # pictures bear the machine's time, which is later
+        page.clock.now_ns = 0  # pictures carry the machine's time, which is later
         page.take()
         shared = drone.streams[0]
         shared.encode(key=True)

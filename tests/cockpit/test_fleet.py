@@ -1,4 +1,4 @@
-"""Drones that come, vanish, come back and are forgotten."""
+"""Drones that appear, vanish, return and are forgotten."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def run(work: Callable[[], Awaitable[None]]) -> None:
 
 
 async def settle(fleet: Fleet) -> None:
-    """Look, and let those who were found be connected to."""
+    """Search, and wait until the found ones are connected."""
     await fleet.look()
     while fleet._connecting:
         await asyncio.gather(*fleet._connecting.values())
@@ -243,7 +243,7 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
             until(lambda: rows(client)[0]["links"]["application"] == "up", "its connection leads to where it is now")
             assert [(row["name"], row["transport"]) for row in rows(client)] == [("alpha", "network")]
             while (state := page.receive_json())["type"] != "state" or state["links"]["application"] != "up":
-                pass  # the page that shows it goes on
+                pass  # its page stays connected
     finally:
         before.stop()
         after.stop()

@@ -99,7 +99,7 @@ def test_each_drone_that_is_not_landed_is_told_with_its_reason(nodes: tuple[Node
 
 
 def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node, Node]) -> None:
-    """The landing took the authority in the middle of it, and was obeyed by a vehicle that had not heard the stop."""
+    """The landing took the authority during the stop, and a vehicle that had not received the stop obeyed it."""
     fleet = Fleet(Nodes(*nodes), look_s=0.05)
     with cockpit(fleet) as client, everybody(client) as pilot:
         until(lambda: len(fleet.stations) == 2)

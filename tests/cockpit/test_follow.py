@@ -1,4 +1,4 @@
-"""Following what a page marked: a real proxy, a vehicle that flies as it is told, and a stand-in that follows."""
+"""Following a target marked on a page: a real proxy, an obedient vehicle, and a stand-in for the follower."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def refused(pilot: Page, do: str) -> str:
 
 
 def draws(watcher: Drone, frames: int) -> None:
-    """A person takes as long as so many frames."""
+    """Wait this many frames, as a person would."""
     for _ in itertools.islice(watcher.frames("front"), frames):
         pass
 
@@ -232,16 +232,16 @@ def following(client: TestClient, node: Node) -> Iterator[Marker]:
 
 
 def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
-    """Who gave it while it flew after a target was told that it had lost control, and of refusals of idle by lease."""
+    """The giver, who was following a target, was told that it had lost control, and of idle refused for its lease."""
     with following(client, node) as giver, page(client) as asker:
         with giver.staying():
-            giver.select()  # the next target is being drawn
+            giver.select()  # a box for the next target is being drawn
         asker.say("take", priority=8, ask=True)
         [asked] = giver.wait("asked")["questions"]
         giver.say("answer", id=asked["id"], grant=True)
         told = giver.wait("authority", mine=False)
         assert told["given"]
-        if told["holder"] is None:  # for a moment nobody has it
+        if told["holder"] is None:  # for a moment no one has it
             told = giver.wait("authority", holder=asked["by"])
         assert told["why"] == f"{asked['by']} has control now"
         giver.say("ping", n=6)
@@ -325,7 +325,7 @@ def test_it_hovers_while_no_frames_come_and_goes_on_when_they_do(
 def test_it_hovers_while_the_vehicles_motion_is_not_known_and_goes_on_when_it_is(
     client: TestClient, node: Node, stand_ins: StandIns
 ) -> None:
-    """It was sent level attitudes, or velocities of zero that nothing can measure, in place of a hover."""
+    """Instead of a hover it was sent level attitudes, or zero velocities that it could not measure."""
     with following(client, node) as pilot:
         stand_ins.last.says(unknown="the vehicle's velocity is not known")
         told = pilot.wait("follow", state="waiting")
@@ -400,7 +400,7 @@ def test_detections_of_processors_are_used(client: TestClient, node: Node, stand
 
 @pytest.mark.process
 def test_nothing_is_imported_when_a_first_target_is_marked() -> None:
-    """SciPy was, with 400 modules: for a second or more the cockpit answered nobody's sticks."""
+    """SciPy was, with 400 modules: for a second or more the cockpit processed no sticks."""
     pytest.importorskip("scipy", reason="needs the extra detect: skyloop install detect")
     command = [sys.executable, "-c", FIRST_TARGET]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
@@ -409,7 +409,7 @@ def test_nothing_is_imported_when_a_first_target_is_marked() -> None:
 
 def test_a_command_that_the_proxy_refuses_ends_it(client: TestClient, node: Node, stand_ins: StandIns) -> None:
     with following(client, node) as pilot:
-        node.flyer.state = FlightState.LANDING  # somebody else's doing
+        node.flyer.state = FlightState.LANDING  # commanded by others
         assert "it is landing" in pilot.wait("follow", state="ended")["problem"]
         assert stand_ins.last.frames
 
@@ -423,7 +423,7 @@ def test_numbers_come_five_times_a_second_at_most(client: TestClient, node: Node
 
 
 def test_frames_that_are_kept_are_not_held(client: TestClient, node: Node) -> None:
-    """What is kept is a JPEG: the proxy has its memory back."""
+    """Frames are kept as JPEGs: the proxy has its memory back."""
     with marker(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.select()
         draws(watcher, frames=30)

@@ -1,4 +1,4 @@
-"""The frames of the last seconds: which are kept, which is found, which is tracked next."""
+"""The frames of the last seconds: which ones are kept, found, and tracked next."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drones on the network are found beside those of this host, and flown as swarms by pattern."""
+"""Drones on the network are found in addition to those of this host, and flown as swarms by pattern."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nothing old is executed: what a page asks for comes in time, or never happens."""
+"""Nothing old is executed: a page's command is carried out in time, or never."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
         pilot.say("fly", forward=0.3)
         until(lambda: node.flyer.state is FlightState.FLYING)
         begin_s = time.monotonic()
-        for _ in range(40):  # what an 8 s stall held back comes all at once, and goes on coming
+        for _ in range(40):  # messages held back by an 8 s stall arrive all at once, and more follow
             pilot.say("fly", left=0.4, at_s=time.monotonic() - 8.0)
             pilot.say("ping", at_s=time.monotonic() - 8.0, seen_s=time.monotonic() - 8.0)
             time.sleep(0.02)
@@ -132,7 +132,7 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
 
 
 def test_what_waited_is_handled_together() -> None:
-    """The sockets of a cockpit that gets too little of its computer."""
+    """The sockets of a cockpit that gets too little processor time."""
     coming = [{"type": "websocket.receive", "text": text} for text in "abc"]
 
     class Socket:
@@ -147,7 +147,7 @@ def test_what_waited_is_handled_together() -> None:
 def test_of_sticks_that_waited_only_the_newest_fly(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of them flew, one after the other, each up to 0.5 s old, and so did those from before an emergency stop."""
+    """All of them flew, one after another, each up to 0.5 s old, even those from before an emergency stop."""
     handle = ControlSession._on_messages
 
     def handle_all(session: ControlSession, messages: Sequence[str | bytes]) -> None:
@@ -165,7 +165,7 @@ def test_of_sticks_that_waited_only_the_newest_fly(
 
 
 def test_sticks_that_were_let_go_hover_however_late_that_is_heard(client: TestClient, node: Node) -> None:
-    """It was refused as too old, and what is newer kept the velocity of before: a page says it only once."""
+    """It was refused as too old, and newer sticks kept the previous velocity: a page sends it only once."""
     with page(client) as pilot:
         pilot.take().take_off()
         with pilot.staying():

@@ -1,4 +1,4 @@
-"""The page that is committed is the one that its sources make: see cockpit-page/build.mjs."""
+"""The committed page matches its sources: see cockpit-page/build.mjs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_BYTES = 1_000_000
 
 
 def hash_of(folder: Path) -> str:
-    """As the build computes it: over name, NUL, content, NUL of each file, by name."""
+    """Hash like the build: over name, NUL, content, NUL of each file, by name."""
     found = [path for part in ("src", "public") for path in (folder / part).rglob("*") if path.is_file()]
     named = {path.relative_to(folder).as_posix(): path for path in [*found, *(folder / name for name in SETTINGS)]}
     total = hashlib.sha256()

@@ -165,10 +165,10 @@ def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, 
     assert page.page.evaluate("window.apart.srcObject") is None
     camera.get_by_role("button", name="full screen").click()
     page.until(lambda: camera.evaluate("camera => document.fullscreenElement === camera"), "it is full")
-    camera.get_by_role("button", name="Motors off").wait_for()  # in reach there, too
+    camera.get_by_role("button", name="Motors off").wait_for()  # within reach there, too
     camera.get_by_role("button", name="Follow something").click()
     page.wait_for_text(".follow-hint", "Drag a box")
-    camera.get_by_role("button", name="Motors off").click(trial=True)  # also above what a box is drawn on
+    camera.get_by_role("button", name="Motors off").click(trial=True)  # also above the layer for drawing a box
     camera.get_by_role("button", name="Follow something").click()
     page.page.evaluate("document.exitFullscreen()")
     page.page.locator(".bar .safety").wait_for()

@@ -1,4 +1,4 @@
-"""The page's files: compressed where the browser takes that, and not sent again while they are the same."""
+"""The page's files: compressed if the browser accepts that, and not sent again while unchanged."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ SMALL = ("cameras=front", "width=160", "height=120", "fps=10", "position=1")
 
 @pytest.fixture(scope="module")
 def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
-    """The cockpit, with three drones that fly in one world."""
+    """The cockpit, with three drones flying in one world."""
     options = [word for option in SMALL for word in ("--option", option)]
     world = Process("-m", "skyloop", "sim", "--drones", "3", "--name", "d", "--world", "empty", *options)
     try:

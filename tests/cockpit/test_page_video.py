@@ -1,4 +1,4 @@
-"""Video on the page in Chromium: H.264 decoded and drawn, JPEGs where it can't be; a stalled page harms nobody."""
+"""Video on the page in Chromium: H.264 decoded and drawn, JPEGs otherwise; a stalled page harms no others."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ PIXELS: Final = """canvas => [...canvas.getContext("2d").getImageData(0, 0, canv
   .filter((_, at) => at % 37 === 0)"""
 ARDRONE: Final = re.compile(r"at udp (\d+), navdata udp (\d+), video \w+ (\d+), control tcp (\d+)")
 WIDE: Final = {"width": 2200, "height": 1500}  #: a pane has room for a picture's full size
-MOST_S: Final = 40.0  # on a machine that is busy pictures come late, and it is tried again
-FAR: Final = 12.0  # of 255, on average: two encodings of one picture are nearer than that
+MOST_S: Final = 40.0  # on a busy machine pictures arrive late, and the test retries
+FAR: Final = 12.0  # of 255, on average: two encodings of one picture are closer than that
 
 
 @pytest.fixture(scope="module")
 def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
-    """The cockpit, with one drone that stands."""
+    """The cockpit, with one drone on the ground."""
     drone = Process("-m", "skyloop", "proxy", WATCHED, "--name", "film")
     try:
         drone.until("ready")
@@ -139,14 +139,14 @@ def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
 
 
 def test_a_page_that_falls_behind_is_told_why_its_picture_is_smaller(deck: Deck) -> None:
-    """It fell to 160 × 120, and nobody said why."""
+    """It fell to 160 × 120, without any explanation."""
     page = deck.page("film", prepare=SLOW)
     page.until(lambda: form(page) == "h264 own", "it has a stream of its own", MOST_S)
     told = page.pane.locator(".chip.smaller")
     page.until(lambda: told.is_visible(), "it says so")
     said = told.text_content() or ""
     assert said.startswith(("Smaller picture, ", "Coarser picture: "))
-    # On a computer that is busy with other tests as well that is the reason.
+    # On a computer also busy with other tests, that is the reason.
     assert said.endswith(("this connection is slow", "this computer is busy", "reach the cockpit late"))
 
 
@@ -163,7 +163,7 @@ def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:
 
 @contextmanager
 def emulated(kind: str) -> Iterator[str]:
-    """Emulated firmware; the address to fly it by."""
+    """Run emulated firmware; yield the address to fly it by."""
     options = ["-m", "skyloop", "sim", "--firmware", kind]
     if kind == "tello":
         addresses = Addresses.free()
@@ -188,7 +188,7 @@ def emulated(kind: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("kind", ["ardrone2", "tello"])
 def test_what_the_vehicle_encodes_is_shown_as_it_comes(deck: Deck, kind: str) -> None:
-    """The proxy runs here, where it shows that it encodes nothing."""
+    """The proxy runs here, which shows that it encodes nothing."""
     with emulated(kind) as address:
         proxy = Proxy(make_driver(address), LocalServer(kind), name=kind)
         with proxy:
@@ -222,7 +222,7 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
     frozen.wait_for_new_picture()
     for page in (live, frozen):
         page.page.wait_for_load_state("networkidle")
-        page.problems.clear()  # on a busy machine the drone's first answers may come too late
+        page.problems.clear()  # on a busy machine the drone's first answers may be late
     with skyloop.connect("film", name="flies.py") as pilot:
         pilot.takeoff()
         with stopped(*(renderers() - others)):
@@ -240,7 +240,7 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
 
 
 def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: Deck) -> None:
-    """Those of a detector that takes half a second were never seen, and nobody knew why."""
+    """Drawings by a detector that takes half a second were never visible, without any explanation."""
     deck.proxy("slow")
     page = deck.page("slow")
     late_s = 0.6
@@ -255,7 +255,7 @@ def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: D
 
         drone.on_frame(draw)
         page.until(lambda: "shown faded" in page.says(".drawn-late"), "it says that they are late")
-        # Counted from the picture that is shown, which is a while old itself.
+        # Counted from the picture shown, which is itself some time old.
         assert re.search(r"detector draws 0\.[3-9] s late", page.says(".drawn-late"))
         overlay = page.pane.locator(".overlay").first
         page.until(lambda: 0 < overlay.evaluate(DRAWN_ON) < 200, "they are shown, pale")

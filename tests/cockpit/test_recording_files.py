@@ -1,4 +1,4 @@
-"""Recordings' files from the page: downloaded, renamed, noted about, thrown away; replays moved; by whom."""
+"""Recordings' files on the page: download, rename, annotate, delete; replays moved; with roles."""
 
 from __future__ import annotations
 

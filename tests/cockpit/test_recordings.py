@@ -1,4 +1,4 @@
-"""Recordings from the page: with a recorder that is not there, and with a real one."""
+"""Recordings on the page: with a stand-in for the recorder, and with a real one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def post(client: TestClient, path: str, body: Any = None) -> Any:
 
 
 def read_on(socket: WebSocketTestSession) -> None:
-    """For ever."""
+    """Block forever."""
     while True:
         socket.receive_json()
 

@@ -1,4 +1,4 @@
-"""Which requests are answered, and to whom: as pure decisions, and through the app."""
+"""Which requests are answered, and for whom: as pure decisions, and through the app."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_whatever_changes_something_needs_a_pilot(rest: str, method: str) -> Non
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wrong token is answered at once: these tests tell many. How long it takes else: ``tests/promises/security``."""
+    """Answer wrong tokens at once, as these tests send many. Their real delay: ``tests/promises/security``."""
     monkeypatch.setattr("skyloop.cockpit.access.LONGEST_S", 0.0)
 
 
@@ -184,7 +184,7 @@ def bearer(token: str) -> dict[str, str]:
 
 
 def ended(client: TestClient, path: str, **more: str) -> int:
-    """The code with which a WebSocket was closed before it said anything."""
+    """Return the code with which a WebSocket was closed before any message."""
     with pytest.raises(WebSocketDisconnect) as end, open_socket(client, path, **more) as socket:
         socket.receive_json()
     return int(end.value.code)
@@ -335,7 +335,7 @@ def test_foreign_requests_change_nothing(client: TestClient, path: str, elsewher
 
 
 def test_a_form_of_a_foreign_page_is_not_understood(client: TestClient) -> None:
-    """Forms can be sent without asking first; what they can send is refused even from here."""
+    """Forms can be sent without asking first; their content types are refused even from here."""
     for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
         answer = client.post("/api/recordings", headers={**ORIGIN, "content-type": kind}, content=b'{"drones":[]}')
         assert answer.status_code == 415
@@ -361,7 +361,7 @@ def test_foreign_sockets_are_not_opened(client: TestClient, path: str, elsewhere
 
 
 def test_cookies_do_not_let_foreign_pages_in(guarded: TestClient) -> None:
-    """A browser may send the cookie along; the origin tells who asks."""
+    """A browser may send the cookie along; the origin reveals the sender."""
     guarded.post("/api/login", headers=ORIGIN, json={"token": PILOT})
     for path in STREAMS:
         with (

@@ -1,4 +1,4 @@
-"""Starting and ending the cockpit: what goes wrong is told, who may come in, and it goes away with its parent."""
+"""Starting and ending the cockpit: errors are reported, access is limited, and it ends with its parent."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ OBSERVER = "observer-token-0123456789"
 
 @pytest.fixture(autouse=True)
 def own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Where recordings would go; and a directory of sockets for this test alone."""
+    """Folders for recordings, and a directory of sockets for this test alone."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
 
@@ -127,13 +127,13 @@ def test_child_tells_why_it_did_not_start() -> None:
 
 
 def on_loopback(address: str) -> str:
-    """The address of a server that listens everywhere, as this machine alone reaches it."""
+    """Return the address of a server that listens everywhere, as reached from this machine."""
     scheme, _, port = address.rpartition(":")
     return f"{scheme.partition('://')[0]}://127.0.0.1:{port}"
 
 
 def test_pages_are_served_while_the_cockpit_warms_up(monkeypatch: pytest.MonkeyPatch, tokens: Path) -> None:
-    """A thread of its own imports what following needs: not the event loop's, on which sticks arrive."""
+    """A separate thread imports the requirements of following: not the event loop's, which receives sticks."""
     begun, go_on = threading.Event(), threading.Event()
 
     def warm_up() -> None:
@@ -201,7 +201,7 @@ def test_its_metrics(capfd: pytest.CaptureFixture[str]) -> None:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority, a server, a pilot, an observer, somebody without a role, and a pilot of another authority."""
+    """An authority, a server, a pilot, an observer, a person without a role, and a pilot of another authority."""
     if shutil.which("openssl") is None:
         pytest.skip("makes certificates with openssl, which is not here")
     folder = tmp_path_factory.mktemp("tls")
@@ -318,7 +318,7 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
             assert isinstance(frame, bytes)
             assert frame[-2:] == b"\xff\xd9", "a whole JPEG file"
             with pytest.raises(TimeoutError):
-                video.recv(0.3)  # three more were taken: none is sent before the first is acknowledged
+                video.recv(0.3)  # three more were captured: none is sent before the first is acknowledged
             video.send(json.dumps({"ack": 1}))
             assert isinstance(video.recv(5), bytes)
         for foreign in (Origin("http://evil.example"), None):

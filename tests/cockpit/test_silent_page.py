@@ -1,4 +1,4 @@
-"""A page in control that is silent is a silent pilot: hover, then landing, as for any program."""
+"""A silent page in control is a silent pilot: hover, then landing, as for any program."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ S = 1_000_000_000
 
 
 class Flown:
-    """A pilot's connection over a link that is always up, on a clock of its own: what it sends and asks."""
+    """A pilot's connection over a link that is always up, with its own clock: what it sends and requests."""
 
     def __init__(self) -> None:
         self.now_ns = 100 * S
@@ -55,7 +55,7 @@ class Flown:
         self.pilot._authority.granted(lease, self.now_ns)
 
     def goes_on(self, seconds: float, step_s: float = 0.02) -> list[Command]:
-        """What is sent meanwhile."""
+        """Collect everything sent during the block."""
         before = len(self.sent)
         for _ in range(round(seconds / step_s)):
             self.now_ns += round(step_s * S)
@@ -141,7 +141,7 @@ def test_a_program_that_flies_itself_is_always_there() -> None:
 
 
 def quick(node: Node) -> None:
-    """As a lab may set it, and so that this test is quick."""
+    """As a lab may set it, and to keep this test quick."""
     with node.connect("lab", on_exit="hover") as lab:
         lab.config["authority.timeout_s"] = 0.3
         lab.config["failsafe.hover_after_s"] = 0.2
@@ -156,7 +156,7 @@ def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClien
             pilot.take_off()
             pilot.say("fly", forward=0.3)
             until(lambda: node.flyer.state is FlightState.FLYING)
-            until(lambda: node.flyer.state is FlightState.HOVERING)  # nothing more came by the sticks
+            until(lambda: node.flyer.state is FlightState.HOVERING)  # no more stick commands arrived
             time.sleep(0.6)  # longer than the proxy waits here
             assert watcher.feedback().lease, "a page that pings keeps control while it hovers"
         silent_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Small video of many drones over one socket: encoded once per size, at a limited rate; a slow page holds nobody up."""
+"""Small video of many drones over one socket: encoded once per size, at a limited rate; slow pages delay no others."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_a_page_that_draws_nothing_gets_nothing_more_and_holds_nobody_up(
             if not drawn:
                 head, (picture,) = unpack(slow.receive_bytes())
                 drawn = head["ack"]
-        slow.send_json({"ack": drawn + 7})  # of a message that it never got
+        slow.send_json({"ack": drawn + 7})  # for a message it never received
         slow.send_json({"ack": drawn})
         head, (picture,) = unpack(slow.receive_bytes())
         assert picture.mean() == pytest.approx(110, abs=2), "the newest, and none between"

@@ -1,4 +1,4 @@
-"""Asking for control before it is taken: pages on both sides, over a real proxy; and what is decided without one."""
+"""Asking for control before it is taken: pages on both sides, over a real proxy; and pure decisions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ S = 1_000_000_000
 
 @contextmanager
 def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) -> Iterator[Drone]:
-    """A program that asks for the drone and waits in line."""
+    """A program that asks for the drone and waits in the queue."""
     asking = Authority(priority=priority, takeover="ask", stay=True, **options)
     drone = open_drone(node.dial, app=app, authority=asking)
     try:
@@ -36,13 +36,13 @@ def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) 
 
 
 def question(pilot: Page) -> dict[str, Any]:
-    """The only one that the page is asked."""
+    """Return the page's only open question."""
     [asked] = pilot.wait("asked")["questions"]
     return dict(asked)
 
 
 def waits(pilot: Page, **values: Any) -> dict[str, Any]:
-    """What the page is told next of its place in the line, with these values."""
+    """Return the page's next message about its place in the queue with these values."""
     while True:
         line = pilot.wait("authority")["line"] or {}
         if values.items() <= line.items():
@@ -156,7 +156,7 @@ def test_who_releases_is_asked_no_more(client: TestClient, node: Node) -> None:
 def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who is pre-empted was told, as of something that went well, to have handed control over."""
+    """A pre-empted pilot's page reported, as a success, that it had handed control over."""
     monkeypatch.setattr(PilotConnection, "answer_takeover", lambda *_: None)
     monkeypatch.setattr(takeover, "GIVEN_S", 0.0)
     with page(client) as pilot:
@@ -175,7 +175,7 @@ def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
 def test_control_that_is_gone_before_the_answer_has_arrived_was_given(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One time in four the page that gave it was told that it had lost control."""
+    """One time in four the page that gave control away reported that it had lost it."""
     answer, gone = PilotConnection.answer_takeover, threading.Event()
 
     def late(pilot: PilotConnection, lease: int, app_id: int, grant: bool, reason: str) -> None:
@@ -198,7 +198,7 @@ def test_control_that_is_gone_before_the_answer_has_arrived_was_given(
 def test_a_page_asks_first_and_is_given_it(client: TestClient, node: Node) -> None:
     with node.connect("demo") as demo, page(client) as pilot:
         demo.on_takeover(lambda request: request.by.startswith("cockpit") and request.priority == 20)
-        pilot.say("take", priority=20, ask=True)  # no higher than the holder's, which would be refused without asking
+        pilot.say("take", priority=20, ask=True)  # not higher than the holder's, which would be refused without asking
         assert pilot.wait("authority", mine=True)["line"] is None
         until(lambda: demo.authority.state == "preempted")
         pilot.say("release")
@@ -228,7 +228,7 @@ def test_a_page_that_asked_takes_over_when_it_can_wait_no_longer(client: TestCli
 
 
 def test_who_presses_take_control_in_line_stays_there_unless_it_has_it(client: TestClient, node: Node) -> None:
-    """The page left the line without a word: the press was refused, and with it went its connection."""
+    """The page left the queue silently: the press was refused, and its connection closed with it."""
     with node.connect("demo", priority=4) as demo, page(client) as pilot:
         demo.on_takeover(lambda _: "measuring")
         pilot.say("take", priority=8, ask=True)

@@ -1,4 +1,4 @@
-"""What pages are told, as pure functions."""
+"""The values for pages, as pure functions."""
 
 from __future__ import annotations
 

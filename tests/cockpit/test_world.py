@@ -1,4 +1,4 @@
-"""What maps show around a drone: the world as a parameter, and as pages get it."""
+"""A drone's surroundings on maps: the world as a parameter, and as sent to pages."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_world_survives_its_text(name: str) -> None:
 
 
 def test_a_replay_shows_what_stood_around_the_recorded_flight() -> None:
-    """Its map was empty: the recorded parameters have a prefix, and those without are of the replay's own proxy."""
+    """Its map was empty: recorded parameters have a prefix, and those without belong to the replay's own proxy."""
     world = geometry_of(load_world("gates"))
     drone = drone_with(
         recorded__world__geometry=encode_world(world),
