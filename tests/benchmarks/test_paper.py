@@ -1,4 +1,4 @@
-"""The paper's test flight: one short flight as the command makes it, and what is worked out from its recording."""
+"""The paper's test flight: one short flight by the command, and the evaluation of its recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skyloop audit``, and the proxies that write what it shows."""
+"""``skyloop audit``, and the proxies that write its trail."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flown(start: Start, *arguments: str) -> None:
-    """A proxy is started, flown, and ended."""
+    """Start a proxy, fly it, and end it."""
     proxy = start("proxy", FAST_SIM, "--name", "alpha", *arguments)
     proxy.until("ready")
     with skyloop.connect("alpha", name="alice", authority=skyloop.Authority(priority=7)) as drone:

@@ -16,7 +16,7 @@ from tests.support.commands import Run
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Pictures of the standard board, and at the end one of a wall."""
+    """Pictures of the standard board, followed by one of a wall."""
     folder, rng = tmp_path_factory.mktemp("pictures"), np.random.default_rng(1)
     names = []
     for number, (turn, middle) in enumerate(poses(9, 3, near=0.3, far=0.6, wide=0.35)):

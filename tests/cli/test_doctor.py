@@ -1,4 +1,4 @@
-"""What the doctor finds, on this machine and on worse ones."""
+"""The doctor's findings, on this machine and on worse ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.commands import Run
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The import time takes two processes: once is enough."""
+    """Measure the import time, in two processes: once is enough."""
 
     def none() -> Iterator[Finding]:
         yield Finding("import skyloop", Health.GOOD, "")
@@ -49,7 +49,7 @@ def test_a_machine_that_is_well(run: Run) -> None:
 
 @pytest.mark.parametrize("encoding", ["cp1252", "latin-1", "ascii", "utf-8"])
 def test_a_terminal_that_lacks_characters_gets_others(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ended in UnicodeEncodeError where the terminal has no check mark."""
+    """It ended in UnicodeEncodeError if the terminal had no check mark."""
     findings = [Finding("part", health, "0.5 … 1 µs × Zoë at \udcff", "try → again") for health in Health]
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
     out = io.TextIOWrapper(io.BytesIO(), encoding)

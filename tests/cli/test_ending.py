@@ -1,4 +1,4 @@
-"""``skyloop land``, ``return`` and ``stop``, with real proxies: of a drone of one's own, of others, and of all."""
+"""``skyloop land``, ``return`` and ``stop``, with real proxies: of your own drone, of others', and of all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skyloop land`` and ``stop`` against a played proxy: silence, failures, and two of the same priority."""
+"""``skyloop land`` and ``stop`` against a simulated proxy: silence, failures, and two of the same priority."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def proxy() -> Iterator[ScriptedProxy]:
 
 
 def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The vehicle's downlink is dead, and the proxy answers no request: it can be stopped all the same."""
+    """The vehicle's downlink is dead, and the proxy answers no request: it can still be stopped."""
 
     def prepare(_: str, **options: Any) -> tuple[Drone, float]:
         drone = Drone(proxy.server.dial, app=options["name"], on_exit="hover", policy=QUICK)
@@ -120,7 +120,7 @@ def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
 
 @pytest.mark.parametrize("connected", [True, False])
 def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch, connected: bool) -> None:
-    """One that was still being connected to flew home after it."""
+    """A drone that was still connecting flew home after it."""
     proxy.state = FlightState.FLYING
 
     def connect(_name: str, _advice: str, **_: object) -> Drone:
@@ -141,7 +141,7 @@ def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest
 
 
 def _interrupted(fly: Any) -> Any:
-    """Ctrl-C, between the connection and the command."""
+    """Send Ctrl-C between the connection and the command."""
 
     def flown(drone: Drone, *arguments: Any, **options: Any) -> None:
         ending._stay(drone)

@@ -1,4 +1,4 @@
-"""Flying a controller from a file: that it lands, whatever happens to the controller."""
+"""Flying a controller from a file: the drone lands even if the controller fails."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_a_wrong_file_is_told_before_anything_is_connected(run: Run, write: Writ
 
 
 class Stranger:
-    """Stands for a drone: a controller only keeps it."""
+    """A stand-in for a drone: a controller only stores it."""
 
 
 def test_a_controller_that_wants_more_than_a_drone_is_refused() -> None:
@@ -249,7 +249,7 @@ def test_what_failed_because_of_another_error_shows_both_without_skyloops_lines(
 
 
 def test_what_failed_begins_with_the_line_of_the_user() -> None:
-    """Their own line comes first, not that of the library which they called, nor the loop that called them."""
+    """Their own line comes first, not one of the library they called, nor of the loop that called them."""
 
     def on_frame() -> object:
         return json.loads("{")

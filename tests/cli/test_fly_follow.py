@@ -1,4 +1,4 @@
-"""``skyloop fly follow``: what it says before it flies, and a flight."""
+"""``skyloop fly follow``: its messages before a flight, and a flight."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ path = { kind = "waypoints", points = [[0, -1.5, 0], [0, 1.5, 0]], speed = 0.6 }
 
 
 def away_m(feedback: Feedback) -> float:
-    """The true distance from the drone to the person."""
+    """Return the true distance from the drone to the person."""
     native = dict(feedback.native or {})
     return math.dist(*([float(native[f"truth.{one}{axis}"]) for axis in "xy"] for one in ("", "anna.")))  # type: ignore[arg-type]
 

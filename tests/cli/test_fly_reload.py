@@ -51,7 +51,7 @@ class Mine(skyloop.Controller):
 
 
 def save(path: Path, text: str) -> None:
-    """As editors do: the new file takes the place of the old one."""
+    """Save like an editor: the new file replaces the old one."""
     new = path.with_suffix(".new")
     new.write_text(text)
     new.replace(path)
@@ -71,13 +71,13 @@ def looker(alpha: Process) -> Iterator[skyloop.Drone]:
 
 
 def speeds(seen: list[Applied]) -> list[float | str]:
-    """What the pilot wanted, in order: the speed to the left, or the name of another action."""
+    """Return the pilot's requests in order: the speed to the left, or the name of another action."""
     wanted = [one.asked for one in list(seen)]
     return [action.left if isinstance(action, Velocity) else type(action).__name__ for action in wanted]
 
 
 class Loaded:
-    """Stands for a reloader: what was loaded, in turn."""
+    """A stand-in for a reloader: the loaded classes, in turn."""
 
     age_s = 0.0
 
@@ -93,7 +93,7 @@ class Loaded:
 
 
 class Listening(Controller):
-    """Commands from a callback that it registered itself."""
+    """Sends commands from a callback it registered itself."""
 
     speed = 0.1
 
@@ -129,7 +129,7 @@ def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_mo
         flying = background(lambda: flight.run_reloading(None, loaded, lambda found: found(drone)))  # type: ignore[arg-type]
 
         def load(found: type[Controller], told: str, speed: float | None) -> None:
-            """After the change is told, so many commands are all of this speed."""
+            """Check that after the reported change, this many commands all have this speed."""
             loaded.found.append(found)
             proxy.until(lambda: any(told in line for line in said), told)
             count = len(proxy.commands)

@@ -1,4 +1,4 @@
-"""``skyloop keys``: a lab made, shown and changed from the command line."""
+"""``skyloop keys``: a lab created, shown and changed from the command line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_lab_from_its_beginning(run: Run, folder: Path) -> None:
     first = run("keys", "issue", "alpha", "--role", "proxy", "--drones", "alpha", "--dir", str(folder))
     assert first.code == 0
     assert f"copy {folder / 'issued' / 'alpha'} to its machine" in first.out
-    assert "roster" not in first.out  # nobody else has one
+    assert "roster" not in first.out  # no one else has one
     second = run("keys", "issue", "jane", "--role", "pilot", "--drones", "alpha*", "--dir", str(folder))
     assert second.out.startswith("jane, pilot of alpha*: valid until 2")
     assert f"copy {folder / 'roster.json'} into the keys of the others: alpha" in second.out

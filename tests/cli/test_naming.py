@@ -1,4 +1,4 @@
-"""One way to name a drone and one to name a network, in every command; errors in the words of the command line."""
+"""One way to name a drone and one to name a network, in every command; errors in the terms of the command line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_every_command_about_a_drone_takes_it_as_name_and_as_drone(command: str)
     group: Any = typer.main.get_command(build([command]))
     options = {word for param in group.commands[command].params for word in param.opts}
     assert "--drone" in options
-    if command != "audit":  # whose files are on this host
+    if command != "audit":  # its files are on this host
         assert {"--network", "--keys"} <= options
 
 
@@ -129,7 +129,7 @@ def test_every_hint_has_its_words_in_python_and_in_the_terminal() -> None:
 
 
 def test_the_words_of_options_are_the_same_everywhere() -> None:
-    """One spelling, one help: a second one would be a second way."""
+    """One spelling and one help text: a second would be a second way."""
     found: dict[str, set[str]] = {}
     group: Any = typer.main.get_command(build())
     for name in OF_DRONES:

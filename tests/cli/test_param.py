@@ -1,4 +1,4 @@
-"""Parameters on the command line: what a person types and reads, and a real proxy behind it."""
+"""Parameters on the command line: typed and shown values, with a real proxy behind."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.process
 
 @contextmanager
 def stopped(process: Process) -> Iterator[None]:
-    """As Ctrl-Z does."""
+    """Suspend it, like Ctrl-Z."""
     process.signal(signal.SIGSTOP)
     try:
         yield

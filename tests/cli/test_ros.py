@@ -1,4 +1,4 @@
-"""``skyloop ros``: what the options become, and what it says without rclpy. tests/ros tests the bridge itself."""
+"""``skyloop ros``: the effect of its options, and its message without rclpy. tests/ros tests the bridge itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skyloop router --print-config`` gives what Zenoh's own router takes; the options of the network."""
+"""``skyloop router --print-config`` prints a configuration for Zenoh's own router; the options of the network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``skyloop sim --autopilot``: what is said about several before any firmware is started."""
+"""``skyloop sim --autopilot``: errors about several ones, before any firmware starts."""
 
 from __future__ import annotations
 

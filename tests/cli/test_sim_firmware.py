@@ -1,4 +1,4 @@
-"""``skyloop sim --firmware``: an emulated drone as a process of its own."""
+"""``skyloop sim --firmware``: an emulated drone as a separate process."""
 
 from __future__ import annotations
 

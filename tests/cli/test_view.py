@@ -20,7 +20,7 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture(autouse=True)
 def priority(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keeps that of the tests' own process."""
+    """Keep the priority of the tests' own process."""
     monkeypatch.setattr("skyloop.recording.view.give_way", lambda: None)
 
 

@@ -166,7 +166,7 @@ def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(client: TestClient, 
         until(lambda: count(node, Hover()) > hovers)
         watcher.wait(lambda feedback: feedback.owner is None, 5)
         watcher.wait("hovering", 5)  # the first sample without an owner may predate the vehicle's hover
-        # The proxy's ladder then continues: no pilot is heard, so it lands.
+        # The proxy's ladder then continues: no pilot is connected, so it lands.
         with node.connect("me") as owner:
             owner.config["failsafe.land_after_s"] = 0.1
         watcher.wait("landed", 5)

@@ -1,4 +1,4 @@
-"""What a page commanded last counts; and the cockpit takes a drone from nobody by itself."""
+"""A page's last command counts, and the cockpit never takes a drone from others automatically."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def client(node: Node) -> Iterator[TestClient]:
 
 @contextmanager
 def slow_parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
-    """The list of parameters takes as long as a network wants; called: until it was asked for."""
+    """Delay the list of parameters like a slow network; the result waits until it is requested."""
     asked, go_on = threading.Event(), threading.Event()
 
     def slow(real: Callable[[Config], object]) -> Callable[[Config], object]:
@@ -155,7 +155,7 @@ FLIGHTS = pytest.mark.parametrize("begin", [go_to, fly_a_route, follow, steer])
 def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None], *, leaves: bool
 ) -> None:
-    """The page's go-to, route, and the page that was closed took it back 0.6 s later by a hover of their own."""
+    """The page's go-to or route, or the closed page, took it back 0.6 s later with its own hover."""
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().take_off()
         with pilot.staying():

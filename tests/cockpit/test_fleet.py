@@ -59,7 +59,7 @@ def run(work: Callable[[], Awaitable[None]]) -> None:
 
 async def settle(fleet: Fleet) -> None:
     """Search, and wait until the found ones are connected."""
-    await fleet.look()
+    await fleet.search()
     while fleet._connecting:
         await asyncio.gather(*fleet._connecting.values())
 

@@ -1,4 +1,4 @@
-"""Land all, stop all: from any page of a pilot, whatever is open on it and whoever flies."""
+"""Land all, stop all: from any pilot's page, with any drone open and any pilot flying."""
 
 from __future__ import annotations
 

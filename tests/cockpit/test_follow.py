@@ -232,7 +232,7 @@ def following(client: TestClient, node: Node) -> Iterator[Marker]:
 
 
 def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
-    """The giver, who was following a target, was told that it had lost control, and of idle refused for its lease."""
+    """The giver, while following a target, got the news of a lost control, and of idle refused for its lease."""
     with following(client, node) as giver, page(client) as asker:
         with giver.staying():
             giver.select()  # a box for the next target is being drawn

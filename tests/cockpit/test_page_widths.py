@@ -13,11 +13,11 @@ pytestmark = pytest.mark.process
 
 FINGER_PX = 44.0
 WIDTHS = (320, 390, 641, 768, 850, 947, 1024, 1440)
-#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: what is left of them.
+#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: the remaining sizes.
 ENLARGED = ((720, 450), (480, 300), (360, 225), (512, 384), (256, 192))
 LONG_NAME = "a-drone-with-a-name-as-long-as-names-can-be-1234"
 PSEUDO = "localStorage.setItem('skyloop-language', 'pseudo');"
-#: What is wrong with the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
+#: Problems of the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
 WRONG = """([drone, least]) => {
   const pane = document.querySelector(`.pane[data-drone="${CSS.escape(drone)}"]`);
   const [own, ...all] = document.querySelectorAll(".safety button");

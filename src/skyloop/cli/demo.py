@@ -278,7 +278,7 @@ class TruthMeter:
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:
         self.errors_m: list[float] = []
         self._follower = follower
-        self._listener = drone.on_feedback(self._look)
+        self._listener = drone.on_feedback(self._compare)
 
     def __enter__(self) -> Self:
         return self
@@ -288,7 +288,7 @@ class TruthMeter:
     ) -> None:
         self._listener.cancel()
 
-    def _look(self, feedback: Feedback) -> None:
+    def _compare(self, feedback: Feedback) -> None:
         first_ns = self._follower.score.first_seen_ns
         distance = true_range(feedback.native)
         if first_ns is None or distance is None or feedback.captured_ns - first_ns < nanoseconds(SETTLING_S):

@@ -105,7 +105,7 @@ def running(settings: FabricSettings | None = None) -> list[Row]:
         return []
     processes = of_one_process(found)
     with ThreadPoolExecutor(max_workers=min(32, len(processes))) as pool:
-        described_rows = [row for rows in pool.map(lambda rows: told(rows, settings), processes) for row in rows]
+        described_rows = [row for rows in pool.map(lambda rows: reported(rows, settings), processes) for row in rows]
     return sorted(described_rows, key=lambda row: (row.name, row.host))
 
 
@@ -117,7 +117,7 @@ def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
     return list(found.values())
 
 
-def told(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
+def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
     """Return the reports of the proxies of one process, several over one connection if possible."""
     overview: dict[str, VehicleOverview] = {}
     if len(rows) > 1:

@@ -540,7 +540,7 @@ class ControlSession:
         if self._awaited is not None and pilot is not None:
             do, n, states, from_ns = self._awaited
             if do == TakeOff().do and not self._repeated:
-                patience_ns = _BEGUN_NS if pilot.is_told else _TAKEOFF_NS
+                patience_ns = _BEGUN_NS if pilot.is_acknowledged else _TAKEOFF_NS
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
                     with suppress(SkyloopError):

@@ -35,7 +35,7 @@ LOOK_S: Final = 0.5
 FORGET_S: Final = 60.0  #: after this time a lost drone is no longer shown
 CONNECT_S: Final = 3.0
 OVERVIEW_S: Final = 0.5  #: period of the overview sent to pages
-FIRST_LOOK_S: Final = 2.0  #: how long the first pages wait for drones that answer slowly
+FIRST_SEARCH_S: Final = 2.0  #: how long the first pages wait for drones that answer slowly
 
 Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class Fleet:
         self._connect = connect
         self._kept = frozenset(kept)
         self._clock = clock
-        self._look_s = look_s
+        self._search_period_s = look_s
         self._seen_ns: dict[str, int] = {}
         self._found: dict[str, Found] = {}  # as last found
         self._connecting: dict[str, asyncio.Task[None]] = {}
@@ -92,10 +92,10 @@ class Fleet:
         self._begun: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
-        """Search once, wait up to :data:`FIRST_LOOK_S` for the proxies found, and keep searching."""
-        await self.look()
+        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies found, and keep searching."""
+        await self.search()
         if self._connecting:
-            await asyncio.wait(list(self._connecting.values()), timeout=FIRST_LOOK_S)
+            await asyncio.wait(list(self._connecting.values()), timeout=FIRST_SEARCH_S)
         self._watching = asyncio.create_task(self._watch())
 
     async def close(self) -> None:
@@ -116,7 +116,7 @@ class Fleet:
         self._begun.add(task)
         task.add_done_callback(self._begun.discard)
 
-    async def look(self) -> None:
+    async def search(self) -> None:
         """Search once: begin to connect to new proxies, and remove those gone for good.
 
         Raises:
@@ -164,9 +164,9 @@ class Fleet:
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(self._look_s)
+            await asyncio.sleep(self._search_period_s)
             try:
-                await self.look()
+                await self.search()
             except (SkyloopError, OSError) as error:
                 _log.warning("can't search for drones: %s", error)
 

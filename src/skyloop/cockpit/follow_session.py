@@ -36,7 +36,7 @@ OLD_FEEDBACK_S: Final = 1.0
 #: A request older than this no longer sets off: the tracker was stuck, or took longer to catch up than anyone expects.
 SET_OFF_S: Final = 10.0
 WATCH_S: Final = 0.1  #: between checks that the tracker still reports
-TELL_S: Final = 0.2  #: between two messages that differ only in numbers
+NUMBERS_PERIOD_S: Final = 0.2  #: between two messages that differ only in numbers
 JOIN_S: Final = 2.0
 NO_CONTROL: Final = "this page has lost control"
 _WHAT: Final = "following a target"
@@ -95,8 +95,8 @@ class FollowSession:
         self._report: TrackReport | None = None
         self._reported_ns = 0
         self._asked_ns = 0  # when the flight was requested
-        self._told: tuple[Any, ...] = ()
-        self._told_ns = 0
+        self._last_sent: tuple[Any, ...] = ()
+        self._last_sent_ns = 0
         self._watch: asyncio.TimerHandle | None = None
         self._ending: set[asyncio.Task[None]] = set()
 
@@ -170,7 +170,7 @@ class FollowSession:
         tracker = self._tracker = TargetTracker(self._drone, keeper, first, make, report, self._clock)
         tracker.steers = pilot is not None
         tracker.start()
-        self._tell()
+        self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
         """Fly after the tracked target, or change the mode of following.
@@ -194,7 +194,7 @@ class FollowSession:
             self._clock(),
         )  # sets off with the next report, once the tracker has caught up
         tracker.steers = True
-        self._tell()
+        self._send_state()
 
     def interrupt(self, why: str) -> None:
         """End a flight because something else is commanded or control was lost; tracking alone continues."""
@@ -222,7 +222,7 @@ class FollowSession:
             self._watch = None
         if hover and flying and pilot is not None:
             pilot.let_go(why or "following was ended")
-        self._tell("ended", why)
+        self._send_state("ended", why)
         self._report = None
 
     async def close(self) -> None:
@@ -250,7 +250,7 @@ class FollowSession:
                 return
             else:
                 self._set_off()
-        self._tell()
+        self._send_state()
 
     def _set_off(self) -> None:
         """Send the first set-point, which ends any other flight."""
@@ -302,7 +302,7 @@ class FollowSession:
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
         if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
             self._steer(None)
-            self._tell()
+            self._send_state()
 
     # Messages to the page --------------------------------------------------------------------------------------
 
@@ -310,8 +310,8 @@ class FollowSession:
         if self._keeper is not None and self._keeper.camera == camera:
             self._send({"type": "follow", "state": "selecting", "camera": camera, "since_ns": str(since_ns)})
 
-    def _tell(self, state: str = "", why: str = "") -> None:
-        """Send the state: each change at once, numbers at most every :data:`TELL_S`."""
+    def _send_state(self, state: str = "", why: str = "") -> None:
+        """Send the state: each change at once, numbers at most every :data:`NUMBERS_PERIOD_S`."""
         if not state:
             if self._tracker is None:
                 return
@@ -324,10 +324,10 @@ class FollowSession:
         problem = why if state == "ended" or status is None else self._waits or status.problem
         now_ns = self._clock()
         # While it waits, only the age grows: that is no change.
-        told = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
-        if told == self._told and now_ns - self._told_ns < nanoseconds(TELL_S):
+        sent = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
+        if sent == self._last_sent and now_ns - self._last_sent_ns < nanoseconds(NUMBERS_PERIOD_S):
             return
-        self._told, self._told_ns = told, now_ns
+        self._last_sent, self._last_sent_ns = sent, now_ns
         message: Json = {"type": "follow", "state": state, "camera": self._camera, "mode": self._mode or None}
         message |= {"phase": phase, "problem": problem, "distance_m": number(self._distance_m)}
         message["size"] = None if report is None else list(report.size)

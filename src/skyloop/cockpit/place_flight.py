@@ -249,7 +249,7 @@ class RouteSession:
                 self._photos.add(task)
                 task.add_done_callback(self._photos.discard)
             else:
-                self._tell(effect)
+                self._send_progress(effect)
         if effects:
             self._aim(self.law.goal if self.law.is_under_way else None)
 
@@ -264,7 +264,7 @@ class RouteSession:
             pilot.idle()  # or it would still be carried out if the link came back soon
         raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
 
-    def _tell(self, step: Progress) -> None:
+    def _send_progress(self, step: Progress) -> None:
         law = self.law
         self._send(
             {

@@ -200,7 +200,7 @@ class RecordingsApi:
         wanted = await body_of(request, _Replay)
         name = await self._recordings.replay(request.path_params["name"], wanted.drone)
         self._fleet.want(name)
-        await self._fleet.look()
+        await self._fleet.search()
         return answer_json({"drone": name}, 201)
 
     @answered

@@ -304,9 +304,9 @@ def _serve(
             endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
             print(endpoint.announcement, file=sys.stderr, flush=True)
         pairing = gate.pairing if isinstance(gate, TokenGate) else None
-        look = _idle if pairing is None else pairing.expire
+        expire_codes = _idle if pairing is None else pairing.expire
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, look))
+        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, expire_codes))
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:

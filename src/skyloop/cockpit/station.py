@@ -134,7 +134,7 @@ class PilotConnection(Drone):
         return told
 
     @property
-    def is_told(self) -> bool:
+    def is_acknowledged(self) -> bool:
         """Whether the proxy reports the fate of the newest command, so it has arrived there."""
         newest, (_, intent) = Known(self).newest, self._newest
         outcome = None if newest is None else newest.outcome

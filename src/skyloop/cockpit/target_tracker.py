@@ -343,7 +343,7 @@ class TargetTracker:
         while arrival is not None and not self._closed and self._clock() < until_ns:
             frame = arrival.frame()
             self._feed(follower, frame.captured_ns)
-            self._look(follower, frame)
+            self._track(follower, frame)
             self._report(self._made(follower, None, caught_up=False))
             arrival = self._keeper.catch_up(self._seen_ns)
         self._keeper.keeps = False
@@ -361,7 +361,7 @@ class TargetTracker:
                 if isinstance(value := result.value, dict) and "detections" in value:
                     follower.detected(detections_of(value), result.captured_ns)
         if frame is not None:
-            self._look(follower, frame)
+            self._track(follower, frame)
         # A law that flies nothing would count on motion that never happens.
         action = follower.step(self._clock() + self._drone.clock_offset_ns) if self.steers else None
         self._report(self._made(follower, action))
@@ -370,7 +370,7 @@ class TargetTracker:
         for sample in self._keeper.feedback(until_ns):
             follower.feedback(sample)
 
-    def _look(self, follower: Follower, frame: Frame) -> None:
+    def _track(self, follower: Follower, frame: Frame) -> None:
         shapes = follower.look(frame)
         if not self.steers:  # the drawing would include the law's state
             shapes = [one for one in shapes if not isinstance(one, Text)]
