@@ -55,7 +55,7 @@ def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> 
     own.make_context(command, words)
 
 
-def test_the_version_is_told(run: Run) -> None:
+def test_the_version_is_printed(run: Run) -> None:
     assert run("--version") == (0, f"skyloop {skyloop.__version__}\n", "")
 
 

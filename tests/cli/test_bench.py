@@ -48,7 +48,7 @@ def test_sizes() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "320", "320x", "0x240", "-1x5", "4000x3000", "axb"])
-def test_sizes_that_are_none(text: str) -> None:
+def test_invalid_sizes_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="not a frame size"):
         parse_sizes(text)
 
@@ -85,7 +85,7 @@ def test_delays_are_measured_beside_the_bare_hand_over() -> None:
 
 
 @pytest.mark.process
-def test_a_process_that_fails_is_told(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_failing_process_is_reported(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     turn = bench._Turn(0, SHORT_S, (320, 240))
     with bench._Pair(bench.BARE, str(tmp_path / "no-such-folder")) as pair, pytest.raises(LinkError, match="ended"):
         pair.measure(turn)

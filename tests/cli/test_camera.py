@@ -69,7 +69,7 @@ def test_a_video_calibrates_by_views_that_differ(run: Run, tmp_path: Path, pictu
     assert "view 9:" not in ended.err
 
 
-def test_a_vehicle_that_shows_no_board_says_so(run: Run, tmp_path: Path) -> None:
+def test_a_vehicle_without_a_board_is_reported(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("cv2", reason="the simulator draws with OpenCV")
     output = str(tmp_path / "camera.json")
     ended = run("camera", "calibrate", "sim://?world=empty&cameras=front&fps=20", "-o", output, "--seconds", "1")
@@ -88,7 +88,7 @@ def test_a_vehicle_that_shows_no_board_says_so(run: Run, tmp_path: Path) -> None
         ([__file__], "can't be read as a video"),
     ],
 )
-def test_sources_that_are_none(run: Run, tmp_path: Path, arguments: list[str], why: str) -> None:
+def test_invalid_sources_are_refused(run: Run, tmp_path: Path, arguments: list[str], why: str) -> None:
     ended = run("camera", "calibrate", *arguments, "-o", str(tmp_path / "camera.json"))
     assert ended.code == 2
     assert why in ended.err

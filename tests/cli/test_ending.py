@@ -45,7 +45,7 @@ def test_a_drone_on_the_ground_has_landed_already(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("alpha")
-def test_a_drone_of_another_is_left_to_it_unless_the_priority_is_higher(run: Run) -> None:
+def test_another_pilots_drone_is_not_touched_unless_the_priority_is_higher(run: Run) -> None:
     with skyloop.connect("alpha", name="the pilot", on_exit="hover") as drone:
         drone.takeoff()
         ended = run("land", "alpha")
@@ -108,7 +108,7 @@ def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None
     assert run("land", "--all", "b1").err == "skyloop: --all means every drone: give either --all or names\n"
 
 
-def test_no_drone_at_all_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_drone_found_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.transport.local.list_names", list)
     for command in (["land", "--all"], ["stop", "--all", "--yes"]):
         ended = run(*command)

@@ -50,7 +50,7 @@ def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkey
     assert ending._stop("alpha") == "motors off"
 
 
-def test_all_hear_of_all_when_one_fails_in_a_way_that_nobody_expected(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unexpected_failure_of_one_does_not_hide_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     def end(name: str) -> str:
         if name == "b":
             raise ZeroDivisionError("a bug")
@@ -86,7 +86,7 @@ def test_every_drone_is_ended_at_once_however_many_there_are() -> None:
 
 
 @pytest.mark.parametrize(("state", "outcome"), [(LANDING, "landed, by its pilot"), (FLYING, None)])
-def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
+def test_a_landing_of_the_same_priority_serves_both(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch, state: FlightState, outcome: str | None
 ) -> None:
     def busy(*_: object, **__: object) -> None:

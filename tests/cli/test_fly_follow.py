@@ -34,7 +34,7 @@ from tests.support.processes import Process
         (("--class", "person", "--detector", "none.onnx"), "there is no file none.onnx"),
     ],
 )
-def test_what_is_wrong_is_told_before_anything_is_connected(run: Run, words: tuple[str, ...], said: str) -> None:
+def test_errors_are_reported_before_connecting(run: Run, words: tuple[str, ...], said: str) -> None:
     ended = run("fly", "follow", "--drone", "nobody", *words)
     assert ended.code == 2
     assert said in ended.err
@@ -50,7 +50,7 @@ def test_a_wrong_class_of_a_file_is_told_with_what_it_may_have_been(run: Run) ->
     assert "named 'persn'; did you mean 'person'?" in ended.err
 
 
-def test_a_file_of_that_name_is_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_named_follow_is_mentioned(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "follow").write_text("x = 1")
     assert "not the file of that name" in run("fly", "follow").err

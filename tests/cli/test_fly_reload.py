@@ -202,7 +202,7 @@ def test_an_error_in_on_frame_hovers_too(start: Callable[..., Process], tmp_path
 
 
 @pytest.mark.process
-def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
+def test_an_error_in_on_authority_is_reported_and_the_drone_left_to_its_new_pilot(
     start: Callable[..., Process], looker: skyloop.Drone, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.py"

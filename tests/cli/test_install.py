@@ -68,7 +68,7 @@ def test_an_unknown_part_is_refused_with_those_that_exist(run: Run) -> None:
         install.requirements(["nothing"])
 
 
-def test_what_can_not_be_installed_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_installations_are_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda command: SimpleNamespace(returncode=1))
     ended = run("install", "metrics")
     assert (ended.code, ended.err) == (1, "skyloop: metrics can't be installed: see above\n")

@@ -59,7 +59,7 @@ def test_an_identity_shows_its_copy_of_the_list_also_to_programs(run: Run, folde
     assert (found["number"], [key["name"] for key in found["keys"]]) == (2, ["jane"])
 
 
-def test_what_ends_within_a_week_is_told(run: Run, tmp_path: Path) -> None:
+def test_keys_that_expire_within_a_week_are_listed(run: Run, tmp_path: Path) -> None:
     now = datetime.now(UTC)
     lab = Lab.make(tmp_path / "lab", now=now - 10 * DAY)
     lab.issue(make_identity("old", "pilot"), days=1, now=now - 2 * DAY + timedelta(hours=1))
@@ -97,7 +97,9 @@ def test_wrong_words_end_with_2_and_say_what_would_be_right(
 
 
 @pytest.mark.parametrize("command", [["issue", "jane", "--role", "pilot"], ["show"], ["revoke", "jane"]])
-def test_without_a_lab_the_way_to_one_is_told(run: Run, tmp_path: Path, command: list[str]) -> None:
+def test_a_missing_lab_is_reported_with_the_command_that_makes_one(
+    run: Run, tmp_path: Path, command: list[str]
+) -> None:
     ended = run("keys", *command, "--dir", str(tmp_path / "nowhere"))
     assert ended.code == 2
     assert "skyloop keys init" in ended.err

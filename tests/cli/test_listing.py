@@ -52,7 +52,7 @@ def test_one_connection_for_all_of_a_process(proxies: list[Proxy], monkeypatch: 
     assert len({row.pid for row in rows}) == 1
 
 
-def test_who_is_not_in_the_overview_is_asked(proxies: list[Proxy]) -> None:
+def test_vehicles_missing_from_the_overview_are_queried(proxies: list[Proxy]) -> None:
     proxies[1].overview.end()  # like one that keys exclude from the others' overview
     assert [row.state for row in listing.running()] == ["landed"] * 3
 

@@ -68,7 +68,7 @@ def test_the_list_of_none_says_how_to_start_one(
     assert run("list", "--json").out == "[]\n"
 
 
-def test_a_stopped_proxy_is_told_by_every_command(
+def test_every_command_reports_a_stopped_proxy(
     run: Run, alpha: Process, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(import_module("skyloop.client.connect"), "NAME_TIMEOUT_S", 0.1)
@@ -256,7 +256,7 @@ def test_the_address_of_a_simulation_is_put_together_from_its_options() -> None:
     ("others", "said"),
     [(["cameras"], "has no value"), (["seed=3"], "give --seed 3"), (["wind=0", "wind=1"], "given twice")],
 )
-def test_an_option_that_is_none_is_answered_with_what_is(others: list[str], said: str) -> None:
+def test_an_unknown_option_is_answered_with_the_known_ones(others: list[str], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         address("room", 0, 1.0, others)
 

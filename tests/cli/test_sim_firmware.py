@@ -97,7 +97,7 @@ def test_ports_count_from_a_base() -> None:
         (("--firmware", "ardrone2", "--port-base", "0", "--bind", "no such host"), "can't be opened"),
     ],
 )
-def test_what_makes_no_sense_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
+def test_nonsense_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
     ended = run("sim", "--world", "empty", *arguments)
     assert ended.code != 0
     assert said in ended.err

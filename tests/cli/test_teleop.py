@@ -295,7 +295,7 @@ def test_an_arrow_that_comes_slowly_is_an_arrow() -> None:
 
 
 @pytest.mark.parametrize(("focus", "told"), [(b"\x1b[O", "another window"), (b"\x1b[I", "again")])
-def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus: bytes, told: str) -> None:
+def test_a_window_without_keys_is_reported_and_swallows_no_esc(focus: bytes, told: str) -> None:
     """A terminal behind another window received no keys, without a message."""
     tokens = Tokenizer()
     assert tokens.feed(focus) == []

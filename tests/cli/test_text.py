@@ -27,7 +27,7 @@ def test_what_matters_is_coloured_in_a_terminal(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(("variable", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_who_wants_no_colour_gets_none(monkeypatch: pytest.MonkeyPatch, variable: str, value: str) -> None:
+def test_no_colour_is_respected(monkeypatch: pytest.MonkeyPatch, variable: str, value: str) -> None:
     monkeypatch.setenv(variable, value)
     assert coloured("skyloop: no file", Terminal()) == "skyloop: no file"
 

@@ -44,7 +44,7 @@ def test_the_port_is_the_same_each_time(ports: tuple[int, int], capsys: pytest.C
     assert capsys.readouterr().err == ""
 
 
-def test_where_it_is_taken_who_has_it_is_told(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_port_names_its_process(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
         assert listening.getsockname()[1] == ports[1]
     said = capsys.readouterr().err
@@ -52,19 +52,21 @@ def test_where_it_is_taken_who_has_it_is_told(ports: tuple[int, int], capsys: py
     assert f"at port {ports[1]}" in said
 
 
-def test_where_all_are_taken_any_free_one_does(ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_free_port_is_used_if_all_defaults_are_taken(
+    ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(addresses, "NEXT_PORTS", 0)
     with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
         assert listening.getsockname()[1] not in ports
 
 
-def test_nobody_listens_there() -> None:
+def test_a_free_port_has_no_listener() -> None:
     with bind(HERE, 0) as listening:
         port = listening.getsockname()[1]
     assert listener_of(port) == ""
 
 
-def test_what_is_printed_is_an_address_that_is_answered() -> None:
+def test_the_printed_address_answers() -> None:
     assert reachable("192.0.2.7") == ["192.0.2.7"]
     for everywhere in ("0.0.0.0", "::"):
         names = own_names(everywhere, 8420, addresses.host_names())
@@ -75,7 +77,7 @@ def test_what_is_printed_is_an_address_that_is_answered() -> None:
         assert not names.own("elsewhere.local:8420")
 
 
-def test_where_no_route_leads_further_the_addresses_of_the_interfaces_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interface_addresses_are_printed_without_a_default_route(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket.socket, "connect", no_route)
     monkeypatch.setattr(addresses, "own_addresses", lambda: ["192.0.2.9", "198.51.100.9"])
     assert reachable("0.0.0.0") == ["192.0.2.9", "198.51.100.9"]
@@ -93,7 +95,7 @@ def test_the_addresses_of_the_interfaces_can_be_bound() -> None:
             assert listening.getsockname()[0] == address != HERE
 
 
-def test_where_there_is_no_network_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_network_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     Announcer(None, loopback=False)("http://127.0.0.1:8123/")
     assert "this machine has no network" in capsys.readouterr().err
     Announcer(None, loopback=True)("http://127.0.0.1:8123/")
@@ -101,7 +103,7 @@ def test_where_there_is_no_network_it_says_so(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr().err == ""
 
 
-def test_a_code_works_once_and_not_for_ever() -> None:
+def test_a_code_works_once_and_expires() -> None:
     now_ns = 0
     used: list[str] = []
     pairing = Pairing(Role.OBSERVER, lambda: now_ns)

@@ -128,7 +128,7 @@ def test_one_address_has_so_many_places_and_gets_them_back() -> None:
     assert hall.admission.requested(open_[1], OBSERVER, 0) == "", "who has a place keeps it"
 
 
-def test_who_says_nothing_in_time_is_ended() -> None:
+def test_silent_connections_are_closed() -> None:
     hall = Hall()
     silent, asked, person = hall.open(), hall.open(), hall.open("b", OBSERVER)
     hall.admission.requested(asked, None, 0)
@@ -141,7 +141,7 @@ def test_who_says_nothing_in_time_is_ended() -> None:
     assert hall.admission.counts.timed_out == 3
 
 
-def test_with_nobody_there_nobody_is_shed() -> None:
+def test_shedding_without_connections_does_nothing() -> None:
     Admission().shed()
 
 
@@ -182,7 +182,9 @@ class Speaker(asyncio.Protocol):
         transport.write(b"hello")
 
 
-def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+def test_accepting_pauses_while_the_system_is_out_of_descriptors(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """Without a free descriptor the cockpit retries after a while, drops a stranger's connection and logs little."""
     monkeypatch.setattr(logging.getLogger(listening.__name__), "filters", [])  # a cockpit that ran here limits repeats
     admission = Admission()
@@ -222,7 +224,7 @@ def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, ca
     ] * 2
 
 
-def test_a_handshake_that_is_not_finished_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_handshake_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listening, "SWEEP_S", 0.001)
     clock, admission = ManualClock(), Admission()
 
@@ -248,7 +250,7 @@ def test_a_handshake_that_is_not_finished_is_ended(monkeypatch: pytest.MonkeyPat
     assert admission.counts.timed_out == 1
 
 
-def test_a_socket_that_was_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_listening_socket_ends_the_listener(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         async def accept(_: socket.socket) -> Any:
             raise OSError(errno.EBADF, "closed")
@@ -268,7 +270,7 @@ def test_this_process_has_places(monkeypatch: pytest.MonkeyPatch) -> None:
     assert places_here() == Places()
 
 
-def test_a_message_that_a_stranger_can_cause_is_told_once_in_a_while() -> None:
+def test_messages_caused_by_strangers_are_rate_limited() -> None:
     clock = ManualClock()
     limit = RepeatLimit(10.0, clock)
 
@@ -299,7 +301,7 @@ def test_messages_are_limited_however_many_different_ones_there_were() -> None:
 
 
 @pytest.mark.parametrize(("kind", "told"), [("http", 503), ("websocket", 1013)])
-def test_who_has_too_many_connections_is_told(kind: str, told: int) -> None:
+def test_too_many_connections_are_refused_with_the_reason(kind: str, told: int) -> None:
     sent: list[Any] = []
 
     async def send(message: Any) -> None:

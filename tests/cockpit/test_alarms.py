@@ -123,7 +123,7 @@ def test_the_usual_thresholds_are_the_proxys_defaults() -> None:
 
 
 @pytest.mark.parametrize("value", [True, "much", (1.0,), math.nan, math.inf])
-def test_what_is_no_number_of_a_driver_is_no_threshold(value: Value) -> None:
+def test_thresholds_that_are_not_numbers_are_ignored(value: Value) -> None:
     assert thresholds_of(Config(dict.fromkeys(PARAMETERS.values(), value))) == USUAL
 
 

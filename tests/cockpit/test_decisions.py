@@ -178,7 +178,7 @@ def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
 
 
 @pytest.mark.parametrize("begin", [go_to, follow])
-def test_a_page_that_pings_and_hears_nothing_flies_nothing(
+def test_a_page_that_pings_without_receiving_flies_nothing(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
 ) -> None:
     """It followed its target without end: each report of the tracker was a new command of a silent pilot."""
@@ -199,7 +199,7 @@ def test_a_page_that_pings_and_hears_nothing_flies_nothing(
         assert not any(isinstance(action, Velocity) for action in node.flyer.applied[at:][1:])
 
 
-def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
+def test_a_person_takes_control_back(client: TestClient, node: Node) -> None:
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().take_off()
         pilot.say("fly", forward=0.4)
@@ -211,7 +211,7 @@ def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
 
 
 @pytest.mark.parametrize("begin", [go_to, fly_a_route, follow])
-def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
+def test_a_low_battery_return_is_ended_only_by_a_person(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
 ) -> None:
     """The end of a go-to or a route, or a closing tab, made it hover until its battery was empty."""
@@ -237,7 +237,7 @@ def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
 # Hands -------------------------------------------------------------------------------------------------------------
 
 
-def test_sticks_that_no_hand_has_moved_are_in_nobodys_hand() -> None:
+def test_untouched_sticks_count_as_released() -> None:
     watch = HandWatch()
     held = Fly(forward=0.5, touches=7)
 

@@ -64,7 +64,7 @@ async def settle(fleet: Fleet) -> None:
         await asyncio.gather(*fleet._connecting.values())
 
 
-def test_one_connection_a_drone() -> None:
+def test_one_connection_per_drone() -> None:
     hangar = Hangar("alpha", "beta")
 
     async def work() -> None:
@@ -80,7 +80,7 @@ def test_one_connection_a_drone() -> None:
     assert all(drone.closed for drone in hangar.drones.values())
 
 
-def test_one_that_does_not_answer_is_told_and_tried_again() -> None:
+def test_an_unresponsive_proxy_is_reported_and_retried() -> None:
     hangar = Hangar("alpha")
     hangar.fails.add("alpha")
 
@@ -168,7 +168,7 @@ def test_a_lost_drone_on_a_page_is_not_forgotten_and_one_that_is_back_neither() 
     run(work)
 
 
-def test_a_finder_that_fails_is_asked_again() -> None:
+def test_a_failing_finder_is_retried() -> None:
     hangar = Hangar("alpha")
     asked = 0
 
@@ -249,7 +249,7 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
         after.stop()
 
 
-def test_the_overview_tells_who_holds_control(nodes: Nodes) -> None:
+def test_the_overview_shows_the_holder_of_control(nodes: Nodes) -> None:
     with cockpit(Fleet(nodes, look_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
         control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})
         until(lambda: rows(client)[0]["me"])

@@ -69,7 +69,7 @@ def test_catching_up_takes_each_frame_but_those_closer_than_a_stride() -> None:
     assert [sparse.next_after(at * MS) is None for at in (0, 500, 1000)] == [False, False, True]
 
 
-def test_a_frame_that_is_kept_as_a_jpeg_is_a_frame_again() -> None:
+def test_a_frame_kept_as_jpeg_can_be_restored() -> None:
     pixels = np.full((24, 32, 3), (200, 40, 90), np.uint8)
     header = FrameHeader("front", 3, 70, 80, 32, 24, Encoding.BGR8, pixels.size)
     original = Arrival(header, pixels.reshape(-1), 90, 5, FeedbackHistory()).frame()

@@ -60,7 +60,7 @@ def test_video_moves_and_is_young(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_video_that_is_scrolled_away_is_not_asked_for(deck: Deck) -> None:
+def test_video_out_of_sight_is_not_requested(deck: Deck) -> None:
     deck.proxy("away")
     page = deck.page("away", viewport={"width": 390, "height": 500})
     page.wait_for_new_picture()
@@ -443,9 +443,7 @@ def test_a_phone(deck: Deck, scheme: str) -> None:
     assert box["y"] + box["height"] <= 844, "in reach without scrolling"
 
 
-def test_a_token_lets_in_as_an_observer_or_a_pilot(
-    open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path
-) -> None:
+def test_a_token_admits_an_observer_or_a_pilot(open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path) -> None:
     tokens = tmp_path / "tokens"
     tokens.write_text("pilot 0123456789abcdefP ann\nobserver 0123456789abcdefO bob\n")
     tokens.chmod(0o600)

@@ -146,7 +146,7 @@ def test_after_a_proxys_death_and_return_control_is_the_persons_to_take(deck: De
     proxy.signal(signal.SIGKILL)
     page.wait_for_text(".ended", "nobody has control, and the state of returns is unknown")
     page.wait_for_text(".holder", "Nobody")
-    page.wait_for_text(".pill", "not known")
+    page.wait_for_text(".pill", "unknown")
     assert page.pane.get_attribute("data-old") == "true"
     proxy.end()
     deck.proxy("returns", SMALL)

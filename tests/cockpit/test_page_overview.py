@@ -71,7 +71,7 @@ def test_all_drones_one_of_them_and_back(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_no_key_flies_what_is_not_seen_and_all_land(deck: Deck) -> None:
+def test_keys_fly_no_invisible_drone_and_all_land(deck: Deck) -> None:
     page = deck.page("d1")
     with ExitStack() as stack:
         seen = {name: stack.enter_context(skyloop.connect(name, access="observe", name="test")) for name in NAMES}

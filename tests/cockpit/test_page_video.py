@@ -126,7 +126,7 @@ def test_over_plain_http_the_page_says_why_and_what_to_do(deck: Deck) -> None:
     page.page.get_by_text("skyloop cockpit --https").wait_for()
 
 
-def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
+def test_a_key_picture_is_requested_after_a_gap(deck: Deck) -> None:
     page = deck.page("film", prepare=LOSES)
     page.until(lambda: form(page).startswith("h264"), "H.264 is shown", MOST_S)
     page.wait_for_new_picture()
@@ -138,7 +138,7 @@ def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_a_page_that_falls_behind_is_told_why_its_picture_is_smaller(deck: Deck) -> None:
+def test_a_page_that_falls_behind_shows_why_its_picture_is_smaller(deck: Deck) -> None:
     """It fell to 160 × 120, without any explanation."""
     page = deck.page("film", prepare=SLOW)
     page.until(lambda: form(page) == "h264 own", "it has a stream of its own", MOST_S)
@@ -239,7 +239,7 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
     assert (live.problems, frozen.problems) == ([], [])
 
 
-def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: Deck) -> None:
+def test_late_drawings_are_shown_faded_or_explained(deck: Deck) -> None:
     """Drawings by a detector that takes half a second were never visible, without any explanation."""
     deck.proxy("slow")
     page = deck.page("slow")

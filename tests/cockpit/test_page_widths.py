@@ -255,7 +255,7 @@ window.WebSocket = class extends WebSocket {
 """
 
 
-def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
+def test_messages_about_one_or_all_drones_move_nothing(deck: Deck) -> None:
     for name in ("told", "beside"):
         deck.proxy(name)
     page = deck.page("told", panels=False)
@@ -265,7 +265,7 @@ def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
     assert moved(page, ".safety-message", ".alarms", ".alarm-chip", ".notice", ".card-alarm") == ""
 
 
-def test_what_is_said_above_all_drones_moves_nothing(deck: Deck) -> None:
+def test_messages_above_all_drones_move_nothing(deck: Deck) -> None:
     deck.proxy("listed")
     page = deck.overview(DEAF)
     landed(page)

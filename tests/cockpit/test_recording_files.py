@@ -152,7 +152,7 @@ def test_a_renamed_recording_keeps_its_notes_and_overwrites_nothing(nodes: Nodes
     ]
 
 
-def test_what_is_deleted_can_be_brought_back(nodes: Nodes, folder: Path) -> None:
+def test_deleted_recordings_can_be_restored(nodes: Nodes, folder: Path) -> None:
     data = (folder / "flight.mcap").read_bytes()
     with serve(nodes, folder) as client:
         post(client, "recordings/flight.mcap/notes", {"text": "keep"})
@@ -203,7 +203,7 @@ def test_notes_and_marks_have_limits(folder: Path) -> None:
     assert not notes_path(path).exists()
 
 
-def test_what_is_recorded_is_marked_and_not_moved(nodes: Nodes, folder: Path) -> None:
+def test_running_recordings_can_be_marked_but_not_moved(nodes: Nodes, folder: Path) -> None:
     with serve(nodes, folder, record=FakeRecorder) as client:
         number = post(client, "recordings", {"drones": ["alpha"]}).json()["id"]
         (name,) = {path.name for path in folder.iterdir()} - {"flight.mcap", "other.mcap"}
@@ -222,7 +222,7 @@ def test_what_is_recorded_is_marked_and_not_moved(nodes: Nodes, folder: Path) ->
 # Replays -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_timeline_holds_what_happened(folder: Path) -> None:
+def test_a_timeline_contains_events_and_marks(folder: Path) -> None:
     recording = Recording.open(folder / "flight.mcap")
     found = timeline(recording, "alpha")
     assert [event["kind"] for event in found["events"]].count("collision") == 1

@@ -193,7 +193,7 @@ def test_a_page_that_falls_silent_or_commands_something_else_pauses_the_route(cl
 
 
 @pytest.mark.parametrize(("first", "then"), [("route", "route_skip"), ("goto", "route_resume")])
-def test_a_route_that_can_not_be_steered_leaves_the_vehicle_hovering(
+def test_a_failed_route_control_leaves_the_vehicle_hovering(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, first: str, then: str
 ) -> None:
     """It flew on to its previous goal, but no one watched that any more."""

@@ -72,7 +72,7 @@ class Flown:
         self.asked.append(wish)
 
 
-def test_nothing_is_repeated_for_a_page_that_is_not_known_to_be_there() -> None:
+def test_nothing_is_repeated_for_an_absent_page() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)
@@ -82,7 +82,7 @@ def test_nothing_is_repeated_for_a_page_that_is_not_known_to_be_there() -> None:
     assert flown.goes_on(60.0) == [], "silent: to the proxy, too"
 
 
-def test_a_page_that_is_heard_goes_on_and_nothing_from_before_its_silence_does() -> None:
+def test_a_returning_page_continues_without_its_earlier_commands() -> None:
     flown = Flown()
     flown.hold(5)
     for _ in range(10):
@@ -96,7 +96,7 @@ def test_a_page_that_is_heard_goes_on_and_nothing_from_before_its_silence_does()
     assert all(type(command.action).__name__ == "Idle" for command in again)
 
 
-def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:
+def test_older_news_never_overrides_newer_news() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)
@@ -104,7 +104,7 @@ def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:
     assert flown.goes_on(1.5)
 
 
-def test_an_emergency_stop_goes_out_whoever_is_silent() -> None:
+def test_an_emergency_stop_is_sent_even_for_a_silent_page() -> None:
     flown = Flown()
     flown.hold(5)
     flown.goes_on(10.0)
@@ -112,7 +112,7 @@ def test_an_emergency_stop_goes_out_whoever_is_silent() -> None:
     assert flown.sent[-1].action == EmergencyStop()
 
 
-def test_control_that_ran_out_is_not_asked_for_again_by_itself() -> None:
+def test_expired_control_is_not_requested_again_automatically() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.disconnected()
@@ -128,7 +128,7 @@ def test_control_that_ran_out_is_not_asked_for_again_by_itself() -> None:
     assert flown.pilot.status.state == "none"
 
 
-def test_a_program_that_flies_itself_is_always_there() -> None:
+def test_a_program_always_counts_as_present() -> None:
     flown = Flown()
     flown.pilot._authority.renews = True
     flown.pilot._present_until_ns = None
@@ -170,7 +170,7 @@ def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClien
         assert not watcher.feedback().lease, "it does not come back by itself"
 
 
-def test_a_page_that_pings_and_hears_nothing_is_silent_too(client: TestClient, node: Node) -> None:
+def test_a_page_that_pings_without_receiving_is_silent_too(client: TestClient, node: Node) -> None:
     quick(node)
     with page(client) as pilot:
         pilot.take().take_off()

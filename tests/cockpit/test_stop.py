@@ -113,7 +113,7 @@ def test_a_stop_of_all_silences_the_sticks_of_every_page(client: TestClient, nod
     assert count(node, EmergencyStop()) >= 1
 
 
-def test_a_fault_in_what_a_page_flies_keeps_no_stop_away(
+def test_a_fault_in_a_session_does_not_prevent_a_stop(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(self: ControlSession, why: str) -> None:
@@ -128,7 +128,7 @@ def test_a_fault_in_what_a_page_flies_keeps_no_stop_away(
         assert node.flyer.state is FlightState.EMERGENCY
 
 
-def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(
+def test_a_stop_refused_by_the_vehicle_is_reported_with_its_reason(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(station, "SHOWN_S", 0.5)
@@ -149,7 +149,7 @@ def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(
             pilot.wait("done", do="land")
 
 
-def test_a_stop_that_the_vehicle_cannot_do_is_told_at_once_and_the_drone_hovers(
+def test_an_unsupported_stop_is_reported_at_once_and_the_drone_hovers(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def cannot(_: object) -> bool:
