@@ -42,8 +42,7 @@ def fly_follow(
         str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
     ] = None,
     class_name: Annotated[
-        str | None,
-        typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person or car"),
+        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person")
     ] = None,
     detector: Annotated[
         str | None,

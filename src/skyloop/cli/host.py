@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from skyloop.host.serve import Answer, Request
     from skyloop.host.vehicle import VehicleStatus
 
-FleetArgument = Annotated[
-    Path, typer.Argument(metavar="FILE", help="File of vehicles; see docs/host.md for an example")
-]
+FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="File of vehicles; see docs/host.md")]
 GroupOption = Annotated[str | None, typer.Option(metavar="GROUP", help="Group of users whose members may also do this")]
 HostOption = Annotated[
     str | None, typer.Option("--host", metavar="NAME", help="Name of the host, if several run [the one that runs]")
@@ -117,9 +115,7 @@ def add(
     what: Annotated[str, typer.Argument(metavar="NAME|FILE", help="Name of a vehicle, or file of several")],
     address: Annotated[
         str | None,
-        typer.Argument(
-            metavar="[ADDRESS]", help="Vehicle's address; without: from the host's own file", show_default=False
-        ),
+        typer.Argument(metavar="[ADDRESS]", help="Its address [from the host's own file]", show_default=False),
     ] = None,
     own_process: Annotated[
         bool | None,

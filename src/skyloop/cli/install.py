@@ -100,9 +100,7 @@ def _installer(anew: bool) -> list[str]:
         return [sys.executable, "-m", "pip", "install", *(["--force-reinstall"] if anew else [])]
     if shutil.which("uv"):
         return ["uv", "pip", "install", "--python", sys.executable, *(["--reinstall"] if anew else [])]
-    raise UnsupportedError(
-        f"{sys.prefix} has no pip, and there is no uv: install the packages shown by --dry-run by other means"
-    )
+    raise UnsupportedError(f"{sys.prefix} has no pip, and there is no uv: install the list of --dry-run by other means")
 
 
 def missing(parts: Iterable[str]) -> Iterator[str]:

@@ -43,7 +43,7 @@ class Row(msgspec.Struct, frozen=True):
     owner: str | None = None
     vehicle_link: str = ""
     problem: str = ""
-    link_reason: str = ""  #: why the vehicle's link is down
+    link_reason: str = ""  #: why the vehicle's link is not up
     link_remedy: str = ""  #: how to fix it
 
 
@@ -214,8 +214,7 @@ def lines(rows: Iterable[Row]) -> list[str]:
 
 def audit(
     name: Annotated[
-        str | None,
-        typer.Argument(metavar="[NAME]", help="Only this drone's flights [default: all]", autocompletion=drone_names),
+        str | None, typer.Argument(metavar="[NAME]", help="Only this drone [all]", autocompletion=drone_names)
     ] = None,
     drone: DroneOption = None,
     file: Annotated[

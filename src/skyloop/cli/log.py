@@ -22,9 +22,7 @@ File = Annotated[
     Path,
     typer.Argument(metavar="FILE", help="Recording: an MCAP file written by Skyloop", autocompletion=recordings),
 ]
-DroneName = Annotated[
-    str | None, typer.Option("--drone", metavar="NAME", help="Drone in the recording [default: the first]")
-]
+DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Recorded drone [the first]")]
 _EXAMPLE: Final = "Example: skyloop log "
 
 
@@ -209,9 +207,7 @@ def compare(
     ] = None,
     drone: DroneName = None,
     what: Annotated[Which, typer.Option(help="Commands as requested, or as applied")] = Which.ASKED,
-    part: Annotated[
-        float, typer.Option(min=0.0, help="Set-points that differ by more count as diverged [SI unit]")
-    ] = 0.01,
+    part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
     """Compare a changed controller's commands with the old one's: RMS of each set-point, and where they diverge."""

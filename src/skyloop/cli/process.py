@@ -55,9 +55,7 @@ def process(
     share: Annotated[
         bool, typer.Option("--share/--all", help="Each frame to one worker of this name, or to all")
     ] = True,
-    workers: Annotated[
-        int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Number of processes on this machine")
-    ] = 1,
+    workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes to run here")] = 1,
     max_age: Annotated[float, typer.Option(metavar="S", min=0.0, help="Skip frames older than this")] = 1.0,
     max_fps: Annotated[
         float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second of a worker")

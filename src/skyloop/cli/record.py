@@ -47,20 +47,12 @@ def record(
         ),
     ] = "auto",
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
-    rotate_mb: Annotated[
-        float | None, typer.Option(metavar="MB", min=1.0, help="Start a new file at this size")
-    ] = None,
-    rotate_s: Annotated[
-        float | None, typer.Option(metavar="S", min=1.0, help="Start a new file after this time")
-    ] = None,
+    rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="Maximum size of a file")] = None,
+    rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="Maximum time of a file")] = None,
     min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Disk space to leave free")] = 256.0,
-    buffer_mb: Annotated[
-        float, typer.Option(metavar="MB", min=1.0, help="Memory for data waiting for a slow disk")
-    ] = 64.0,
+    buffer_mb: Annotated[float, typer.Option(metavar="MB", min=1.0, help="Buffer for a slow disk")] = 64.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file")] = False,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Duration [until Ctrl-C]")] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
@@ -148,9 +140,7 @@ def view(
     rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
         str,
-        typer.Option(
-            metavar="ADDRESS", help="Address to listen on; beyond loopback, anyone who reaches it sees the drones"
-        ),
+        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback, anyone who reaches it sees the drones"),
     ] = "127.0.0.1",
     port: Annotated[
         int | None,
@@ -168,9 +158,7 @@ def view(
     save: Annotated[
         Path | None, typer.Option(metavar="FILE", help="With --rerun: save to this .rrd file instead of a viewer")
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Duration [until Ctrl-C]")] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:

@@ -29,17 +29,13 @@ def ros(
     map_frame: Annotated[
         str, typer.Option("--map", metavar="FRAME", help="Join the drones' odom frames, if they share their axes")
     ] = "",
-    use_sim_time: Annotated[
-        bool, typer.Option("--use-sim-time", help="Stamp messages with the time of /clock")
-    ] = False,
+    use_sim_time: Annotated[bool, typer.Option("--use-sim-time", help="Use the time of /clock")] = False,
     domain: Annotated[
         str | None, typer.Option(metavar="ID", help="DDS domain, 0 to 101 [ROS_DOMAIN_ID]", show_default=False)
     ] = None,
     subnet: Annotated[
         bool,
-        typer.Option(
-            "--subnet", help="Let other machines find it: ROS 2 has no keys, so anyone who reaches it may fly"
-        ),
+        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in reach may fly"),
     ] = False,
     ros_args: Annotated[
         str, typer.Option(metavar="ARGS", help='For ROS 2, in quotes: --ros-args "-r cmd_vel:=teleop"')

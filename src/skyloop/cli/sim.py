@@ -63,9 +63,7 @@ def sim(
     world: Annotated[str, typer.Option(metavar="WORLD", help="Name or file of the world")] = "room",
     seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed of wind, noise and targets")] = 0,
     speed: Annotated[float, typer.Option(metavar="X", min=0.01, max=100.0, help="Simulated seconds per second")] = 1.0,
-    name: Annotated[
-        str, typer.Option(metavar="NAME", help="Name of the proxy; several are numbered: sim1, sim2, …")
-    ] = NAME,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy; several are numbered: sim1, sim2, …")] = NAME,
     option: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; repeatable"),
@@ -116,9 +114,7 @@ def sim(
     ] = None,
     video_port: Annotated[
         int | None,
-        typer.Option(
-            metavar="P", min=1, max=65000, help="For arducopter and px4: send the camera's video to this port"
-        ),
+        typer.Option(metavar="P", min=1, max=65000, help="For arducopter and px4: port to send the video to"),
     ] = None,
     fault_seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Firmware: seed of the faults [0]")] = None,
 ) -> None:

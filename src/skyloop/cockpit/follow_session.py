@@ -189,10 +189,7 @@ class FollowSession:
             tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
-        self._pilot, self._asked_ns = (
-            pilot,
-            self._clock(),
-        )  # sets off with the next report, once the tracker has caught up
+        self._pilot, self._asked_ns = pilot, self._clock()  # sets off with the report after catching up
         tracker.steers = True
         self._send_state()
 
