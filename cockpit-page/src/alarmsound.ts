@@ -75,7 +75,7 @@ export class AlarmSound {
 
   private mute(muted: boolean): void {
     settings.set("sound", muted ? "off" : "on");
-    if (!muted) this.play("warning"); // so that one knows what it is like
+    if (!muted) this.play("warning"); // a sample, so that the person knows the sound
   }
 
   private look(): void {

@@ -227,7 +227,7 @@ export class CommandSender {
   private settle(answer: Answer, fate: Fate): void {
     const what = answer.do ?? "";
     const pending = this.pending.get(what);
-    if (answer.n && answer.n !== (pending?.n ?? this.settled.get(what))) return; // of an earlier one
+    if (answer.n && answer.n !== (pending?.n ?? this.settled.get(what))) return; // answers an earlier one
     this.pending.delete(what);
     if (pending) this.settled.set(what, pending.n);
     this.show(what, fate, answer.why ?? "");

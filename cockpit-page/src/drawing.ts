@@ -41,7 +41,7 @@ export function contain(width: number, height: number, box: { width: number; hei
 }
 
 const rgb = ([red, green, blue]: readonly number[]): string => `rgb(${red} ${green} ${blue})`;
-const EDGE = "rgb(0 0 0 / 55%)"; // below lines and dots: they are to be seen on any picture
+const EDGE = "rgb(0 0 0 / 55%)"; // below lines and dots, so that they are visible on any picture
 
 export function draw(pen: CanvasRenderingContext2D, shapes: readonly Shape[], fit: Fit): void {
   pen.lineJoin = pen.lineCap = "round";

@@ -92,7 +92,7 @@ export class Flying {
   private down(event: KeyboardEvent): void {
     const stops = stopKeys(event);
     if (stops !== null) {
-      event.preventDefault(); // also in a text field: it writes nothing there
+      event.preventDefault(); // also in a text field, where it must not type anything
       event.stopImmediatePropagation();
       if (!event.repeat) this.stop("keys", stops);
       return;

@@ -30,7 +30,7 @@ export class Freshness {
     const now_ms = performance.now();
     this.clock.received(now_ms, state.now_s);
     if (state.links.application === "lost") return;
-    const feedback_s = isRecording ? 0 : (state.feedback?.age_s ?? 0); // what was recorded is old anyhow
+    const feedback_s = isRecording ? 0 : (state.feedback?.age_s ?? 0); // a recording is always old
     this.fresh_ms = now_ms - ((this.clock.age_s(state.now_s, now_ms) ?? 0) + feedback_s) * 1000;
   }
 

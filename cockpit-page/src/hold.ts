@@ -122,7 +122,7 @@ export class Countdown {
 /** A button to hold: by pointer, or by the space bar or Enter. `deadly` is called when the press begins. */
 export function holdButton(countdown: Countdown, deadly: () => Deadly | null, attributes: Record<string, string>, ...children: (Node | string)[]): HTMLButtonElement {
   const button = h("button", { type: "button", ...attributes }, ...children);
-  let pressed: { by: number | string; meant: Deadly } | null = null; // by which finger or key: to let go of another one ends nothing
+  let pressed: { by: number | string; meant: Deadly } | null = null; // the finger or key: releasing another one ends nothing
   const press = (by: number | string): void => {
     const meant = deadly();
     if (meant === null || button.disabled) return;
@@ -136,7 +136,7 @@ export function holdButton(countdown: Countdown, deadly: () => Deadly | null, at
     const { meant } = pressed;
     pressed = null;
     setAttribute(button, "data-held", "false");
-    if (countdown.holds(meant)) countdown.release(); // or it is done, and what is held now was begun elsewhere
+    if (countdown.holds(meant)) countdown.release(); // otherwise it is done, and the present hold began elsewhere
   };
   button.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;

@@ -69,7 +69,7 @@ class Tape {
       const [px, py] = this.vertical ? [x + width / 2, y + height / 2 - away] : [x + width / 2 + away, y + height / 2];
       label.setAttribute("transform", `translate(${px.toFixed(1)} ${py.toFixed(1)})`);
       setText(label, this.name(at));
-      const half = (step * unit_px) / 2; // a line between each two
+      const half = (step * unit_px) / 2; // one line between two labels
       const ends = this.vertical ? [x + width / 2 - 5, py - half, x + width / 2 + 5, py - half] : [px + half, y + height / 2 - 4, px + half, y + height / 2 + 4];
       ["x1", "y1", "x2", "y2"].forEach((key, place) => line.setAttribute(key, (ends[place] as number).toFixed(1)));
     });

@@ -76,7 +76,7 @@ export class Instruments {
     const slow = round_trip_s !== null && round_trip_s > SLOW_S;
     this.page.show(connected ? (round_trip_s === null ? named(t.linkStates, "up") : t.flight.milliseconds(Math.max(1, Math.round(round_trip_s * 1000)))) : named(t.linkStates, "lost"), connected ? (slow ? "warn" : "ok") : "bad");
     const hop = (name: string | undefined): [string, Tone] => (connected && name ? [named(t.linkStates, name), LINK_TONES[name] ?? "quiet"] : ["–", "quiet"]);
-    const over = state?.links.vehicle === "closed"; // a recording, which ends some time
+    const over = state?.links.vehicle === "closed"; // a recording that has ended
     this.application.show(...hop(state?.links.application));
     this.vehicle.show(...(over && connected ? ([t.linkStates["over"], "quiet"] as [string, Tone]) : hop(state?.links.vehicle)));
     setText(this.reason, connected ? (state?.links.reason ?? "") : "");

@@ -12,8 +12,8 @@ import type { Scene } from "./world.js";
 const PERIOD_MS = 80;
 const CLICK_PX = 5;
 const REACH_PX = 12;
-const EASE = 0.15; // of the way to the wanted view, each time that it is drawn
-const STILL = 0.01; // of the view's extent: less than this to the wanted view is no movement
+const EASE = 0.15; // share of the way to the desired view, per drawing
+const STILL = 0.01; // share of the view's extent: a smaller distance counts as no movement
 const ZOOM = 1.4;
 const INKS = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "target"];
 
@@ -135,7 +135,7 @@ export class MapView {
     if (!wanted) return;
     const { view } = this;
     const known = room.flat().join();
-    const jumps = !view || known !== this.room; // a room that has become known is not approached, it is shown
+    const jumps = !view || known !== this.room; // show a newly known room at once, without easing
     this.room = known;
     const mix = (from: number, to: number): number => from + (to - from) * EASE;
     this.view = jumps ? wanted : { east: mix(view.east, wanted.east), north: mix(view.north, wanted.north), scale: mix(view.scale, wanted.scale) };
@@ -186,7 +186,7 @@ export class MapView {
     this.canvas.setPointerCapture(event.pointerId);
     const [x, y] = this.pixel(event);
     const taken = this.used?.press(this.spot(shown, x, y)) ?? false;
-    if (taken) this.free(); // the view stays while something is dragged
+    if (taken) this.free(); // keep the view while dragging
     this.drag = { x, y, shown, moved: false, taken };
   }
 

@@ -8,8 +8,8 @@ import type { PastRecording, Recordings, RunningRecording } from "./model.js";
 import { RecordingRow } from "./recordingrow.js";
 
 const PERIOD_MS = 1000;
-const IDLE_PERIODS = 5; // while nothing is recorded it is asked less often
-const FEW = 3; // are seen at a glance
+const IDLE_PERIODS = 5; // poll less often while nothing is recorded
+const FEW = 3; // few enough to see at a glance
 
 /** Samples missing from a recording: received and left out, or never received. */
 export function lacking(recording: Pick<RunningRecording, "dropped" | "missed">): number {

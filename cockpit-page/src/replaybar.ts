@@ -9,7 +9,7 @@ import { clamped, fine, type Mark, nearest, next, type Playback, type Replayed, 
 const NEAR_PX = 7;
 const NEAR_TOUCH_PX = 16;
 const APART_S = 0.3;
-const KEPT_MS = 900; // what was asked for is shown for so long, until the replay says so itself
+const KEPT_MS = 900; // how long a requested position is shown before the replay confirms it
 const NOTES_MS = 5000;
 const KEYS = "ArrowLeft ArrowRight ArrowUp ArrowDown Home End PageUp PageDown Space Comma Period";
 

@@ -337,7 +337,7 @@ export class RoutePanel implements MapTool {
     await this.doing(async () => {
       if (file.size > 65536) throw new Error(t.route.tooLarge(file.name));
       const read: unknown = JSON.parse(await file.text());
-      const checked = await post<RouteCheck>(`/api/drones/${encodeURIComponent(this.drone)}/route/check`, read as object); // says what is wrong with it
+      const checked = await post<RouteCheck>(`/api/drones/${encodeURIComponent(this.drone)}/route/check`, read as object); // reports its problems
       this.edit(whole(read as Partial<Route>));
       this.check = checked;
     });

@@ -39,7 +39,7 @@ export function describe(row: DroneRow): Described {
   const recorded = isRecording(row);
   const [application, vehicle] = [row.links.application, row.links.vehicle];
   const lost = application === "lost";
-  const over = recorded && (lost || vehicle === "closed"); // as every recording is some time
+  const over = recorded && (lost || vehicle === "closed"); // every recording ends
   const critical = row.alarms.some((alarm) => alarm.severity === "critical");
   const flight = row.airborne && row.altitude !== null ? `${named(t.states, row.state)} · ${height(row.altitude)}` : vehicle === "connecting" && !lost && row.state === "unknown" ? t.waking : named(t.states, row.state);
   return {

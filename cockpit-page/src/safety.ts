@@ -80,7 +80,7 @@ export class Safety {
 
   /** The drone stopped by its own button, by keys and by the gamepad; null: no drone to fly is visible. */
   aim(target: Target | null): void {
-    if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // that was meant for another one
+    if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // the hold was meant for another drone
     this.target = target;
     this.show();
   }
@@ -152,7 +152,7 @@ export class Safety {
   private shown_ms = 0;
 
   private show(): void {
-    if (!this.all) return; // while it is made
+    if (!this.all) return; // still being constructed
     const { target } = this;
     setHidden(this.own, target === null);
     setText(this.name, target?.name ?? "");

@@ -34,7 +34,7 @@ import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
 const PERIOD_MS = 50;
-const POINTS = 4096; // of the path, at most
+const POINTS = 4096; // maximum of the path
 
 const TURNS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"]);
 const NEARER: Readonly<Record<string, number>> = { Equal: 0.85, NumpadAdd: 0.85, Minus: 1.18, NumpadSubtract: 1.18 };
@@ -166,7 +166,7 @@ export class SceneView {
     }
     this.around = world && scenery(world);
     if (this.around) this.scene.add(this.around);
-    const own = this.bodies.get("own"); // its cameras may be others
+    const own = this.bodies.get("own"); // its cameras may have changed
     if (own) this.scene.remove(own);
     this.bodies.delete("own");
     this.grid.visible = !world?.room;

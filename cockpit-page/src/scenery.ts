@@ -22,8 +22,8 @@ import { colour } from "./dom.js";
 import type { Vector } from "./model.js";
 import type { CameraView, World } from "./surroundings.js";
 
-const OPEN_M = 20; // a safety box is drawn to here where it has no wall
-const SEEN_M = 1.2; // of a camera's field of view
+const OPEN_M = 20; // extent drawn for a missing wall of the safety box
+const SEEN_M = 1.2; // drawn length of a camera's field of view
 
 /** Everything that is fixed. */
 export function scenery(world: World): Group {

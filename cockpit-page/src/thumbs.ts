@@ -74,7 +74,7 @@ export class Thumbs {
 
   constructor() {
     const label = (): void => {
-      this.release(); // what a thumb held has another meaning now
+      this.release(); // a held stick has another meaning now
       for (const { place, stick } of this.sides) {
         const { x, y } = STICK_MODES[settings.get("mode")][place];
         stick.call(t.thumbs.label(t.thumbs.axes[y], t.thumbs.axes[x]));

@@ -29,7 +29,7 @@ export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
 }
 
 const AGAIN_MS = 1000;
-const ABOVE_GROUND_M = 1; // height of a place that is chosen before the take-off
+const ABOVE_GROUND_M = 1; // height of a place chosen before take-off
 
 export interface WaypointHost {
   /** The drone's position; null while unknown. */
@@ -128,7 +128,7 @@ export class WaypointTool implements MapTool {
     this.show();
     if (!place) return;
     const problem = await this.host.problem(place);
-    if (this.asked !== place) return; // another one is chosen by now
+    if (this.asked !== place) return; // another one has been chosen
     this.problem = problem;
     this.show();
   }

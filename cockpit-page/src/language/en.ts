@@ -218,7 +218,7 @@ export const en = {
   },
   battery: {
     label: "Battery",
-    unknown: "not known",
+    unknown: "unknown",
   },
   channels: {
     delayHead: "delay",
@@ -347,7 +347,7 @@ export const en = {
     horizonUnknown: "Artificial horizon: attitude unknown",
     attitudeUnknown: "attitude unknown",
     horizon: (tilt: string, heading: string) => `Artificial horizon: ${tilt}, heading ${heading}`,
-    notKnown: "not known",
+    notKnown: "unknown",
     label: "Instruments",
     links: "Links, from this page to the vehicle",
     page: "Page",
@@ -446,7 +446,7 @@ export const en = {
     gone: (name: string) => `${name} is gone; it reappears when it comes back`,
     nothingNew: (name: string) => `no new data about ${name}: what you see is old`,
     cockpitSilent: "the cockpit does not answer: your commands are not sent",
-    unknown: "not known",
+    unknown: "unknown",
     over: "recording over",
     was: (flight: string) => `was ${flight}`,
     recordingFlies: "A recording or a camera: nothing flies here.",
