@@ -95,7 +95,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
         assert time.monotonic() - stopped_s < 6.0
         page.until(lambda: float(page.says(".old b").split()[0]) > 2.0, "the age counts")
         assert "was hovering" in page.says(".pill")
-        assert "Not known" in page.says(".holder")
+        assert "Unknown" in page.says(".holder")
         assert "you had control" in page.says(".holder")
         assert page.pane.get_attribute("data-mine") == "false"
         for part in (".pane-body", ".holder", ".deeds", ".pill", ".battery"):

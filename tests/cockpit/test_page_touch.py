@@ -172,6 +172,6 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
         page.wait_for_text(".alarms", "battery critical")
         page.until(lambda: page.page.evaluate("felt.length") >= felt + 3, "felt again and again")
         drone.land()
-    page.page.get_by_role("button", name="Alarms' sound").tap()
+    page.page.get_by_role("button", name="Alarm sound").tap()
     assert page.page.evaluate("localStorage.getItem('skyloop-sound')") == "off"
     assert page.problems == []

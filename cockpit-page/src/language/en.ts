@@ -355,7 +355,7 @@ export const en = {
     proxy: "Proxy",
     vehicle: "Vehicle",
     noCommand: "No command yet",
-    unknownHolder: "Not known",
+    unknownHolder: "Unknown",
     youHad: "you had control",
     whoHas: "who has control",
     you: "You",
