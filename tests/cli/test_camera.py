@@ -73,7 +73,7 @@ def test_a_vehicle_without_a_board_is_reported(run: Run, tmp_path: Path) -> None
     pytest.importorskip("cv2", reason="the simulator draws with OpenCV")
     output = str(tmp_path / "camera.json")
     ended = run("camera", "calibrate", "sim://?world=empty&cameras=front&fps=20", "-o", output, "--seconds", "1")
-    assert "looking for a board of 7 × 5 squares for 1 s at most; Ctrl-C ends that earlier" in ended.err
+    assert "looking for a board of 7 × 5 squares for at most 1 s; Ctrl-C ends that earlier" in ended.err
     assert ended.code == 2
     assert "1 s are over" in ended.err
     assert "0 views of the board are too few" in ended.err

@@ -472,7 +472,7 @@ def test_without_a_terminal_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr("sys.stdin", nothing)
         ended = run("teleop", "alpha")
     assert ended.code == 2
-    assert "no terminal" in ended.err
+    assert "not a terminal" in ended.err
 
 
 class Terminal:
