@@ -17,7 +17,7 @@ from tests.support.commands import Run
     ("kind", "name", "advice"),
     [(Kind.ARDUCOPTER, "ArduCopter 4.7.0", "fs_gcs_enable 7"), (Kind.PX4, "PX4 1.17.0", "com_obl_rc_act 5")],
 )
-def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, advice: str) -> None:
+def test_disabled_safety_nets_are_reported(run: Run, kind: Kind, name: str, advice: str) -> None:
     host = SimHost(with_multirotors(SimOptions(world="empty", speed=3.0)))
     with MavlinkFirmware(host, kind=kind, ports=Ports.free(kind)) as firmware:
         ended = run("doctor", firmware.address)
@@ -49,7 +49,7 @@ def test_a_vehicle_that_has_not_been_looked_for_long_enough(run: Run, monkeypatc
     assert "✗ vehicle: its link is connecting" in ended.out
 
 
-def test_an_address_that_makes_no_sense(run: Run) -> None:
+def test_an_invalid_address(run: Run) -> None:
     ended = run("doctor", "mavlink://nowhere")
     assert ended.code == 2
     assert "udpin" in ended.err
