@@ -323,7 +323,7 @@ def test_a_second_program_that_takes_the_vehicle_keeps_it() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             lands = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_DO_SET_MODE, 0, 1, 9, 0, 0, 0, 0, 0)
             other.sendto(Codec(250, 190).encode(lands), ("127.0.0.1", it.settings.ports.udp))
-        assert sink.wait(lambda: any("went to LAND" in event.text for event in sink.events), PATIENCE_S)
+        assert sink.wait(lambda: any("changed to LAND" in event.text for event in sink.events), PATIENCE_S)
         with pytest.raises(DriverError, match="not chosen here"):
             driver.apply(Velocity(forward=0.3))
         assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, PATIENCE_S)

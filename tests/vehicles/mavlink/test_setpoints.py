@@ -307,7 +307,7 @@ def test_who_takes_it_over_on_the_way_up_keeps_it() -> None:
     bench.go_on(1.0)
     vehicle.mode = "POSCTL"
     bench.go_on(1.0)
-    assert any("went to POSCTL" in text for text in bench.texts)
+    assert any("changed to POSCTL" in text for text in bench.texts)
     bench.said.clear()
     bench.go_on(1.0)
     assert (bench.commands(), bench.heard_of(SET_POINT)) == ([], [])
