@@ -148,7 +148,7 @@ def test_answers_to_other_programs_are_not_ours() -> None:
     assert bench.session.commands.result(400, 0) == 4
 
 
-@pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "autopilot is number 0"), (3, 1, "no multirotor")])
+@pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "MAV_AUTOPILOT is 0"), (3, 1, "not a multirotor")])
 def test_what_can_not_be_flown_is_seen_and_refused_clearly(autopilot: int, kind: int, why: str) -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.vehicle.autopilot, bench.vehicle.kind = autopilot, kind
@@ -262,7 +262,7 @@ def test_an_autopilot_of_another_component_is_named_and_can_be_chosen() -> None:
     for _ in range(3):
         bench.hear(vehicle.heartbeat())
     assert [event.text for event in bench.sink.events] == [
-        "an autopilot answers as component 42 of system 1, not as component 1: it is ignored; ?component=42 chooses it"
+        "an autopilot answers as component 42 of system 1, not as component 1: ignored; ?component=42 chooses it"
     ]
     given = Bench(vehicle, options("mavlink://udpin:127.0.0.1:14540?parameters=no&component=42")).found()
     assert given.sink.link_state is LinkState.UP
