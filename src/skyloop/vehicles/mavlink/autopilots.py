@@ -268,9 +268,7 @@ class ArduCopterProfile(AutopilotProfile):
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
-            detail = (
-                f"it watches system {listens:g}, but this is system {own_system}: it won't notice our loss"
-            )
+            detail = f"it watches system {listens:g}, but this is system {own_system}: it won't notice our loss"
             diagnostics.append(Diagnostic("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
         return diagnostics
 

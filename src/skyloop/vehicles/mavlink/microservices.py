@@ -226,7 +226,7 @@ PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`: the vehicle may 
 TRIES: Final = 4
 
 
-LOOK_NS: Final = nanoseconds(0.2)  #: between checks of the rates, once everything was requested
+CHECK_NS: Final = nanoseconds(0.2)  #: between checks of the rates, once everything was requested
 
 
 class MessageIntervals:
@@ -235,11 +235,11 @@ class MessageIntervals:
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
         self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at the start, number of requests
-        self._look_ns = 0
+        self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
         """Request up to :data:`AT_ONCE` messages that are missing or too slow."""
-        if now_ns < self._look_ns:
+        if now_ns < self._check_ns:
             return
         left = AT_ONCE
         for name, rate_hz in self._rates.items():
@@ -258,7 +258,7 @@ class MessageIntervals:
             number = getattr(m, f"MAVLINK_MSG_ID_{name}")
             commands.request(VehicleCommand(m.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / rate_hz)), now_ns, 0.0)
             left -= 1
-        self._look_ns = now_ns + LOOK_NS
+        self._check_ns = now_ns + CHECK_NS
 
 
 ASK_NS: Final = nanoseconds(1.0)

@@ -221,7 +221,7 @@ class Codec:
         except dialect.MAVError:
             self.damaged += 1
             return []
-        except Exception:  # noise in a field broke the parser: restart with the next bytes
+        except Exception:  # noqa: BLE001  noise in a field broke the parser: restart with the next bytes
             self._receiver = self._fresh()
             self.damaged += 1
             return []
