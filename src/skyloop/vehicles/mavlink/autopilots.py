@@ -140,7 +140,7 @@ class AutopilotProfile(ABC):
     HOLDING: ClassVar[frozenset[str]]  #: modes that stay in place without set-points
     LANDING: ClassVar[frozenset[str]]
     TAKING_OFF: ClassVar[frozenset[str]]
-    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that need somebody at a remote control
+    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes flown by a remote control
     LEAD_S: ClassVar[float]  #: how long set-points must flow before GUIDED is entered
     BYTEWISE: ClassVar[bool]  #: encoding of parameter writes, unless its capabilities say otherwise
     EARTH_RADIUS_M: ClassVar[float]  #: of the sphere with which it converts latitude and longitude
@@ -365,7 +365,7 @@ class Px4Profile(AutopilotProfile):
         return None if estimator is None else bool(estimator.flags & (EKF_PLACE | EKF_RELATIVE_PLACE))
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the messages needed. The heartbeat's rate is fixed; the mode has a message of its own."""
+        """Return the messages needed. The heartbeat's rate is fixed; CURRENT_MODE is separate."""
         return {
             "ATTITUDE": rate_hz,
             "LOCAL_POSITION_NED": rate_hz,

@@ -193,14 +193,14 @@ class AttitudeSetpoint:
 Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
-PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off not requested for this long is given up if the vehicle is not armed
-RISING_NS: Final = nanoseconds(8.0)  #: an armed vehicle still on the ground after this long is given up
+PATIENCE_NS: Final = nanoseconds(6.0)  #: give up a take-off not requested for this long if the vehicle is not armed
+RISING_NS: Final = nanoseconds(8.0)  #: give up if an armed vehicle is still on the ground after this
 ARM_PACE_S: Final = 1.0
 ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledged arming counts without a heartbeat that confirms it
 LANDED_NS: Final = nanoseconds(2.5)  #: a landing has disarmed the vehicle by then, or never will: a PX4 does after 2 s
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3
-CUT_SHORT: Final = 0.5  #: somebody stopped a take-off that holds its position below this share of its height
+CUT_SHORT: Final = 0.5  #: another operator stopped a take-off that holds below this share of its height
 CUT_SHORT_M: Final = 1.05  #: and this far below it: a PX4 ends one NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for this long, as messages may overtake one another
 STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long was cancelled

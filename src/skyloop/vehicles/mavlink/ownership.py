@@ -1,4 +1,4 @@
-"""Who flies the vehicle: this program, another operator, or the vehicle's own failsafe. Pure.
+"""Ownership of the vehicle: this program, another operator, or the vehicle's own failsafe. Pure.
 
 A remote control, a ground station or the autopilot itself may change the mode. Skyloop leaves the vehicle in a mode
 that it did not choose; only a new action from an application takes the vehicle back.
@@ -21,10 +21,10 @@ _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
-    """Who flies the vehicle, judged by each reported mode and the modes requested here."""
+    """Ownership of the flight, judged by the reported modes and the modes requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
-        self.left_to = ""  #: a mode chosen elsewhere that flies the vehicle now; empty: we are in command, or nobody is
+        self.left_to = ""  #: a mode chosen elsewhere that flies the vehicle now; empty: ours, or without a pilot
         self._autopilot = autopilot
         self._by_itself = False  # its own failsafe chose the mode: the vehicle is still ours to hold and to land
         self._steering = False  # this flight was started or taken over here
@@ -49,10 +49,10 @@ class FlightOwnership:
         return not self._is_left_to_nobody(vehicle)
 
     def _is_left_to_nobody(self, vehicle: VehicleState) -> bool:
-        """Return whether its failsafe chose a mode that needs sticks: with nobody at them, the vehicle sinks."""
+        """Return whether its failsafe chose a mode that needs sticks that no pilot may hold, so that the vehicle sinks."""
         return vehicle.failsafe and vehicle.mode in self._autopilot.NEEDS_STICKS and not vehicle.remote
 
-    # What is decided here ----------------------------------------------------------------------------------------
+    # Decisions ---------------------------------------------------------------------------------------------------
 
     def check(self, action: AnyAction, now_ns: int, *, new: bool) -> None:
         """Refuse an action that would take the vehicle from another operator without a new decision to do so.
@@ -84,7 +84,7 @@ class FlightOwnership:
         Args:
             action: The accepted action.
             vehicle: The vehicle's state; None while nothing is received.
-            alone: Whether a failsafe requested it, with nobody in command.
+            alone: Whether a failsafe requested it, without a pilot in command.
             new: Whether an application newly requested it.
         """
         begins = not self._steering or not isinstance(action, _SET_POINTS)
@@ -100,7 +100,7 @@ class FlightOwnership:
         """Return whether a mode may be the late effect of our own command."""
         return now_ns - self._asked.get(mode, -LATE_NS) < LATE_NS
 
-    # What the vehicle reports ------------------------------------------------------------------------------------
+    # Reports of the vehicle --------------------------------------------------------------------------------------
 
     def on_mode(self, mode: str) -> None:
         """Record that the vehicle left the mode of the last decision: a return to it is another operator's choice."""
@@ -133,7 +133,7 @@ class FlightOwnership:
         self._from = ""
 
     def on_flight_over(self) -> None:
-        """Forget the flight: the vehicle is on the ground, and whoever flies it next starts over."""
+        """Forget the flight: the vehicle is on the ground, and its next pilot starts over."""
         self._steering, self._by_itself, self.left_to, self._from = False, False, "", ""
         self._foreign_ns, self._repeated = None, None
         self._asked.clear()

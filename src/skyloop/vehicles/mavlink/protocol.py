@@ -59,7 +59,7 @@ _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that carry the mode
 
-#: Safety commands: sent before all else, whatever is in progress.
+#: Safety commands: sent before everything else.
 _URGENT: Final = frozenset(
     {m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_NAV_TAKEOFF, m.MAV_CMD_NAV_LAND}
 )

@@ -1,6 +1,6 @@
 """Turn the last action into the messages due at each tick. Pure.
 
-Set-points are streamed while somebody is at the controls, and only in the mode that follows them. A failsafe, a lost
+Set-points are streamed while a pilot is at the controls, and only in the mode that follows them. A failsafe, a lost
 link or another operator's change of mode (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream: from then
 on only the vehicle's own safety nets fly it.
 """
@@ -106,11 +106,11 @@ class SetpointController:
         self._settling_ns: int | None = None  # when a take-off reached its height and began to wait for the next mode
         self._stepped_ns = 0  # time of the last step; 0: none yet
         self._arms_until_ns: int | None = None  # a take-off aborted by a landing may arm the vehicle until then
-        self._disarms_until_ns = 0  # a take-off that was given up or cut off may arm the vehicle until then
+        self._disarms_until_ns = 0  # a failed or cut-off take-off may arm the vehicle until then
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
-    # What is decided ---------------------------------------------------------------------------------------------
+    # Decisions ---------------------------------------------------------------------------------------------------
 
     def apply(
         self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
@@ -124,7 +124,7 @@ class SetpointController:
             action: The requested action.
             vehicle: The vehicle's state; None while nothing is received.
             now_ns: The present time.
-            alone: Whether a failsafe requested it, with nobody in command.
+            alone: Whether a failsafe requested it, without a pilot in command.
             new: Whether an application newly requested it; False for the library's repeats.
 
         Returns:
@@ -169,7 +169,7 @@ class SetpointController:
         return action
 
     def _others_fly(self, vehicle: VehicleState | None) -> bool:
-        """Return whether another operator flies the vehicle while nobody is at our controls."""
+        """Return whether another operator flies the vehicle while no pilot is at our controls."""
         if self.ownership.others:
             return True
         if vehicle is None or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
@@ -260,7 +260,7 @@ class SetpointController:
         self._arms_until_ns = None
         self._lead_ns, self._entered, self._strayed_ns, self._settling_ns = None, False, None, None
 
-    # What is reported -----------------------------------------------------------------------------------------------
+    # Reports --------------------------------------------------------------------------------------------------------
 
     def on_link_lost(self) -> None:
         """End the stream, which does not resume when the link returns; the vehicle must hold its position."""
@@ -273,7 +273,7 @@ class SetpointController:
             self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
             if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may be armed on the ground
                 self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
-        self._entered, self._strayed_ns = False, None  # mode changes while the link is down are nobody's decision
+        self._entered, self._strayed_ns = False, None  # mode changes while the link is down are no pilot's decision
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:
@@ -318,7 +318,7 @@ class SetpointController:
             else FlightState.HOVERING
         )
 
-    # What is sent ------------------------------------------------------------------------------------------------
+    # Messages ----------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
@@ -408,7 +408,7 @@ class SetpointController:
         return None
 
     def _flight_is_over(self) -> None:
-        """Forget the flight: whoever flies the vehicle next starts over."""
+        """Forget the flight: the vehicle's next pilot starts over."""
         self._end()
         self.ownership.on_flight_over()
 
@@ -431,7 +431,7 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm the vehicle after a take-off that was given up, or cut off by a lost link.
+        """Disarm the vehicle after a failed take-off or one cut off by a lost link.
 
         A vehicle that rises, or is in another mode, was armed by others.
         """

@@ -18,7 +18,7 @@ from skyloop.vehicles.mavlink.wire.codec import Message, Texts
 from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
 
 FLOWING_S: Final = 1.0  #: older attitude, position and velocity count as unknown
-SLOW_S: Final = 6.0  #: the same for battery, GPS and the like
+SLOW_S: Final = 6.0  #: the same for slow messages such as battery and GPS
 LANDED_S: Final = 3.0
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
@@ -113,7 +113,7 @@ class Telemetry:
         newest = self._newest
         return {name: round(seconds(now_ns - newest[kind][1]), 3) for kind, name in _AGED.items() if kind in newest}
 
-    # What it means -----------------------------------------------------------------------------------------------
+    # Meaning -----------------------------------------------------------------------------------------------------
 
     def custom_mode(self) -> int | None:
         """Return the mode number from the newest message that has one."""

@@ -223,9 +223,7 @@ class TransportStream:
         self._stream.pix_fmt = "yuv420p"
         self._stream.bit_rate = _SETTINGS.bitrate_kbps * 1000
         self._stream.gop_size = GROUP
-        self._stream.time_base = self._stream.codec_context.time_base = (
-            _CLOCK  # finer than two images are apart
-        )
+        self._stream.time_base = self._stream.codec_context.time_base = _CLOCK  # finer than the frame interval
         self._begun_ns: int | None = None
         self._stamp = -1
 

@@ -61,7 +61,7 @@ class Target:
     yaw_rate: float = 0.0
 
     def follow(self, flight: FlightControl, speeds: Speeds = USUAL, turn: float | None = None) -> None:
-        """Fly it, with a yaw rate [rad/s] instead of its own if one is given. Called at every tick."""
+        """Fly it, with ``turn`` [rad/s] as yaw rate if given. Called at every tick."""
         if turn is None:
             turn = self.yaw_rate if self.yaw is None else flight.yaw_rate_to(self.yaw)
         if self.velocity is not None and self.place is None:

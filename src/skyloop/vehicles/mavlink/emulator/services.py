@@ -54,7 +54,7 @@ def mission_ack(message: Message, result: int) -> Message:
 
 
 class Mission:
-    """A mission as ArduCopter stores it: item 0 is always home, whatever is uploaded.
+    """A mission as ArduCopter stores it: item 0 is always home, even after an upload.
 
     Attributes:
         current: The number of the next item to fly.
