@@ -31,7 +31,7 @@ def test_a_fault_that_ends_when_sticks_arrive_is_not_reported(run: Run) -> None:
     with BetaflightFirmware(world(), port=0) as firmware:
         ended = run("doctor", firmware.address)
     assert ended.code == 0, ended.out
-    assert "✓ arming: it reports nothing that keeps it from being armed" in ended.out
+    assert "✓ arming: it reports nothing that prevents arming" in ended.out
     assert "RXLOSS" not in ended.out
 
 

@@ -139,8 +139,8 @@ def test_inav_that_does_nothing_is_refused() -> None:
     assert str(inav) == "INAV 8.0.0 on MATEKF405"
     unknown = Setup(inav, BOXES, setup.ranges, receiver_is_msp=False)
     told = hindrances(unknown.diagnose(override=False))
-    assert "sticks do not come by MSP" in told
-    assert "failsafe is not known" in told
+    assert "sticks do not arrive by MSP" in told
+    assert "failsafe is unknown" in told
 
 
 def test_charge() -> None:

@@ -257,8 +257,8 @@ def test_what_appears_while_it_arms_is_told_by_name() -> None:
     [
         (BoardSettings(ranges=(ModeRange(1, 1, 900, 2100),)), "no AUX channel arms it"),
         (BoardSettings(ranges=(ModeRange(0, 0, 1700, 2100),)), "no AUX channel switches ANGLE mode on"),
-        (BoardSettings(rx_msp=False), "sticks do not come by MSP"),
-        (BoardSettings(on_loss=()), "before its failsafe, is not known"),
+        (BoardSettings(rx_msp=False), "sticks do not arrive by MSP"),
+        (BoardSettings(on_loss=()), "before the failsafe is unknown"),
         (BoardSettings(on_loss=((OnLoss.HOLD, 1500),) * 18), "holds the last roll, pitch, yaw, throttle"),
     ],
 )
@@ -743,7 +743,7 @@ def test_override_needs_its_switch_and_a_receiver() -> None:
     bench = Bench(text=OVERRIDE)
     bench.run(1.0)
     told = " ".join(bench.texts("setup"))
-    assert "no switch gives the sticks away" in told
+    assert "no switch hands over the sticks" in told
     assert "there is no pilot's" in told
     assert "holds the last sticks for ever" in told
     with pytest.raises(DriverError, match="no switch gives"):
