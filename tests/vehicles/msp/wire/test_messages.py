@@ -65,7 +65,7 @@ def test_settings_of_a_real_one() -> None:
     assert failsafe == msp.FailsafeConfig(1.5, 60.0, 1000, 10.0, 1)
     assert failsafe.encode() == FAILSAFE
     assert msp.rx_map(bytes((0, 1, 3, 2, 4, 5, 6, 7))) == msp.USUAL_MAP
-    with pytest.raises(DecodeError, match="does not say where the sticks are"):
+    with pytest.raises(DecodeError, match="does not contain the sticks"):
         msp.rx_map(bytes((0, 1, 3, 3)))
     assert msp.angle_limit_deg(PID_ADVANCED) == 60
     assert msp.box_names(b"ARM;ANGLE;AIR MODE;") == ["ARM", "ANGLE", "AIR MODE"]
