@@ -119,7 +119,7 @@ def test_an_error_of_our_own_is_told_in_words(flight: Path, monkeypatch: pytest.
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, WAIT_S)
         (event,) = [event for event in sink.events if event.severity is Severity.ERROR]
     assert event.text == sink.links[-1][1]
-    assert "can't be played beyond 0.0 s: an error in Skyloop, which the proxy's output has" in event.text
+    assert "can't be played beyond 0.0 s: an error in Skyloop (see the proxy's output)" in event.text
 
 
 def test_events_of_the_old_proxy_are_no_news_of_the_new_one(flight: Path) -> None:
@@ -331,7 +331,7 @@ def test_what_can_not_be_played_says_so(flight: Path, tmp_path: Path) -> None:
         missing.open(RecordingSink())
     with pytest.raises(UnknownNameError, match="drone"):
         driver_of(flight, "?drone=beta").open(RecordingSink())
-    with pytest.raises(UsageError, match=r"lasts 2\.0 s, and start is 7 s"):
+    with pytest.raises(UsageError, match=r"lasts 2\.0 s, but start is 7 s"):
         driver_of(flight, "?start=7").open(RecordingSink())
     with pytest.raises(UsageError, match=r"in step with one application: call skyloop\.connect"):
         driver_of(flight, "?speed=max").open(RecordingSink())

@@ -371,7 +371,7 @@ def test_a_stream_without_a_key_frame_shows_nothing_and_says_so(tmp_path: Path) 
     path.write_bytes(torn[:7431])  # the stale frame and the two P frames after it
     sink = play(f"video://{path}?{FAST}")
     assert not sink.frame_counts
-    assert sink.links[-1] == (LinkState.LOST, "no picture of the recording can be decoded")
+    assert sink.links[-1] == (LinkState.LOST, "no image of the recording can be decoded")
 
 
 # Devices ---------------------------------------------------------------------------------------------------------
@@ -436,8 +436,8 @@ def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and
 @pytest.mark.parametrize(
     ("uri", "message"),
     [
-        ("video:///dev/video0?loop=1", "a live camera has no loop and no speed"),
-        ("video:///dev/video0?speed=2", "a live camera has no loop and no speed"),
+        ("video:///dev/video0?loop=1", "loop and speed are for files, not live cameras"),
+        ("video:///dev/video0?speed=2", "loop and speed are for files, not live cameras"),
         ("video:///tmp/x.mp4?gain=3", "only a device has gain"),
         ("video://rtp://:5600?format=mjpeg", "only a device has format"),
         ("video:///dev/video0?format=png", "format of video:// named 'png'"),

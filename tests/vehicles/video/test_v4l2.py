@@ -104,7 +104,7 @@ def test_formats_sizes_and_rates_are_listed(webcam: Webcam) -> None:
         "format=mjpeg: 1280x720 at 30, 15; 640x480 at 29.97",
         "format=yuyv: 640x480 at 10",
         "BGR3 (BGR): 32x24 to 1920x1080 at 60, 5",
-        "BGR3 (BGR, big-endian): sizes not known",
+        "BGR3 (BGR, big-endian): unknown sizes",
     ]
 
 
@@ -143,7 +143,7 @@ def test_what_a_camera_refuses_is_told_with_its_range(webcam: Webcam) -> None:
     webcam.ranges.clear()
     assert device.set_exposure(10.0) == "the camera's exposure can't be set"
     assert device.set_gain(3) == "the camera's gain can't be set"
-    assert "no automatic exposure: the camera has no such setting" in device.set_exposure(None)
+    assert "no automatic exposure: the camera does not support this setting" in device.set_exposure(None)
     assert "no automatic gain" in device.set_gain(None)
 
 
@@ -184,4 +184,4 @@ def test_a_listing_of_what_can_not_be_opened_says_why(webcam: Webcam, tmp_path: 
     device = CameraDevice(tmp_path / "video0", "Webcam", True)
     assert listed(device)[1] == f"  can't be opened: {os.strerror(errno.ENOTTY)}"
     webcam.capabilities = 0, 0
-    assert listed(device, lambda _descriptor, *asked: webcam(7, *asked))[1] == "  gives no pictures"
+    assert listed(device, lambda _descriptor, *asked: webcam(7, *asked))[1] == "  captures no images"

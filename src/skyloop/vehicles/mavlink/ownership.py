@@ -49,7 +49,7 @@ class FlightOwnership:
         return not self._is_left_to_nobody(vehicle)
 
     def _is_left_to_nobody(self, vehicle: VehicleState) -> bool:
-        """Return whether its failsafe chose a mode that needs sticks that no pilot may hold, so that the vehicle sinks."""
+        """Return whether its failsafe chose a mode that sinks without a pilot at the sticks."""
         return vehicle.failsafe and vehicle.mode in self._autopilot.NEEDS_STICKS and not vehicle.remote
 
     # Decisions ---------------------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ PASSING: Final = frozenset(
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precise or not
 LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from a sufficient throttle to a visible lift-off, by precise or not
 OTHER: Final = 0.15  #: share by which the learnt throttle may differ from the one at lift-off
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a descent stalled for this long has met something
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a stalled descent has met something by then
 HEADWAY: Final = 0.4  #: share of the requested descent
 STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means not on the ground, by precise or not
 #: Time constant of the climb and height behind lift-off and touch-down [s]. It reduces noise of 0.2 m/s (UWB) to
