@@ -69,9 +69,9 @@ def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
     served.add("alpha")
     with pytest.raises(UsageError, match="did you mean 'alpha'"):
         ask("host", Remove("alpa"))
-    with pytest.raises(UsageError, match="runs already"):
+    with pytest.raises(UsageError, match="is already running"):
         ask("host", AddNamed("alpha"))
-    with pytest.raises(NameTakenError, match="has a vehicle named 'alpha' already"):
+    with pytest.raises(NameTakenError, match="already has a vehicle named 'alpha'"):
         ask("host", AddNamed("alpha", "fake://alpha"))
     with pytest.raises(UsageError, match="lower-case"):
         ask("host", AddNamed("Al Pha", "fake://alpha"))

@@ -64,7 +64,7 @@ def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses
 
 
 def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_process, "SILENT_LOOKS", 2)
+    monkeypatch.setattr(own_process, "SILENT_CHECKS", 2)
     monkeypatch.setattr("skyloop.child_process._LOOK_S", 0.05)
     lines: list[str] = []
     hung = vehicle("say(); time.sleep(60)", lines)

@@ -9,11 +9,11 @@ from typing import cast
 
 from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
 from skyloop.host.threads import (
-    HANG_LOOKS,
+    HANG_CHECKS,
     IDLE_THREADS,
-    LOOK_S,
+    CHECK_S,
     MAX_THREADS,
-    STALL_LOOKS,
+    STALL_CHECKS,
     WHOLE_ROUNDS,
     RequestWorkers,
     SharedLoop,
@@ -48,34 +48,34 @@ class Watched:
             lambda _, inside: self.stalls.append(inside),
             lambda _, inside: self.hangs.append(inside),
         )
-        self.look(2)
+        self.check(2)
 
-    def look(self, times: int = 1, apart_s: float = LOOK_S) -> None:
+    def check(self, times: int = 1, apart_s: float = CHECK_S) -> None:
         for _ in range(times):
             self.now_s += apart_s
-            self.watchdog.look(self.now_s)
+            self.watchdog.check(self.now_s)
 
 
 def test_a_call_that_does_not_return_is_noticed_twice() -> None:
     watched = Watched()
     watched.loop.inside, watched.loop.entries = "x", 7
-    watched.look(STALL_LOOKS)
+    watched.check(STALL_CHECKS)
     assert watched.stalls == []
-    watched.look()
+    watched.check()
     assert watched.stalls == ["x"]
-    watched.look(HANG_LOOKS - STALL_LOOKS - 1)
+    watched.check(HANG_CHECKS - STALL_CHECKS - 1)
     assert watched.hangs == []
-    watched.look(5)
+    watched.check(5)
     assert (watched.stalls, watched.hangs) == (["x"], ["x"])
 
 
 def test_calls_that_return_are_no_stall_however_many_there_are() -> None:
     watched = Watched()
-    for number in range(3 * HANG_LOOKS):
+    for number in range(3 * HANG_CHECKS):
         watched.loop.inside, watched.loop.entries = "x", number
-        watched.look()
+        watched.check()
     watched.loop.inside = None
-    watched.look(3 * HANG_LOOKS)
+    watched.check(3 * HANG_CHECKS)
     assert watched.stalls == watched.hangs == []
 
 
@@ -83,7 +83,7 @@ def test_a_process_that_stood_still_has_no_stall() -> None:
     """It looks late: the loop had no more time than the watchdog."""
     watched = Watched()
     watched.loop.inside, watched.loop.entries = "x", 1
-    watched.look(3 * HANG_LOOKS, apart_s=10.0)
+    watched.check(3 * HANG_CHECKS, apart_s=10.0)
     assert watched.stalls == watched.hangs == []
 
 
@@ -91,7 +91,7 @@ def test_each_call_that_stalls_is_noticed() -> None:
     watched = Watched()
     for number, inside in enumerate("xy"):
         watched.loop.inside, watched.loop.entries = inside, number + 1
-        watched.look(STALL_LOOKS + 2)
+        watched.check(STALL_CHECKS + 2)
     assert watched.stalls == ["x", "y"]
 
 
@@ -103,8 +103,8 @@ def test_what_is_done_about_a_stall_may_fail() -> None:
         raise RuntimeError("on purpose")
 
     watchdog = Watchdog(lambda: [loop], fail, lambda _, inside: hangs.append(inside))
-    for number in range(HANG_LOOKS + 5):
-        watchdog.look(1.0 + number * LOOK_S)
+    for number in range(HANG_CHECKS + 5):
+        watchdog.check(1.0 + number * CHECK_S)
     assert hangs == ["x"]
 
 
