@@ -9,9 +9,9 @@ from typing import cast
 
 from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
 from skyloop.host.threads import (
+    CHECK_S,
     HANG_CHECKS,
     IDLE_THREADS,
-    CHECK_S,
     MAX_THREADS,
     STALL_CHECKS,
     WHOLE_ROUNDS,

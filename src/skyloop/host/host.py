@@ -19,7 +19,7 @@ from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNa
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.threads import HANG_CHECKS, CHECK_S, STALL_CHECKS, RequestWorkers, SharedLoop, Ticker, Watchdog
+from skyloop.host.threads import CHECK_S, HANG_CHECKS, STALL_CHECKS, RequestWorkers, SharedLoop, Ticker, Watchdog
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
