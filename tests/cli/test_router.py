@@ -31,7 +31,7 @@ def test_addresses_that_are_none_are_told(run: Run) -> None:
     ):
         ended = run(*words)
         assert ended.code == 2
-        assert "is no network address" in ended.err
+        assert "is not a network address" in ended.err
 
 
 @pytest.mark.parametrize(

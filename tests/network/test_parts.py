@@ -213,7 +213,7 @@ def test_an_address_stands_for_two_links_without_keys_and_one_with() -> None:
 
 @pytest.mark.parametrize("address", ["", ":1", "host:", "host:x", "host:70000", "::1", "[::1", "a:b:1"])
 def test_what_is_no_address(address: str) -> None:
-    with pytest.raises(UsageError, match="is no network address"):
+    with pytest.raises(UsageError, match="is not a network address"):
         config.endpoints_of([address], FabricSettings())
 
 
@@ -278,7 +278,7 @@ def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     assert config.choose("10.0.0.5,multicast") == FabricSettings(connect=("10.0.0.5",))
     given_ = FabricSettings(connect=("1.2.3.4",))
     assert config.choose(given_) is given_
-    with pytest.raises(UsageError, match="is no network address"):
+    with pytest.raises(UsageError, match="is not a network address"):
         config.choose("10.0.0.5:port")
 
 
