@@ -139,7 +139,7 @@ def test_a_handler_that_raises_on_a_refusal_leaves_the_applications_heard(
 def test_an_application_that_takes_nothing_is_let_go_and_counted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ServerConnection, "stalled_s", lambda _connection, _now: STALLED_S + 1.0)
     wait_until(lambda: scene.log.left, "it is let go")
-    assert "it took nothing of what was sent to it for 3 s" in str(scene.log.left)
+    assert "it acknowledged nothing for 3 s" in str(scene.log.left)
     assert scene.server.counters["network.dropped"] == 1
 
 

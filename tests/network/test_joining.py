@@ -48,7 +48,7 @@ def test_what_does_not_come_from_the_proxy_that_is_meant_is_passed_over() -> Non
 
 def test_a_refusal_is_told_with_its_reason() -> None:
     refused = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"it is full")), ok=None)
-    with pytest.raises(LinkError, match="does not let us in: it is full"):
+    with pytest.raises(LinkError, match="does not admit us: it is full"):
         join(session(refused), "alpha", RUN, layout.new_id())
 
 
@@ -65,7 +65,7 @@ def test_somebody_who_answers_in_its_place_is_named_as_that(monkeypatch: pytest.
         raise LinkError("its proof is wrong")
 
     monkeypatch.setattr(JoinRequest, "accept", accept)
-    with pytest.raises(LinkError, match="who answers as the proxy 'alpha' is not it: its proof is wrong"):
+    with pytest.raises(LinkError, match="an impostor answers as the proxy 'alpha': its proof is wrong"):
         join(session(welcome(RUN)), "alpha", RUN, layout.new_id())
 
 

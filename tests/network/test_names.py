@@ -120,7 +120,7 @@ def test_a_proxy_that_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
         dialer: Dialer = dial("alpha", calling(at))
         client = dialer(ClientLog())
         wait_until(lambda: log.joined, "the first is in")
-        with pytest.raises(LinkError, match="already has 1 of at most"):
+        with pytest.raises(LinkError, match="already has its maximum of 1 connections"):
             dialer(ClientLog())
         client.close()
         wait_until(lambda: log.left, "it left")

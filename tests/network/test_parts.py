@@ -459,7 +459,7 @@ def test_the_end_of_the_process_waits_for_a_session_that_is_being_closed(monkeyp
     may_end.set()
     ending.join(10.0)
     assert not ending.is_alive()
-    with pytest.raises(LinkError, match="process is ending"):
+    with pytest.raises(LinkError, match="process is exiting"):
         pool.acquire(FabricSettings(), Part.APP)
 
 

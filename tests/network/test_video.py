@@ -134,7 +134,7 @@ def test_without_what_encodes_frames_go_as_they_are_and_that_is_said_once(
         network.sends(seq + 1)
         assert network.headers[-1].encoding is Encoding.BGR8
         network.video.taken("a", JPEG, network.numbers[-1])
-    assert len([record for record in caplog.records if "is sent as it is" in record.getMessage()]) == 1
+    assert len([record for record in caplog.records if "is sent unencoded" in record.getMessage()]) == 1
 
 
 def test_a_send_that_fails_costs_one_frame(caplog: pytest.LogCaptureFixture) -> None:
