@@ -24,7 +24,7 @@ PER_KEY: Final = 64
 FOR_PILOTS: Final = 64
 #: Tokens remembered per key: a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
-#: Without keys all have the same name, and applications can't be told from a flood.
+#: Without keys all have the same name, and a flood looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 

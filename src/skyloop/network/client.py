@@ -388,7 +388,7 @@ class FabricClient(TransportClient):
     # --- keys ---
 
     def _check_keys(self) -> None:
-        """End the connection if a newer roster excludes the proxy or a node in between. On the receiving thread."""
+        """End the connection if a newer roster excludes the proxy or a linked node. On the receiving thread."""
         ring, proxy, expires = self._ring, self._admission.identity, self._admission.expires
         now_s = time.monotonic()
         if ring is None or proxy is None or now_s < self._keys_s:

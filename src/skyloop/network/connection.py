@@ -220,7 +220,7 @@ class Publisher:
         self._run = bytes.fromhex(run)
         self._sealer = sealer
         self._clock = clock
-        self.held_back = 0  #: packets skipped because no subscriber was heard
+        self.held_back = 0  #: packets skipped because all subscribers were silent
         self._lock = threading.RLock()  # guards what follows
         self._session: Session | None = None  # while it may publish
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}

@@ -1,4 +1,4 @@
-"""End-to-end sealed packets: nobody between a proxy and its applications can read, change or repeat them.
+"""End-to-end sealed packets: no node between a proxy and its applications can read, change or repeat them.
 
 The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
 Without keys nothing is sealed. ``docs/wire-format.md`` has the bytes.
@@ -28,7 +28,7 @@ TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
 #: How late a packet may arrive: datagrams overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
-GENERATIONS: Final = 3  #: topic keys that an application keeps: the present one, the next one, and one in between
+GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the pending one, and one more
 #: A new topic key is used this long after it was sent, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 

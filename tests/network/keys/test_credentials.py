@@ -66,7 +66,7 @@ def _sign_away(folder: Path) -> None:
         (lambda mine, _: shutil.rmtree(mine), UsageError, "there is no folder"),
         (lambda mine, _: (mine / "identity.key").unlink(), UsageError, "the private key .* can't be read"),
         (lambda mine, _: (mine / "identity.key").chmod(0o644), UsageError, "open to others .mode 0644.*chmod 600"),
-        (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "no unencrypted private key"),
+        (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "not an unencrypted private key"),
         (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "another kind"),
         (
             lambda mine, other: shutil.copy(other / "identity.key", mine),
@@ -74,7 +74,7 @@ def _sign_away(folder: Path) -> None:
             "does not belong to the certificate",
         ),
         (lambda mine, _: (mine / "identity.pem").unlink(), UsageError, "the certificate .* can't be read"),
-        (lambda mine, _: (mine / "identity.pem").write_bytes(b"\xff"), FileFormatError, "no certificate in PEM form"),
+        (lambda mine, _: (mine / "identity.pem").write_bytes(b"\xff"), FileFormatError, "not a certificate in PEM form"),
         (lambda mine, _: (mine / "ca.pem").write_bytes(b"-----BEGIN"), FileFormatError, "ca.pem is no certificate"),
         (
             lambda mine, _: shutil.copy(mine / "identity.pem", mine / "ca.pem"),

@@ -160,7 +160,7 @@ def test_an_authority_whose_files_are_damaged_or_mixed_up_is_told(lab: Lab, jane
     with pytest.raises(FileFormatError, match="not the certificate of an authority"):
         Lab.open(lab.directory)
     authority.write_bytes(b"rubbish")
-    with pytest.raises(FileFormatError, match="no certificate in PEM form"):
+    with pytest.raises(FileFormatError, match="not a certificate in PEM form"):
         Lab.open(lab.directory)
     authority.unlink()
     with pytest.raises(UsageError, match="can't be read"):
