@@ -79,7 +79,7 @@ def test_what_ends_within_a_week_is_told(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["init"], "has an authority already"),
+        (["init"], "already has an authority"),
         (["issue", "Jane", "--role", "pilot"], "cannot be the name of a key"),
         (["issue", "jane", "--role", "captain"], "pilot, observer, proxy, router"),
         (["issue", "jane", "--role", "pilot", "--drones", "a/b"], "names no drones"),

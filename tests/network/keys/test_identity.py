@@ -25,7 +25,7 @@ NAMES = st.from_regex(NAME, fullmatch=True)
         ("jane/x", "pilot", "*", "cannot be the name of a key"),
         ("j*", "pilot", "*", "cannot be the name of a key"),
         ("a" * 49, "pilot", "*", "1 to 48"),
-        ("anyone", "pilot", "*", "who has none"),
+        ("anyone", "pilot", "*", "who have no key"),
         ("jane", "captain", "*", "pilot, observer, proxy, router"),
         ("jane", "pilot", "", "names no drones"),
         ("jane", "pilot", "alpha,", "names no drones"),
@@ -34,7 +34,7 @@ NAMES = st.from_regex(NAME, fullmatch=True)
         ("jane", "pilot", ".alpha", "names no drones"),
         ("jane", "pilot", "Alpha", "names no drones"),
         ("jane", "pilot", ",".join(f"d{n}" for n in range(MAX_PATTERNS + 1)), "too many"),
-        ("hub", "router", "alpha", "leave out which"),
+        ("hub", "router", "alpha", "leave out the drones"),
     ],
 )
 def test_what_makes_no_identity_is_told_with_what_would(name: str, role: str, drones: str, words: str) -> None:

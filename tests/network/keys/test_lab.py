@@ -111,7 +111,7 @@ def test_revoking_what_is_not_there_or_was_revoked_is_refused(lab: Lab, jane: Pa
 
 
 def test_a_second_authority_in_one_folder_is_refused(lab: Lab) -> None:
-    with pytest.raises(UsageError, match="has an authority already"):
+    with pytest.raises(UsageError, match="already has an authority"):
         Lab.make(lab.directory, now=NOW)
 
 

@@ -69,7 +69,7 @@ def test_a_damaged_or_older_roster_changes_nothing(ring: KeyRing, lab: Lab, tmp_
     ring.poll(NOW)
     mine.write_bytes(newer[:50])
     (news,) = ring.poll(NOW)
-    assert "is no roster" in news
+    assert "is not a roster" in news
     assert "stays in force" in news
     assert ring.poll(NOW) == []
     mine.write_bytes(good)
