@@ -28,7 +28,7 @@ TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
 #: How late a packet may arrive: datagrams overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
-GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the pending one, and one more
+GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
 #: A new topic key is used this long after it was sent, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 

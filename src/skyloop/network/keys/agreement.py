@@ -3,7 +3,7 @@
 A link's certificates show the neighbour on that *link*, which may be a router. So the two ends of a connection also
 show theirs to each other, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each signs a fresh X25519
 share together with the terms of the connection, and the proxy also the application's whole message. The secrets,
-unknown to anybody in between, are derived from both shares and the transcript (HKDF-SHA256). Hence recorded messages
+unknown to any router, are derived from both shares and the transcript (HKDF-SHA256). Hence recorded messages
 open nothing, and a key that is lost later opens no earlier recording.
 """
 
