@@ -81,7 +81,7 @@ def test_a_driver_that_blocks_for_a_moment_goes_on_beside_the_others(hosting: Ho
     with Flight(hosting, "good") as flight:
         slow.hangs = {"velocity"}
         pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
-        wait_until(lambda: any("has blocked" in line for line in hosting.lines), "it was noticed")
+        wait_until(lambda: any("has been blocking" in line for line in hosting.lines), "it was noticed")
         slow.hangs = set()
         slow.let_go.set()
         pilot.sync()
@@ -345,6 +345,6 @@ def test_a_vehicle_that_blocks_again_and_again_keeps_its_one_loop(hosting: Hosti
         host._on_stall(loops[0], proxy)
         counts.append(len(host._loops))
     assert counts == [4] * 5
-    assert sum("has blocked" in line for line in hosting.lines) == 1
+    assert sum("has been blocking" in line for line in hosting.lines) == 1
     host.remove("alpha")
     assert len(host._loops) == 3, "what was its own is closed with it"

@@ -67,7 +67,7 @@ def _sign_away(folder: Path) -> None:
         (lambda mine, _: (mine / "identity.key").unlink(), UsageError, "the private key .* can't be read"),
         (lambda mine, _: (mine / "identity.key").chmod(0o644), UsageError, "open to others .mode 0644.*chmod 600"),
         (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "not an unencrypted private key"),
-        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "another kind"),
+        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "not a key as made by"),
         (
             lambda mine, other: shutil.copy(other / "identity.key", mine),
             UsageError,

@@ -646,7 +646,7 @@ def test_what_can_not_be_flown_is_not_flown_in_the_place_of_another() -> None:
     bench.go_on(3.0, silent=True)
     bench.vehicle.kind = 1  # a plane
     bench.found()
-    with pytest.raises(DriverError, match="no multirotor"):
+    with pytest.raises(DriverError, match="not a multirotor"):
         bench.apply(Hover())
 
 
@@ -852,7 +852,7 @@ def test_what_can_not_be_encoded_keeps_no_stop_back() -> None:
     assert [each.param2 for each in bench.heard_of("COMMAND_LONG")] == [21196.0]
     bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
     bench.tick()
-    assert sum("ODOMETRY is not sent" in text for text in bench.texts) == 1, "told once"
+    assert sum("ODOMETRY was not sent" in text for text in bench.texts) == 1, "told once"
 
 
 def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:

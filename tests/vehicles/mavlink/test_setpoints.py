@@ -119,7 +119,7 @@ def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here(
     vehicle.mode = "OFFBOARD"
     bench.go_on(0.3)
     assert bench.state() is FlightState.HOVERING
-    assert [text for text in bench.texts if "not from here" in text] == []
+    assert [text for text in bench.texts if "not chosen here" in text] == []
 
 
 def just_landed(autopilot: int) -> Bench:
@@ -663,7 +663,7 @@ def test_what_somebody_else_flies_is_neither_held_nor_landed(autopilot: int, mod
     assert bench.heard_of(SET_POINT) == []
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.ownership.others == other_mode(autopilot, mode)
-    assert [text for text in bench.texts if "not from here" in text] != []
+    assert [text for text in bench.texts if "not chosen here" in text] != []
 
 
 @AUTOPILOTS
@@ -681,7 +681,7 @@ def test_a_mode_that_somebody_chooses_while_the_vehicle_holds_its_place_is_left(
     assert bench.apply(Land(), alone=True) == Idle()
     bench.go_on(1.0)
     assert bench.commands() == []
-    assert any("not from here" in text for text in bench.texts)
+    assert any("not chosen here" in text for text in bench.texts)
 
 
 @AUTOPILOTS
@@ -778,7 +778,7 @@ def test_a_mode_that_somebody_chooses_before_it_leaves_the_ground_stays(autopilo
     bench.commands()
     bench.go_on(4.0)
     assert bench.commands() == []
-    assert any("not from here" in text for text in bench.texts)
+    assert any("not chosen here" in text for text in bench.texts)
 
 
 def test_what_others_armed_is_not_disarmed_when_a_take_off_is_given_up() -> None:

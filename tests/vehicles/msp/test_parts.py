@@ -303,7 +303,7 @@ def test_a_pilot_gives_the_sticks_away_and_takes_them_back() -> None:
     setpoints.on_report(Report(armed=True), 2)
     assert setpoints.left_to == "RECEIVER"
     assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
-    with pytest.raises(DriverError, match="by the pilot's receiver"):
+    with pytest.raises(DriverError, match="at the pilot's receiver"):
         setpoints.apply(Attitude(climb=0.5), 3)
 
 

@@ -314,7 +314,7 @@ def test_capabilities(flight: Path, tmp_path: Path) -> None:
         ("?speed=0", "speed"),
         ("?speed=fast", "speed"),
         ("?start=-1", "start"),
-        ("?speed=max&loop=1", "neither with loop"),
+        ("?speed=max&loop=1", "combined with loop"),
     ],
 )
 def test_options_that_make_no_sense(flight: Path, query: str, words: str) -> None:
