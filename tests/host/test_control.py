@@ -87,7 +87,7 @@ def test_garbage_and_callers_who_ask_nothing_do_no_harm(served: Hosting) -> None
         if packet:
             sock.send(packet)
             answer = msgspec.json.decode(sock.recv(1 << 16), type=Answer)
-            assert "not understood" in answer.error
+            assert "malformed request" in answer.error
         sock.hang_up()
     assert ask("host", Status()).vehicles == ()
 

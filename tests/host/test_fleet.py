@@ -94,7 +94,7 @@ def test_an_empty_file_is_a_host_to_which_vehicles_are_added() -> None:
         ("[defaults]\nname = 'x'", ["[defaults]", "'name'", "unknown key"]),
         (
             "".join(f'[[vehicle]]\nname = "{name}"\naddress = "tello://192.168.10.1"\n' for name in "ab"),
-            ["vehicle 'b'", "'address'", "address of 'a' too"],
+            ["vehicle 'b'", "'address'", "also the address of 'a'"],
         ),
         ("[[vehicle", ["not valid TOML"]),
     ],

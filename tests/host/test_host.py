@@ -243,7 +243,7 @@ def test_all_land_at_the_end_though_one_hangs(hosting: Hosting) -> None:
         wait_until(partial(hosting.drivers[name].told.__contains__, Land()), "it lands")
     landing.join(20.0)
     assert not landing.is_alive(), "it must not wait for the one that hangs once that is given up"
-    with pytest.raises(RefusedError, match="ending"):
+    with pytest.raises(RefusedError, match="shutting down"):
         hosting.add("late")
 
 

@@ -154,8 +154,8 @@ class Host:
         status = vehicle.status()
         if status.airborne and status.pilot is not None and not land:
             raise RefusedError(
-                f"{name} is flying, and {status.pilot} has authority: let {status.pilot} land it, or land and remove "
-                f"it anyway: skyloop host remove {name} --land",
+                f"{name} is flying, and {status.pilot} has the authority: let {status.pilot} land it, or land and "
+                f"remove it anyway: skyloop host remove {name} --land",
                 code="flown",
             )
         proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
