@@ -991,7 +991,7 @@ def test_a_vehicle_armed_by_a_take_off_that_a_lost_link_cut_off_is_disarmed(
 @AUTOPILOTS
 @pytest.mark.parametrize("switched", [True, False])
 def test_an_operator_who_flies_it_right_after_a_failed_take_off_keeps_it(autopilot: int, switched: bool) -> None:
-    """A safety pilot took over a vehicle that had not started, and landings were sent twice a second all flight long."""
+    """A safety pilot took over a vehicle that had not started, and got landings twice a second all flight long."""
     bench = arming(autopilot)
     while not any("does not answer" in text for text in bench.texts):
         bench.go_on(0.02)

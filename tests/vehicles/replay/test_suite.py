@@ -1,4 +1,4 @@
-"""A replay keeps the drivers' contract, of a drone that flew and of a camera that can't."""
+"""The drivers' contract, checked with replays of a drone that flew and of a camera."""
 
 from __future__ import annotations
 
