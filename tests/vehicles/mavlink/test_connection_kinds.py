@@ -144,7 +144,7 @@ def test_tcp_sends_half_a_frame_to_its_end_and_then_whole_ones() -> None:
     frame = bytes(32 << 20)
     with by_tcp() as (ours, vehicle):
         ours.send(Packet(frame, None))
-        # Freed room may take a moment to show on both sides: here nobody reads, so none is freed.
+        # Freed room may take a moment to show on both sides: here nothing is read, so none is freed.
         wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
         ours.send(Packet(b"lost without a word", None))
         got = bytearray()

@@ -313,7 +313,7 @@ def fly(driver: Driver, sink: RecordingSink) -> None:
 
 
 def test_a_second_program_that_takes_the_vehicle_keeps_it() -> None:
-    """On its own connection it lands the vehicle, and the driver lets it."""
+    """On a separate connection it lands the vehicle, and the driver lets it."""
     with firmware(world(speed=1.0), kind=Kind.ARDUCOPTER) as it, opened(it.tcp_address) as (driver, sink):
         up(sink)
         wait_until(lambda: ready(sink), "it can be armed")

@@ -169,7 +169,7 @@ def test_the_answer_to_disarming_after_a_landing_does_not_count_for_arming(autop
 
 @AUTOPILOTS
 def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again(autopilot: int) -> None:
-    """The previous landing is over by then: another operator's switch did it, and somebody may walk up to it."""
+    """The previous landing is over by then: another operator's switch did it, and a person may walk up to it."""
     bench = just_landed(autopilot)
     vehicle = bench.vehicle
     bench.apply(Takeoff())
@@ -501,7 +501,7 @@ def test_an_operator_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: s
 @AUTOPILOTS
 @pytest.mark.parametrize("alone", [False, True])
 def test_an_operator_who_holds_a_landing_vehicle_keeps_it(autopilot: int, alone: bool) -> None:
-    """Somebody stands below, and another station stops it. Each repeat of the landing took it back."""
+    """A person stands below, and another station stops it. Each repeat of the landing took it back."""
     bench = steering(autopilot)
     bench.apply(Land())
     bench.vehicle.mode = LAND[autopilot][0]

@@ -657,7 +657,7 @@ def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -
 
 
 def test_a_stop_by_a_new_proxy_reaches_a_vehicle_that_is_not_received() -> None:
-    """A flying one may receive it; one on the ground had no sticks for so long that it wants its arm switch off first."""
+    """A flying one may receive it; one on the ground got no sticks for a while, so its arm switch must first be off."""
     bench = Bench()
     bench.take_off()
     bench.reconnect()

@@ -305,7 +305,7 @@ def test_capabilities(flight: Path, tmp_path: Path) -> None:
     path = write_flight(tmp_path / "plain.mcap", Plan(capabilities=plain, seconds=0.3))
     found = driver_of(path).capabilities()
     assert (found.actions, found.why_not) == (frozenset(), "it is a picture only")
-    assert [camera.name for camera in found.cameras] == ["front"]  # frames were recorded, whatever was announced
+    assert [camera.name for camera in found.cameras] == ["front"]  # frames were recorded, though not announced
 
 
 @pytest.mark.parametrize(
