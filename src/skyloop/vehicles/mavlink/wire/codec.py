@@ -48,7 +48,8 @@ _HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, the 
 class _Kind(NamedTuple):
     """A message type with numeric fields only, and how to build it from a payload.
 
-    pymavlink's own decoder takes three times as long, mostly to sort fields and to handle strings and arrays.
+    pymavlink's own decoder takes three times as long, mostly because it sorts the fields and makes room for strings and
+    arrays in every message.
     """
 
     make: type[Message]
