@@ -166,33 +166,33 @@ def test_a_resting_vehicle_gets_all_ticks_as_soon_as_a_pilot_takes_it() -> None:
     ticker.close()
 
 
-def test_a_lanes_jobs_run_in_order_one_at_a_time() -> None:
+def test_a_queues_jobs_run_in_order_one_at_a_time() -> None:
     workers = RequestWorkers()
-    lanes = [workers.lane() for _ in range(5)]
+    queues = [workers.queue() for _ in range(5)]
     done: list[tuple[int, int]] = []
-    inside = [0] * len(lanes)
+    inside = [0] * len(queues)
 
-    def job(lane: int, number: int) -> None:
-        inside[lane] += 1
-        assert inside[lane] == 1
-        done.append((lane, number))
-        inside[lane] -= 1
+    def job(queue: int, number: int) -> None:
+        inside[queue] += 1
+        assert inside[queue] == 1
+        done.append((queue, number))
+        inside[queue] -= 1
 
     for number in range(50):
-        for index, lane in enumerate(lanes):
-            lane.put(lambda index=index, number=number: job(index, number))  # type: ignore[misc]
+        for index, queue in enumerate(queues):
+            queue.put(lambda index=index, number=number: job(index, number))  # type: ignore[misc]
     wait_until(lambda: len(done) == 250, "all are done")
-    for index in range(len(lanes)):
-        assert [number for lane, number in done if lane == index] == list(range(50))
+    for index in range(len(queues)):
+        assert [number for queue, number in done if queue == index] == list(range(50))
     workers.close()
 
 
-def test_a_hanging_lane_delays_no_other_and_stops_in_time() -> None:
+def test_a_hanging_queue_delays_no_other_and_stops_in_time() -> None:
     workers = RequestWorkers()
     gate, reached = threading.Event(), threading.Event()
-    stuck, other = workers.lane(), workers.lane()
-    for lane in (stuck, other):
-        lane.start()
+    stuck, other = workers.queue(), workers.queue()
+    for queue in (stuck, other):
+        queue.start()
     stuck.put(lambda: (reached.set(), gate.wait(30.0))[0])  # type: ignore[func-returns-value]
     assert reached.wait(10.0)
     stuck.put(lambda: reached.clear())
@@ -212,7 +212,7 @@ def test_the_threads_end() -> None:
     gate = threading.Event()
     others = set(threading.enumerate())
     for _ in range(2 * MAX_THREADS):
-        workers.lane().put(lambda: (gate.wait(30.0), None)[1])
+        workers.queue().put(lambda: (gate.wait(30.0), None)[1])
     before = [thread for thread in threading.enumerate() if thread not in others]
     assert len(before) <= MAX_THREADS
     gate.set()

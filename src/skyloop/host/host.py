@@ -109,9 +109,9 @@ class Host:
     def _make(self, settings: VehicleSettings, network: FabricSettings | None) -> HostedVehicle:
         if settings.own_process:
             return OwnProcessVehicle(settings, self.announce)
-        lane = self._workers.lane()
+        jobs = self._workers.queue()
         return SharedVehicle(
-            settings, self._reactor, lane, network, self._make_driver, self._overview, self._serve_link
+            settings, self._reactor, jobs, network, self._make_driver, self._overview, self._serve_link
         )
 
     def _serve_link(self, vehicle: SharedVehicle, link: ServedLink) -> None:

@@ -120,21 +120,21 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads, one per concurrent request, for the lanes of proxies.
+    """A pool of daemon threads, one per concurrent request, for the job queues of proxies.
 
-    A job that hangs holds up only its own lane.
+    A job that hangs holds up only its own queue.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._ready: deque[RequestLane] = deque()  # with a job not yet started
+        self._ready: deque[PooledJobQueue] = deque()  # with a job not yet started
         self._idle = 0
         self._threads = 0
         self._closed = False
 
-    def lane(self) -> RequestLane:
-        """Return a lane for one proxy."""
-        return RequestLane(self)
+    def queue(self) -> PooledJobQueue:
+        """Return one proxy's job queue."""
+        return PooledJobQueue(self)
 
     def close(self) -> None:
         """End the idle threads."""
@@ -142,10 +142,10 @@ class RequestWorkers:
             self._closed = True
             self._changed.notify_all()
 
-    def schedule(self, lane: RequestLane) -> None:
-        """Have a thread do the next job of a lane. For lanes."""
+    def schedule(self, jobs: PooledJobQueue) -> None:
+        """Have a thread do the queue's next job. Called by job queues."""
         with self._changed:
-            self._ready.append(lane)
+            self._ready.append(jobs)
             if self._idle >= len(self._ready):
                 self._changed.notify()
             elif self._threads < MAX_THREADS:
@@ -153,10 +153,10 @@ class RequestWorkers:
                 threading.Thread(target=self._run, name="skyloop-requests", daemon=True).start()
 
     def _run(self) -> None:
-        while (lane := self._next()) is not None:
-            lane.do_one()
+        while (jobs := self._next()) is not None:
+            jobs.do_one()
 
-    def _next(self) -> RequestLane | None:
+    def _next(self) -> PooledJobQueue | None:
         with self._changed:
             self._idle += 1
             try:
@@ -170,7 +170,7 @@ class RequestWorkers:
                 self._idle -= 1
 
 
-class RequestLane:
+class PooledJobQueue:
     """One proxy's jobs: a :class:`skyloop.proxy.requests.JobQueue` on the threads of a pool."""
 
     def __init__(self, workers: RequestWorkers) -> None:

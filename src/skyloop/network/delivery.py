@@ -177,17 +177,17 @@ class Pace:
     later packets. So a silent subscriber is sent few.
     """
 
-    __slots__ = ("_acknowledged", "_newest", "_prompt", "_sent_s", "_since_s")
+    __slots__ = ("_acknowledged", "_eager", "_newest", "_sent_s", "_since_s")
 
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
-        self._prompt = False  # it acknowledges more often than it must, so that silence is significant
+        self._eager = False  # it acknowledges more often than it must, so that silence is significant
         self._sent_s = -math.inf  # when the newest was sent
         self._since_s = math.inf  # when the oldest unacknowledged packet was sent, or later
 
     def may_send(self, now_s: float) -> bool:
         """Return whether another packet may be sent now."""
-        stands = self._prompt and now_s - self._since_s > STANDS_S
+        stands = self._eager and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
@@ -199,7 +199,7 @@ class Pace:
         """Record an acknowledgement up to this number; ignore a number that was not sent yet."""
         if not self._acknowledged < number <= self._newest:
             return
-        self._prompt = self._prompt or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
+        self._eager = self._eager or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
         self._acknowledged = number
         self._since_s = math.inf if number == self._newest else now_s
 

@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 IN_A_ROW: Final = 16
 
 
-class _Lane(Generic[Item]):
+class _TurnQueue(Generic[Item]):
     """Queues of the connections, which take turns."""
 
     def __init__(self) -> None:
@@ -53,8 +53,8 @@ class HandlerQueue(Generic[Item]):
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.Lock())
-        self._urgent: _Lane[Item] = _Lane()
-        self._others: _Lane[Item] = _Lane()
+        self._urgent: _TurnQueue[Item] = _TurnQueue()
+        self._others: _TurnQueue[Item] = _TurnQueue()
         self._in_a_row = 0
         self._closed = False
 
@@ -65,10 +65,10 @@ class HandlerQueue(Generic[Item]):
             False if it was refused.
         """
         with self._changed:
-            lane = self._urgent if urgent else self._others
-            if at_most is not None and lane.count(of) >= at_most:
+            queue = self._urgent if urgent else self._others
+            if at_most is not None and queue.count(of) >= at_most:
                 return False
-            lane.put(of, item)
+            queue.put(of, item)
             self._changed.notify()
             return True
 

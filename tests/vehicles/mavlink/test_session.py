@@ -520,7 +520,7 @@ def test_neither_poses_that_may_be_read_late_nor_old_ones_are_sent() -> None:
     assert "no data from the vehicle" in problem()
     bench.go_on(1.0)
     assert problem() == ""
-    bench.session._heard_by_it = False
+    bench.session._receives_us = False
     assert problem() != "", "nothing shows yet that it receives us"
 
 

@@ -418,12 +418,12 @@ def test_closing_disarms_a_vehicle_on_the_ground() -> None:
     bench.ready()
     bench.fly(climb=0.5)
     bench.until(lambda: bench.board.armed, 2.0)
-    words = bench.session.last_words(bench.clock.now_ns)
+    words = bench.session.final_bytes(bench.clock.now_ns)
     assert channels(words[5:-1])[4] == 1000, "the arm switch is off"
     bench.until(lambda: not bench.board.armed, 1.0)
     bench.run(0.2)
     bench.take_off()
-    assert bench.session.last_words(bench.clock.now_ns) == b""
+    assert bench.session.final_bytes(bench.clock.now_ns) == b""
 
 
 def test_sticks_are_held_back_while_unacknowledged() -> None:
@@ -652,7 +652,7 @@ def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -
     setpoints.on_report(Report(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)
     assert setpoints.channels(10**9)[:4] == [1000] * 4
-    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_told=True), "")
+    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_known=True), "")
     assert setpoints.channels(10**9)[:4] == [1000, 1500, 1500, 1500]
 
 

@@ -42,7 +42,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 TICK_NS: Final = nanoseconds(0.02)
 REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session: silence, heartbeats, requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
-UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: above the 5 to 10 s after which the autopilots' failsafes act
+SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: above the 5 to 10 s after which the autopilots' failsafes act
 QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points wait: the vehicle might follow them late
 OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose says where the vehicle was, not where it is
 DEGRADED_NS: Final = nanoseconds(1.2)  #: silence until the link is degraded
@@ -118,14 +118,14 @@ class MavlinkSession(VehicleSession):
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
         self._peer = options.peer  # the chosen vehicle's; kept while the link is lost
-        self._unheard = False  # lost while armed: our heartbeats would keep its own failsafe from acting
+        self._slow_heartbeat = False  # lost while armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
-        self._unfit: set[str] = set()  # message types already reported as impossible to encode
+        self._unencodable: set[str] = set()  # message types already reported as impossible to encode
         self._kind: tuple[int, int] | None = None  # autopilot and type, from its heartbeat
         self._known_as: Message | None = None  # version from before the link was lost, until it arrives again
-        self._heard_by_it = True  # False until the vehicle shows that it receives us
-        self._said: tuple[int | None, bool, int] | None = None  # mode, armed, MAV_STATE at the last check
+        self._receives_us = True  # False until the vehicle shows that it receives us
+        self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed, MAV_STATE at the last check
         self._waking = False  # it has just booted and can't be armed yet
         self._prearm = ""  # the latest reason that it gave
         self._unsupported_reason = "no data from it"
@@ -263,7 +263,7 @@ class MavlinkSession(VehicleSession):
         elif kind == "COMMAND_ACK":
             if message.target_system in (0, self.options.own_system):
                 self.commands.on_ack(message, now_ns)
-                self._heard_by_it = True
+                self._receives_us = True
                 self.due_ns = 0
         elif kind == "PARAM_VALUE":
             self.parameters.on_value(message, now_ns)
@@ -286,9 +286,9 @@ class MavlinkSession(VehicleSession):
             if age_s is None or age_s > QUIET_ATTITUDE_S:
                 self._publish(self.clock.now(now_ns), now_ns)
         if kind in _MODES:
-            said = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
-            if said != self._said:
-                self._said = said
+            report = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
+            if report != self._last_report:
+                self._last_report = report
                 self.due_ns = 0  # wake callers that wait for a mode
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
@@ -346,26 +346,26 @@ class MavlinkSession(VehicleSession):
         return min(max(due_ns, tick_ns), next_ns)
 
     def _fly(self, vehicle: VehicleState | None, now_ns: int) -> list[Message]:
-        if self.version is None or not self._heard_by_it:
+        if self.version is None or not self._receives_us:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
         messages: list[Message] = []
         if self.setpoints is not None and vehicle is not None:
             messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
-        if not self._heard_by_it:
+        if not self._receives_us:
             messages = []  # nothing shows yet that it receives us
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:
         """Return whether the vehicle seems to read promptly, judging by its messages."""
-        return self._heard_by_it and now_ns - (self._received_ns or 0) < QUIET_NS
+        return self._receives_us and now_ns - (self._received_ns or 0) < QUIET_NS
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
         """Return the heartbeat when it is due.
 
         A vehicle that speaks MAVLink 1 gets both versions: some autopilots switch to MAVLink 2 once they receive it.
         """
-        if now_ns - self._heartbeat_ns < (UNHEARD_HEARTBEAT_NS if self._unheard else HEARTBEAT_NS):
+        if now_ns - self._heartbeat_ns < (SLOW_HEARTBEAT_NS if self._slow_heartbeat else HEARTBEAT_NS):
             return []
         self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
@@ -378,8 +378,8 @@ class MavlinkSession(VehicleSession):
         try:
             data = self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
         except (struct.error, OverflowError) as error:
-            if (kind := message.get_type()) not in self._unfit:
-                self._unfit.add(kind)
+            if (kind := message.get_type()) not in self._unencodable:
+                self._unencodable.add(kind)
                 text = f"{kind} was not sent: a number does not fit its MAVLink field ({error})"
                 self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "encoding"}))
             return None
@@ -396,7 +396,7 @@ class MavlinkSession(VehicleSession):
             self._read_again(now_ns)  # it does not identify itself
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
             return
-        if self._known_as is not None or not self._heard_by_it:
+        if self._known_as is not None or not self._receives_us:
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
@@ -434,9 +434,9 @@ class MavlinkSession(VehicleSession):
     # Losing and finding ------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._received_ns = self._said = None
+        self._received_ns = self._last_report = None
         self._waking, self._prearm = False, ""
-        self._unheard = self.telemetry.armed()
+        self._slow_heartbeat = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()
         self.parameters.fail_writes(reason)
@@ -449,7 +449,7 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
-        self._found_ns, self._unreachable, self._unheard = now_ns, "", False
+        self._found_ns, self._unreachable, self._slow_heartbeat = now_ns, "", False
         target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
         self.commands.target = self.parameters.target = target
         kind = heartbeat.autopilot, heartbeat.type
@@ -466,7 +466,7 @@ class MavlinkSession(VehicleSession):
         if self._known_as is None:
             self._read_again(now_ns)
         text = "reading its parameters" if self.parameters.busy else ""
-        if not self._heard_by_it:
+        if not self._receives_us:
             text = "it has not answered since sending failed"
         self._set_link_state(LinkState.DEGRADED, text)
 
@@ -520,7 +520,7 @@ class MavlinkSession(VehicleSession):
     def broken(self, error: OSError, now_ns: int) -> None:
         """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle has answered something."""
         super().broken(error, now_ns)
-        self._heard_by_it = False
+        self._receives_us = False
 
     def limit(self, limits: Mapping[str, float]) -> None:
         """Set the driver's own limits."""

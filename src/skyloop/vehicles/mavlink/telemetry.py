@@ -41,7 +41,7 @@ class VehicleState:
     amsl_m: float | None  #: altitude above mean sea level
     remote: bool = False  #: it receives a remote control, as far as it reports that
     heartbeat_ns: int = 0  #: arrival of its newest heartbeat, which says whether it is armed
-    tells_landed: bool = False  #: it has reported whether it is on the ground, if not recently
+    reports_landed: bool = False  #: it has reported whether it is on the ground, if not recently
 
     @property
     def airborne(self) -> bool | None:
@@ -54,7 +54,7 @@ class VehicleState:
             return False
         if self.landed is Landed.UNKNOWN:
             high = None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
-            return None if self.tells_landed and not high else high
+            return None if self.reports_landed and not high else high
         return True
 
     @property
@@ -215,7 +215,7 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
-            tells_landed=self.landed(now_ns, math.inf) is not Landed.UNKNOWN,
+            reports_landed=self.landed(now_ns, math.inf) is not Landed.UNKNOWN,
         )
 
 

@@ -174,4 +174,4 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
     def _on_end(self, connection: ByteStream) -> None:
         connection.drain_s = END_S
         with suppress(OSError):
-            connection.write(self.session.last_words(self._clock()), Rank.COMMAND)
+            connection.write(self.session.final_bytes(self._clock()), Rank.COMMAND)

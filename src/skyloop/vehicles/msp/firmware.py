@@ -66,7 +66,7 @@ class Setup:
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
-    sticks_told: bool = False  #: whether that was reported; else it is a guess
+    sticks_known: bool = False  #: whether that was reported; else it is a guess
     rx: RxConfig = field(default_factory=RxConfig)
     failsafe: FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
@@ -343,7 +343,7 @@ class Identification:
         self.setup = replace(self.setup, ranges=tuple(msp.mode_ranges(payload)))
 
     def _on_sticks(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_told=True)
+        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_known=True)
 
     def _on_rx(self, payload: bytes) -> None:
         self.setup = replace(self.setup, rx=RxConfig.decode(payload))

@@ -113,7 +113,7 @@ class MspSession(VehicleSession):
         """End the session."""
         self._questions.clear()
 
-    def last_words(self, now_ns: int) -> bytes:
+    def final_bytes(self, now_ns: int) -> bytes:
         """Return the final bytes before the connection closes: they disarm a vehicle on the ground.
 
         A flying one gets nothing: its failsafe is set up for the silence that follows.
@@ -440,7 +440,7 @@ class MspSession(VehicleSession):
         if self.setup is not None or self._identification is None:
             return
         found, before = self._identification.setup, self._part
-        if found.identity.variant in SUPPORTED and _told(found) >= _told(before):
+        if found.identity.variant in SUPPORTED and _known_settings(found) >= _known_settings(before):
             self._part = found
             self.setpoints.set_up(found, "its settings have not been read")
 
@@ -486,8 +486,8 @@ class MspSession(VehicleSession):
         return super()._trouble(error)
 
 
-def _told(setup: Setup) -> tuple[bool, bool]:
-    return bool(setup.arm_ranges), setup.sticks_told
+def _known_settings(setup: Setup) -> tuple[bool, bool]:
+    return bool(setup.arm_ranges), setup.sticks_known
 
 
 def _has_height(status: msp.Status) -> bool:

@@ -47,7 +47,7 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     }
 )
-LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: lift-off height [m] or climb [m/s], by precise or not
+LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
 LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from a sufficient throttle to a visible lift-off, by precise or not
 OTHER: Final = 0.15  #: share by which the learnt throttle may differ from the one at lift-off
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a stalled descent has met something by then
@@ -384,7 +384,7 @@ class SetpointController:
         centred = (round(1500 + 500 * stick) for stick in (roll, pitch, yaw))
         for place, width in zip(self._setup.sticks, (*centred, throttle), strict=True):
             sticks[place] = width
-        if self.stop.active and not self._setup.sticks_told:
+        if self.stop.active and not self._setup.sticks_known:
             sticks = [OFF_US] * len(sticks)  # throttle off, whichever channel it is
         given: Mapping[int, int] = self.given_aux
         return [*sticks, *self._setup.aux_us(arm=on, given=given)]
