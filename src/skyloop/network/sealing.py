@@ -1,4 +1,4 @@
-"""End-to-end sealed packets: no node between a proxy and its applications can read, change or repeat them.
+"""End-to-end sealed packets: no node between a proxy and its applications can read, change or replay them.
 
 The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
 Without keys nothing is sealed. ``docs/wire-format.md`` has the bytes.

@@ -273,7 +273,7 @@ class SetpointController:
             self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
             if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may be armed on the ground
                 self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
-        self._entered, self._strayed_ns = False, None  # mode changes while the link is down are no pilot's decision
+        self._entered, self._strayed_ns = False, None  # mode changes during the outage are the vehicle's own
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:

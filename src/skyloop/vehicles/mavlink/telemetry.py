@@ -47,8 +47,8 @@ class VehicleState:
     def airborne(self) -> bool | None:
         """Whether it is off the ground under its own power; None while unknown.
 
-        An armed vehicle that reports neither that nor its height, such as one just found again, may be flying; so may a
-        low one whose own report is late.
+        An armed vehicle may be flying if it reports neither that nor its height, as when it was just found again, or if
+        it is low and its own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False

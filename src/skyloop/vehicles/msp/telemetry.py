@@ -234,7 +234,7 @@ class MotionEstimate:
         self._heading_rad: float | None = None  # as yaw, counter-clockwise from east
         self._turned_rad: float | None = None  # difference of the poses' yaw from it
         self._ground: dict[str, float] = {}  # height of each source at the last place on the ground
-        self._stood = 0  # number of samples of it
+        self._stood = 0  # samples of the ground's height
         self.satellites: int | None = None
 
     @property
@@ -274,7 +274,7 @@ class MotionEstimate:
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the ground's height while at rest: a single sample may be off by more than a lift-off."""
+        """Learn the ground's height while at rest: a single sample may be wrong by more than a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])

@@ -49,8 +49,8 @@ class Moment:
         return self.state is not None and found.issuperset(cameras)
 
 
-#: Parts of the file, of about half a second each, to read before the one with the time sought, until each camera has an
-#: image. A camera that was silent for longer shows nothing.
+#: Parts of the file (about half a second each) to read before the time sought, until each camera has an image. A
+#: camera that was silent for longer shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
 _KEPT_STATES: Final = 500  #: states kept before the time sought, to find the one of the images
 

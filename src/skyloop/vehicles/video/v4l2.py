@@ -275,7 +275,7 @@ class CameraDevice:
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
     """Return the local cameras, by number; none if the system has no Video4Linux.
 
-    Of a camera's nodes only the first, which captures images, is listed.
+    Only a camera's first node, the one that captures images, is listed.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))

@@ -91,7 +91,7 @@ class Px4(Autopilot):
         super().__init__(vehicle, system, boot_s, gps)
         self.parameters = ParameterTable(services.PX4, bytewise=True)
         self.mode = "AUTO.LOITER"
-        self._intended = self.mode  # the mode that the user chose; kept under failsafes
+        self._intended = self.mode  # the mode that the user chose; failsafes keep it
         self._before = self.mode  # the mode before a manoeuvre
         self._waiting_at: Target | None = None  # where HOLD should be
         self._speeds = USUAL
