@@ -275,7 +275,7 @@ def test_a_booting_vehicle_reports_that_once() -> None:
     vehicle = Vehicle(ARDUPILOT)
     vehicle.ready = False
     bench = Bench(vehicle).found()
-    assert bench.sink.links[-1] == (LinkState.UP, "still waking up: its own checks before arming do not pass yet")
+    assert bench.sink.links[-1] == (LinkState.UP, "still waking up: its pre-arm checks do not pass yet")
     links, events = len(bench.sink.links), len(bench.sink.events)
     for _ in range(10):
         bench.go_on(0.5)

@@ -37,10 +37,10 @@ def test_addresses() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("msp://", "names no place"),
-        ("msp://ttyACM0", "names no place"),
-        ("msp://tcp:127.0.0.1", "names no place"),
-        ("msp://tcp:127.0.0.1:0", "names no place"),
+        ("msp://", "names no host or device"),
+        ("msp://ttyACM0", "names no host or device"),
+        ("msp://tcp:127.0.0.1", "names no host or device"),
+        ("msp://tcp:127.0.0.1:0", "names no host or device"),
         ("msp://tcp:127.0.0.1:5761?baud=9600", "baud is for a serial port"),
         ("msp:///dev/ttyACM0?rate=5", "from 20 to 250"),
         ("msp:///dev/ttyACM0?speed=5", "option of msp://"),

@@ -230,8 +230,8 @@ def page_certificate(
         for name in wanted:
             if not certificates.may_certify(authority, name):
                 raise UsageError(
-                    f"{name} can't be certified by {made.authority}, which is for private networks and the names of "
-                    f"when it was made: give --tls-cert and --tls-key, or remove {directory} to make a new one, which "
+                    f"{name} can't be certified by {made.authority}, which covers private networks and the names given "
+                    f"at its creation: give --tls-cert and --tls-key, or remove {directory} to make a new one, which "
                     "browsers then have to trust again"
                 )
         names = [name.lower() for name in dict.fromkeys([*own, *wanted]) if certificates.may_certify(authority, name)]

@@ -166,13 +166,13 @@ def address_of(uri: VehicleUri) -> Address:
     if kind is not ConnectionKind.SERIAL:
         found = host_and_port(rest)
         if found is None:
-            raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+            raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
         return Address(kind, *found)
     place, colon, number = rest.rpartition(":")
     if not colon or not number.isdecimal():
         place, number = rest, str(DEFAULT_BAUD)
     if not place or not 1 <= int(number) <= 10_000_000:
-        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+        raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
     return Address(kind, place, int(number))
 
 
@@ -255,7 +255,7 @@ def limits_text(values: Mapping[str, float]) -> str:
     """Return a sentence for people about the limits in force."""
     speed, climb, altitude = (values[name] for name in ("limits.speed", "limits.climb", ALTITUDE))
     return (
-        f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them by the parameters "
+        f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them with the parameters "
         "limits.speed, limits.climb and limits.altitude, or in the address (?speed=…&climb=…&altitude=…)"
     )
 

@@ -53,7 +53,7 @@ WAKING_MS: Final = 60_000  #: on the vehicle's clock: if it can't be armed this 
 IDENTITY_NS: Final = nanoseconds(2.0)  #: time for a vehicle found again to prove that it is the same
 QUIET_ATTITUDE_S: Final = 0.5  #: without attitude for this long, other messages trigger feedback
 VERSION_PACE_S: Final = 1.0
-_WAKING: Final = f"{WAKING_UP}: its own checks before arming do not pass yet"
+_WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
@@ -142,7 +142,7 @@ class MavlinkSession(VehicleSession):
     def description(self) -> str:
         """Autopilot, version and system, for people."""
         if self.autopilot is None:
-            return "an autopilot that is not known here"
+            return "an unknown autopilot"
         system = self._selector.system
         version = self.version.flight_sw_version if self.version is not None else 0
         number = f" {version >> 24}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}" if version else ""
@@ -215,7 +215,7 @@ class MavlinkSession(VehicleSession):
         if self.codec.signed > self._signed:
             first, self._signed = not self._signed, self.codec.signed
             if first:
-                text = "the vehicle signs its messages: give its key with ?signing_key=FILE"
+                text = "the vehicle signs its messages, which are ignored without its key: give ?signing_key=FILE"
                 self._unreachable = text
                 self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
 

@@ -54,7 +54,7 @@ def options_of(uri: VehicleUri) -> MspOptions:
     word, _, rest = uri.place.partition(":")
     found = host_and_port(rest)
     if word != "tcp" or found is None:
-        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+        raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
     return MspOptions(*found, rate_hz=rate, override=override)
 
 
