@@ -91,7 +91,7 @@ def serve(
         announce(f"hosting {served} of {len(fleet.vehicles)} vehicles as {fleet.name}, process {os.getpid()}{failed}")
         polls = _key_changes(fleet)
         gc.collect()
-        gc.freeze()  # permanent objects: without them, a collection no longer takes 20 ms
+        gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
         # Poll: the kernel may deliver a signal to any thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))

@@ -35,7 +35,7 @@ SETTLE_S: Final = 0.6
 ANSWER_S: Final = 0.5
 #: Time for a linked node to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
 SYNC_S: Final = 5.0
-RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one, two or three in a network that was split
+RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three in a split network
 SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
 YOUNG_S: Final = 1.0  #: age up to which a new session searches well without help
 FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long

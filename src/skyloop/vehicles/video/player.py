@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FFmpegError = av.error.FFmpegError
 
 CHUNK: Final = 1 << 16
-SNIFF: Final = 1 << 18  #: even a truncated PaVE stream shows a header within this many bytes
+SNIFF: Final = 1 << 18  #: a PaVE stream cut at any point shows a header within this many bytes
 DEFAULT_FPS: Final = 30.0
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
