@@ -30,7 +30,7 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-LAND_WITHIN_S: Final = 20.0
+LAND_WITHIN_S: Final = 20.0  #: default time for a landing
 _AT_ONCE: Final = 8  # vehicles that start concurrently
 _STALL_S: Final = STALL_CHECKS * CHECK_S
 _HANG_S: Final = HANG_CHECKS * CHECK_S

@@ -19,7 +19,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
 
-_LONGEST_WAIT_NS: Final = 1_000_000_000
+_LONGEST_WAIT_NS: Final = 1_000_000_000  #: of the selector
 _MOST_STALE: Final = 4  #: queue entries per link before stale ones are removed
 
 

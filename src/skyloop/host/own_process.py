@@ -27,9 +27,9 @@ from skyloop.proxy.serve import run
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
-STARTS_WITHIN_S: Final = 20.0
-FIRST_PAUSE_S: Final = 0.5
-LONGEST_PAUSE_S: Final = 30.0
+STARTS_WITHIN_S: Final = 20.0  #: time for the first report
+FIRST_PAUSE_S: Final = 0.5  #: before the first restart; doubles with each death
+LONGEST_PAUSE_S: Final = 30.0  #: its limit
 #: Checks without a report, at four a second, after which the process counts as hung and is killed. Checks rather than
 #: seconds: a process does not hang because its computer was suspended.
 SILENT_CHECKS: Final = 40
@@ -39,7 +39,7 @@ _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
 FAILED: Final = 1
-STATUS_EVERY_S: Final = 0.25
+STATUS_EVERY_S: Final = 0.25  #: between reports
 
 
 def pause_s(deaths: int) -> float:

@@ -39,12 +39,12 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-_POLL_S: Final = 0.2
+_POLL_S: Final = 0.2  # between checks for signals and changes
 MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: bytes
 MAX_ANSWER: Final = 1 << 22  #: bytes
 ANSWERS_WITHIN_S: Final = 60.0  #: includes a landing before a removal
-_CHUNK: Final = 1 << 15
+_CHUNK: Final = 1 << 15  # bytes of a packet
 _AGAIN_S: Final = 0.1  # pause after a failed accept
 _SLOW_S: Final = 2.0  # for the other end to receive or send a packet
 _log = logging.getLogger(__name__)

@@ -23,10 +23,10 @@ _log = logging.getLogger(__name__)
 OnFailing = Callable[[Proxy, BaseException], None]
 MAX_THREADS: Final = 64  #: drivers that may hang in a request before others have to wait
 IDLE_THREADS: Final = 2  #: threads kept for bursts of requests
-_IDLE_S: Final = 5.0
+_IDLE_S: Final = 5.0  #: after this time without a job, a spare thread ends
 
 Job = Callable[[], None]
-CHECK_S: Final = 0.05
+CHECK_S: Final = 0.05  #: between two checks
 STALL_CHECKS: Final = 5  #: 0.25 s: other vehicles get a new thread before their pilots' silence makes them hover
 HANG_CHECKS: Final = 40  #: 2 s: drop the vehicle
 

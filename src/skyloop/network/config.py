@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skyloop.network.keys import Credentials, Identity, KeyRing
 
 LEASE_S: Final = 0.7  #: default time without a sign of life after which a peer counts as gone
-MAX_LEASE_S: Final = 10.0
+MAX_LEASE_S: Final = 10.0  #: longest lease
 DEFAULT_PORT: Final = 7447  #: Zenoh's
 #: Time for an address to answer before the next one of the same peer is tried.
 OPEN_MS: Final = 800

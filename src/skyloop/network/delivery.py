@@ -24,7 +24,7 @@ RECENT_PACKETS: Final = 64  #: an end's latest packets, among which repeats are 
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this many packets
 #: Packets in flight at once: as many as Zenoh queues per link before it drops one (config._QUEUES).
 ON_THE_WAY: Final = 16
-ON_THE_WAY_BYTES: Final = 1 << 18
+ON_THE_WAY_BYTES: Final = 1 << 18  #: the same in bytes
 ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and this often on topics where only the newest counts (:class:`Pace`)
 STANDS_S: Final = 0.5  #: a path with a packet unacknowledged for this long is stalled …
 SLOW_S: Final = 0.25  #: … and until it recovers, a packet is sent this often

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 #: Time after opening for a session to find the nodes within reach: by multicast, or at the given addresses.
 SETTLE_S: Final = 0.6
-ANSWER_S: Final = 0.5
+ANSWER_S: Final = 0.5  #: time for proxies to describe themselves
 #: Time for a linked node to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
 SYNC_S: Final = 5.0
 RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three in a split network

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import zenoh
 
 FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
-_POLL_S: Final = 0.5
+_POLL_S: Final = 0.5  # between checks of the connections
 _REFUSED: Final = b""  # stands for a refused packet
 _COMMAND: Final = b"c"  # stands for a command: the first one in the connection's backlog
 _log = logging.getLogger(__name__)

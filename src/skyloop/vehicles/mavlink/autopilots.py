@@ -18,11 +18,11 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_GAIN_PER_S: Final = 2.0
-ALTITUDE_GAIN_PER_S2: Final = 0.8
-MOST_ALTITUDE_ERROR_M: Final = 1.5
-LEAST_THRUST: Final = 0.1
-MOST_THRUST: Final = 0.9
+CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per climb rate error
+ALTITUDE_GAIN_PER_S2: Final = 0.8  #: acceleration per altitude error, the integral of that
+MOST_ALTITUDE_ERROR_M: Final = 1.5  #: limit of the integral
+LEAST_THRUST: Final = 0.1  #: lower limit of the thrust field
+MOST_THRUST: Final = 0.9  #: upper limit
 
 
 class ThrustModel(Protocol):

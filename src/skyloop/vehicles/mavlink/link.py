@@ -18,7 +18,7 @@ from skyloop.vehicles.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.vehicles.mavlink.protocol import MavlinkSession, Packet
 from skyloop.vehicles.mavlink.wire.codec import Message
 
-MAX_DATAGRAM: Final = 65_536
+MAX_DATAGRAM: Final = 65_536  #: bytes
 BURST: Final = 64  #: maximum datagrams per read, so that other links get their turn
 
 
@@ -172,7 +172,7 @@ def open_connection(address: Address) -> MavlinkConnection:
 
 
 WRITE_S: Final = 0.9  #: a write that is not confirmed within this time has failed
-_CLOSE_S: Final = 3.0
+_CLOSE_S: Final = 3.0  #: time for the thread to end
 
 
 class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):

@@ -223,7 +223,7 @@ AT_ONCE: Final = 4  #: requests per tick: a slow link needs room for others
 RETRY_S: Final = 3.0  #: then request a message that is slower than requested again
 ENOUGH: Final = 0.5  #: share of the requested rate that is good enough
 PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`: the vehicle may not have the message
-TRIES: Final = 4
+TRIES: Final = 4  #: requests at the faster pace
 
 
 CHECK_NS: Final = nanoseconds(0.2)  #: between checks of the rates, once everything was requested
@@ -261,10 +261,10 @@ class MessageIntervals:
         self._check_ns = now_ns + CHECK_NS
 
 
-ASK_NS: Final = nanoseconds(1.0)
+ASK_NS: Final = nanoseconds(1.0)  #: between TIMESYNC requests
 HURRY_NS: Final = nanoseconds(0.1)  #: between the first few requests
-FIRST: Final = 5
-KEEP_NS: Final = nanoseconds(10.0)
+FIRST: Final = 5  #: number of fast requests
+KEEP_NS: Final = nanoseconds(10.0)  #: how long clock samples count
 PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this on arrival is from another clock
 BEHIND_MS: Final = 1000  #: stamps behind by more than this may mean that the vehicle rebooted
 _WRAP: Final = 1 << 32  #: of stamps in ms: after 49 days

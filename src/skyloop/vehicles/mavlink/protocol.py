@@ -39,20 +39,20 @@ from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-TICK_NS: Final = nanoseconds(0.02)
+TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
 REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session: silence, heartbeats, requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: above the 5 to 10 s after which the autopilots' failsafes act
 QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points wait: the vehicle might follow them late
 OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose says where the vehicle was, not where it is
 DEGRADED_NS: Final = nanoseconds(1.2)  #: silence until the link is degraded
-LOST_NS: Final = nanoseconds(2.5)
+LOST_NS: Final = nanoseconds(2.5)  #: silence until the link is lost
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle that has sent no data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: time for the parameter list; after it, the link is up without the list
 WAKING_MS: Final = 60_000  #: on the vehicle's clock: if it can't be armed this soon after boot, it is still booting
 IDENTITY_NS: Final = nanoseconds(2.0)  #: time for a vehicle found again to prove that it is the same
 QUIET_ATTITUDE_S: Final = 0.5  #: without attitude for this long, other messages trigger feedback
-VERSION_PACE_S: Final = 1.0
+VERSION_PACE_S: Final = 1.0  #: between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")

@@ -19,7 +19,7 @@ from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
 
 FLOWING_S: Final = 1.0  #: older attitude, position and velocity count as unknown
 SLOW_S: Final = 6.0  #: the same for slow messages such as battery and GPS
-LANDED_S: Final = 3.0
+LANDED_S: Final = 3.0  #: the same for the landed state
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 AIRBORNE_M: Final = 0.5  #: above this it counts as flying, where it does not report that

@@ -45,8 +45,8 @@ from skyloop.vehicles.msp.wire.messages import (
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: AUX channels that are always sent beside the sticks
-MOST_AUX: Final = 14
-USUAL_AUX_US: Final = 1000
+MOST_AUX: Final = 14  #: AUX channels of SET_RAW_RC
+USUAL_AUX_US: Final = 1000  #: an AUX channel that nothing needs
 _ARM_NUMBER: Final = 0  #: in both firmwares
 LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later gets a warning
 CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on, a stick's lean follows the curve of its rates

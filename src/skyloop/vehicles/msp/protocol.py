@@ -30,9 +30,9 @@ from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
-DEGRADED_NS: Final = nanoseconds(0.4)
-LOST_NS: Final = nanoseconds(1.0)
-FIRST_WORD_NS: Final = nanoseconds(2.0)
+DEGRADED_NS: Final = nanoseconds(0.4)  #: silence until the link is degraded
+LOST_NS: Final = nanoseconds(1.0)  #: silence until it is lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller without a reply by then is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
 MOST_STICKS: Final = 4  #: stick frames that may be unacknowledged
 STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older unacknowledged frame counts as lost once a newer reply arrives
@@ -50,7 +50,7 @@ ALTITUDE_HZ: Final = 25.0
 STATUS_HZ: Final = 20.0
 GPS_HZ: Final = 10.0
 BATTERY_HZ: Final = 2.0
-PILOT_HZ: Final = 10.0
+PILOT_HZ: Final = 10.0  #: the pilot's sticks, with override
 
 
 class MspSession(VehicleSession):

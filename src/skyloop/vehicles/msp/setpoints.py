@@ -59,8 +59,8 @@ SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction once it seems to be on the ground, share per second
 OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
 BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
-BLIND_NS: Final = nanoseconds(6.0)
-MOST_LEARNT: Final = 0.9
+BLIND_NS: Final = nanoseconds(6.0)  #: without a measured climb for this long, it is disarmed
+MOST_LEARNT: Final = 0.9  #: limits of the learnt hover throttle
 LEAST_LEARNT: Final = 0.05
 LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
 #: Why nothing restarts a vehicle that did not confirm a stop.

@@ -30,7 +30,7 @@ from skyloop.vehicles.msp.wire.messages import (
 )
 
 PATIENCE_NS: Final = nanoseconds(0.5)  #: an answer that has not arrived by then is lost
-TRIES: Final = 3
+TRIES: Final = 3  #: per question
 
 #: Receives the answer's payload; None: the function is unknown, or there was no answer.
 Handler = Callable[[bytes | None], None]
@@ -175,11 +175,11 @@ class Telemetry:
 Vector = tuple[float, float, float]
 
 POSE_NS: Final = nanoseconds(0.25)  #: an older pose no longer counts
-ALTITUDE_NS: Final = nanoseconds(0.5)
-GPS_NS: Final = nanoseconds(1.0)
+ALTITUDE_NS: Final = nanoseconds(0.5)  #: an older barometer altitude no longer counts
+GPS_NS: Final = nanoseconds(1.0)  #: an older fix no longer counts
 GAP_NS: Final = nanoseconds(0.4)  #: a longer gap restarts the velocity
 SMOOTH_S: Final = 0.05  #: time constant of the velocity from poses
-LEAST_SATELLITES: Final = 5
+LEAST_SATELLITES: Final = 5  #: fewer make no usable fix
 GROUND_SAMPLES: Final = 10  #: samples over which the ground's height is averaged, roughly
 EARTH_RADIUS_M: Final = 6_371_000.0
 

@@ -31,7 +31,7 @@ from skyloop.vehicles.replay.player import PREFIX, Player, ReplayPublisher, Step
 from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
-_CLOSE_S: Final = 2.0
+_CLOSE_S: Final = 2.0  #: time for the thread to end
 
 
 class ReplayDriver(Driver):

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 FFmpegError = av.error.FFmpegError
 
-CHUNK: Final = 1 << 16
+CHUNK: Final = 1 << 16  #: bytes per read
 SNIFF: Final = 1 << 18  #: a PaVE stream cut at any point shows a header within this many bytes
-DEFAULT_FPS: Final = 30.0
+DEFAULT_FPS: Final = 30.0  #: if the file does not say
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
 
@@ -207,8 +207,8 @@ class PaveSource:
         self._parser.end()
 
 
-FEEDBACK_NS: Final = 50_000_000
-POLL_S: Final = 0.02
+FEEDBACK_NS: Final = 50_000_000  #: between feedback samples
+POLL_S: Final = 0.02  #: between checks for a viewer
 BEHIND_NS: Final = 250_000_000  #: when further behind, restart the schedule instead of rushing to catch up
 GAP_S: Final = 2.0  #: a longer step between stamps, or a step back, is a cut in the recording
 

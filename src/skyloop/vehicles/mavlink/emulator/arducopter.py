@@ -50,16 +50,16 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
-SINK_WITHOUT_STICKS_M_S: Final = -2.5
-STICK_TIMEOUT_S: Final = 3.0
+SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: in stick modes without a remote control
+STICK_TIMEOUT_S: Final = 3.0  #: after this silence, a remote control over MAVLink counts as gone
 STICK_SPEED_M_S: Final = 6.0  #: at full stick
 TURN_RAD_S: Final = math.radians(60)  #: maximum turn rate of CONDITION_YAW
-RTL_LOWEST_M: Final = 0.3
-RTL_LEAST_SLOPE: Final = 0.5
+RTL_LOWEST_M: Final = 0.3  #: lowest return altitude above home
+RTL_LEAST_SLOPE: Final = 0.5  #: flatter RTL cones are ignored
 _GUIDED_ITEM: Final = 2  #: "current" of a mission item that is a position to fly to now
 _ALTITUDE_ITEM: Final = 3
 CHANNELS: Final = 16
-_OVERRIDDEN: Final = 8
+_OVERRIDDEN: Final = 8  #: channels that an override can set
 _IGNORED: Final = 0xFFFF  #: a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")

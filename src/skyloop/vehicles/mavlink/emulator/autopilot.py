@@ -31,9 +31,9 @@ FORCE: Final = 21196  #: parameter of the disarm command: "even in flight"
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
-AFTER_LANDING_S: Final = 2.0
+AFTER_LANDING_S: Final = 2.0  #: on the ground after a flight, until it disarms
 POSES_S: Final = 1.0  #: how long external poses must arrive without GPS
-POSE_GAP_S: Final = 0.5
+POSE_GAP_S: Final = 0.5  #: without external poses, until the position is lost
 _GCS: Final = 6  #: MAV_TYPE
 #: Messages that the old request for all messages does not change.
 _ON_REQUEST: Final = (

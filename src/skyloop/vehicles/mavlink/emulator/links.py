@@ -17,7 +17,7 @@ from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPo
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
-APART: Final = 10
+APART: Final = 10  #: between the ports of two drones
 
 
 class Kind(StrEnum):

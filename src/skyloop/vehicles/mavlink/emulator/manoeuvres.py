@@ -47,7 +47,7 @@ _YAW_RATE: Final = 0x800
 _NO_RATES: Final = 0x07
 _NO_THRUST: Final = 0x40
 _NO_ATTITUDE: Final = 0x80
-_UNIT_WITHIN: Final = 1e-3
+_UNIT_WITHIN: Final = 1e-3  #: tolerance of a unit quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def attitude_target_of(message: Message) -> AttitudeTarget:
     )
 
 
-_THERE_M: Final = 0.3
+_THERE_M: Final = 0.3  #: a waypoint of a return counts as reached within this
 
 
 class _Leg(Enum):

@@ -68,7 +68,7 @@ def angles_of(q: Quaternion) -> Vector:
 
 
 ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: message with the origin of the autopilot's axes
-ORIGIN_HZ: Final = 1.0
+ORIGIN_HZ: Final = 1.0  #: requested rate
 _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITION_ESTIMATE")
 
 

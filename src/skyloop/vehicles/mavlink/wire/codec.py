@@ -31,8 +31,8 @@ Message: TypeAlias = Any
 MAX_FRAME: Final = 280  #: bytes of the longest frame, signature included
 KEY_BYTES: Final = 32
 _AROUND_V1: Final = 8  #: bytes of a frame's header and checksum
-_AROUND_V2: Final = 12
-_SIGNATURE: Final = 13
+_AROUND_V2: Final = 12  #: the same of MAVLink 2
+_SIGNATURE: Final = 13  #: bytes
 _LEAST: Final = _AROUND_V1
 _MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
 _MOST_SOURCES: Final = 16  #: senders whose cut frames are kept: anybody can send datagrams
@@ -252,7 +252,7 @@ class Codec:
         return receiver
 
 
-CHUNK: Final = 50
+CHUNK: Final = 50  #: characters of a STATUSTEXT
 _MOST_OPEN: Final = 8  #: unfinished texts; beyond that the oldest is returned incomplete
 
 

@@ -17,7 +17,7 @@ from skyloop.vehicles.msp.wire.messages import INAV
 Curve = Callable[[float], float]  #: from a stick, 0 to 1, to a rate [degrees/s] or a share; increasing
 
 _KINDS: Final = ("betaflight", "raceflight", "kiss", "actual", "quick")
-_STEPS: Final = 24
+_STEPS: Final = 24  #: of the bisection
 
 
 @dataclass(frozen=True, slots=True)
