@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import prose
 import pytest
-
-from scripts import prose
 
 STIFF = "Who comes later waits in vain. The one who was told goes on by itself for so long.\n"
 PLAIN = "Late subscribers request a key frame. Return the newest sample, or None after `timeout_s`.\n"

@@ -31,7 +31,7 @@ def test_a_fault_that_ends_when_sticks_arrive_is_not_reported(run: Run) -> None:
     with BetaflightFirmware(world(), port=0) as firmware:
         ended = run("doctor", firmware.address)
     assert ended.code == 0, ended.out
-    assert "✓ arming: it reports nothing that keeps it from being armed" in ended.out
+    assert "✓ arming: it reports nothing that prevents arming" in ended.out
     assert "RXLOSS" not in ended.out
 
 
@@ -39,7 +39,7 @@ def test_a_vehicle_that_is_not_there(run: Run) -> None:
     ended = run("doctor", f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}")
     assert ended.code == 1
     assert "✗ vehicle: its link is lost: no message on udpin" in ended.out
-    assert "→ have the vehicle send to UDP port" in ended.out
+    assert "→ point the vehicle at UDP port" in ended.out
 
 
 def test_a_vehicle_that_has_not_been_looked_for_long_enough(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

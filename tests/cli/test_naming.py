@@ -89,9 +89,9 @@ def test_a_network_without_a_place_is_searched_by_multicast(words: list[str], me
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        ("nonsense/x", "'nonsense/x' is no network address: it looks like 10.0.0.5:7447"),
-        ("host:70000", "is no network address"),
-        ("nowhere.invalid:7447", "cannot join the network: the host's name is not known"),
+        ("nonsense/x", "'nonsense/x' is not a network address, such as 10.0.0.5:7447"),
+        ("host:70000", "is not a network address"),
+        ("nowhere.invalid:7447", "cannot join the network: the host's name is unknown"),
     ],
 )
 def test_a_wrong_network_is_refused_without_a_library_s_paths(run: Run, where: str, said: str) -> None:

@@ -31,7 +31,7 @@ def test_invalid_addresses_are_reported(run: Run) -> None:
     ):
         ended = run(*words)
         assert ended.code == 2
-        assert "is no network address" in ended.err
+        assert "is not a network address" in ended.err
 
 
 @pytest.mark.parametrize(
