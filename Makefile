@@ -18,7 +18,7 @@ help:
 	@echo "make test-core                               the core's tests, without all that plugs into it, in 1 minute"
 	@echo "make test-room ROOM=client                   the tests of one room that start no processes"
 	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
-	@echo "make check                                   lint, format, types, import contracts, budgets"
+	@echo "make check                                   lint, format, types, import contracts, budgets, prose"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
 	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
 	@echo "make docs                                    the tables of the code, and the documentation as a site: build/site"
@@ -69,6 +69,7 @@ check: $(VENV)/.installed-dev
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/house.py --check
 	$(BIN)/python scripts/paths.py --check
+	$(BIN)/python scripts/prose.py --check
 
 # Three minutes by default; an hour by hand: make chaos ARGS="--seconds 3600".
 chaos: $(VENV)/.installed-dev

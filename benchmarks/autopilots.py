@@ -1,4 +1,4 @@
-"""Real firmware in the simulated world: it flies a square and follows a marker, and is held against the truth.
+"""Real firmware in the simulated world: flies a square and follows a marker, compared with the truth.
 
 ``SKYLOOP_ARDUCOPTER=… python -m benchmarks.autopilots ardupilot`` prints the figures of ``docs/autopilots.md``.
 """
@@ -47,15 +47,15 @@ class Spread(msgspec.Struct, frozen=True):
 
 
 class AgreementRow(msgspec.Struct, frozen=True):
-    """What the firmware said of itself, against the truth, over a time in the air."""
+    """The firmware's own state compared with the truth, over a time in the air."""
 
     seconds: float
     samples: int
     roll_deg: Spread
     pitch_deg: Spread
     yaw_deg: Spread
-    position_m: Spread | None  #: distance; None: it does not report its position
-    position_wander_m: Spread | None  #: the same without its mean, which is what its GPS was wrong by meanwhile
+    position_m: Spread | None  #: distance; None: position not reported
+    position_wander_m: Spread | None  #: the same without its mean, the GPS error during the flight
 
 
 class FlightRow(msgspec.Struct, frozen=True):
@@ -72,7 +72,7 @@ class FlightRow(msgspec.Struct, frozen=True):
 
 @dataclass
 class Agreement:
-    """Compares each sample with the truth beside it. ``angles``: roll, pitch, yaw [rad]."""
+    """Compares each sample with the simultaneous truth. ``angles``: roll, pitch, yaw [rad]."""
 
     angles: list[tuple[float, float, float]] = field(default_factory=list)
     errors_m: list[tuple[float, ...]] = field(default_factory=list)
@@ -80,7 +80,7 @@ class Agreement:
     ended_ns: int = 0
 
     def look(self, feedback: Feedback) -> None:
-        """Note a sample."""
+        """Record a sample."""
         native = feedback.native or {}
         true = [native.get(f"truth.{name}") for name in ("roll", "pitch", "yaw", "x", "y", "z")]
         said = (feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad)
@@ -109,13 +109,13 @@ class Agreement:
 
 
 def address(autopilot: str, **options: str) -> str:
-    """Return the address of a drone that this firmware flies."""
+    """Return the address of a drone flown by this firmware."""
     return "sim://?" + urlencode({"autopilot": autopilot, **options}, safe="/,")
 
 
 @contextmanager
 def compared(drone: skyloop.Drone) -> Iterator[Agreement]:
-    """Compare the drone's state with the truth meanwhile."""
+    """Compare the drone's state with the truth during the block."""
     agreement = Agreement()
     listener = drone.on_feedback(agreement.look, inline=True)
     try:
@@ -125,13 +125,13 @@ def compared(drone: skyloop.Drone) -> Iterator[Agreement]:
 
 
 def take_off(drone: skyloop.Drone, ready_s: float = READY_S) -> float:
-    """Take off as soon as the firmware lets itself be armed.
+    """Take off as soon as the firmware can be armed.
 
     Returns:
-        How long that took [s].
+        The time until then [s].
 
     Raises:
-        SkyloopError: It did not.
+        SkyloopError: The firmware could not be armed, or did not take off.
     """
     begun_s = time.monotonic()
     while True:
@@ -146,7 +146,7 @@ def take_off(drone: skyloop.Drone, ready_s: float = READY_S) -> float:
 
 
 def wait_ready(drone: skyloop.Drone, ready_s: float = READY_S) -> None:
-    """Wait until an autopilot is connected and, if it is one that says so (MAVLink), can be armed."""
+    """Wait until an autopilot is connected and, if it reports that (MAVLink), can be armed."""
     until_s = time.monotonic() + ready_s
     while time.monotonic() < until_s:
         feedback = drone.feedback()
@@ -158,13 +158,13 @@ def wait_ready(drone: skyloop.Drone, ready_s: float = READY_S) -> None:
 
 
 def fly_square(drone: skyloop.Drone, seconds: float, least_corners: int = 0) -> int:
-    """Fly the square again and again, for so long and until so many corners; return the corners that were reached."""
+    """Fly the square repeatedly, for this time and at least this many corners; return the corners reached."""
     until_s, corners = time.monotonic() + seconds, 0
     while time.monotonic() < until_s or corners < least_corners:
         x, y = SQUARE[corners % len(SQUARE)]
         try:
             drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)
-        except RefusedError:  # a busy computer: it hovered meanwhile, and is sent on
+        except RefusedError:  # a busy computer: it hovered meanwhile, so send it on
             time.sleep(0.5)
         else:
             corners += 1
@@ -182,7 +182,7 @@ def fly(autopilot: str, square_s: float, follow_s: float, say: Callable[[str], o
     """Fly everything in one flight.
 
     Raises:
-        SkyloopError: It could not be started, did not take off, or did not get to a corner.
+        SkyloopError: It could not be started, did not take off, or did not reach a corner.
     """
     begun_s = time.monotonic()
     with skyloop.connect(address(autopilot, **options), timeout_s=30.0) as drone:
@@ -216,7 +216,7 @@ def main() -> None:
     parser.add_argument("autopilot", choices=KINDS)
     parser.add_argument("--square", type=float, default=MINUTE_S, metavar="S", help="flying the square [60]")
     parser.add_argument("--follow", type=float, default=FOLLOW_S, metavar="S", help="following the marker [30]")
-    parser.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="more options of sim://")
+    parser.add_argument("--option", action="append", default=[], metavar="KEY=VALUE", help="further options of sim://")
     given = parser.parse_args()
     options = dict(option.split("=", 1) for option in given.option)
     row = fly(given.autopilot, given.square, given.follow, lambda text: print(text, flush=True), **options)

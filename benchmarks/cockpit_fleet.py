@@ -1,13 +1,13 @@
-"""The cockpit's video of many drones: frames and their age in each pane, bytes, and what everything costs.
+"""The cockpit's video of many drones: frames and their age in each pane, bytes, and the cost of each part.
 
 ``python -m benchmarks.cockpit_fleet --drones 12 --seconds 20`` starts the simulator, a cockpit and headless Chromium on
-this machine, in a directory of sockets of their own. It shows all drones as H.264, then as JPEGs, as to a browser
+this machine, with a separate directory of sockets. It shows all drones as H.264, then as JPEGs, as for a browser
 without a decoder; then one drone's pane in both. It needs Chromium and ``pip install playwright``.
 
-An age is from a frame's capture until the browser begins the animation frame that shows it, on one clock: the page's
-clock is compared with this process's. Shares are of one core, by the processor time of each process with its children:
-on a busy machine they still tell what work costs, while frames are only as many as the machine had time for. The load
-before and after is printed.
+An age runs from a frame's capture until the browser begins the animation frame that shows it, on one clock: the page's
+clock is compared with this process's. Shares are of one core, from the processor time of each process and its children:
+on a busy machine they remain meaningful, while the number of frames depends on the machine. The load before and after
+is printed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NAME: Final = "drone"
 WARM_UP_S: Final = 5.0
 SIZE: Final = (1440, 900)
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
-#: Counts what comes over WebSockets, and notes when each frame is shown.
+#: Counts the bytes from WebSockets, and records when each frame is shown.
 _COUNT: Final = """
 window.received = 0;
 window.shown = [];
@@ -53,24 +53,24 @@ new MutationObserver((changes) => {
 """
 _NO_DECODER: Final = "delete window.VideoDecoder"
 _PANES: Final = "[...document.querySelectorAll('.tile, .camera')].map((pane) => pane.dataset.form ?? '')"
-_TRIES: Final = 30  # of reading the page's clock: the quickest counts
+_TRIES: Final = 30  # readings of the page's clock: the quickest counts
 
 
 class Moment(NamedTuple):
-    """What was counted until some time."""
+    """The counts up to some time."""
 
     at_s: float
-    bytes: int  #: that the page received over WebSockets
+    bytes: int  #: received by the page over WebSockets
     cpu_s: dict[str, float]  #: by part
 
 
 class Watched(NamedTuple):
-    """What a page showed for a while."""
+    """The result of watching a page."""
 
     name: str
     panes: int
     seconds: float
-    ages_s: list[float]  #: of all frames that it showed
+    ages_s: list[float]  #: of all frames shown
     bytes: int
     cpu_s: dict[str, float]  #: by part
 
@@ -78,9 +78,9 @@ class Watched(NamedTuple):
 def main() -> None:
     """Measure, and print the results."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.cockpit_fleet", description=__doc__.splitlines()[0])
-    parser.add_argument("--drones", type=int, default=12, help="how many (default: 12)")
-    parser.add_argument("--seconds", type=float, default=20.0, help="to measure each for (default: 20)")
-    parser.add_argument("--sim", nargs="*", default=[], help="more options of skyloop sim, e.g. world=empty fps=10")
+    parser.add_argument("--drones", type=int, default=12, help="number of drones (default: 12)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each measurement (default: 20)")
+    parser.add_argument("--sim", nargs="*", default=[], help="further options of skyloop sim, e.g. world=empty fps=10")
     given = parser.parse_args()
     machine = Machine.here()
     found = []
@@ -103,7 +103,7 @@ def main() -> None:
 
 
 def watch(name: str, page: Page, panes: int, parts: dict[str, int], seconds: float) -> Watched:
-    """Watch a page for a while."""
+    """Watch a page for this time."""
     offset_s = clock_offset_s(page)
     page.evaluate("window.shown = []")
     before = moment(page, parts)
@@ -127,7 +127,7 @@ def clock_offset_s(page: Page) -> float:
 
 
 def report(found: list[Watched]) -> list[str]:
-    """Return what was seen as lines, a column for each page."""
+    """Return the results as lines, a column for each page."""
     rows: list[tuple[str, list[str]]] = [
         ("", [one.name for one in found]),
         ("frames/s of a pane", [f"{len(one.ages_s) / one.seconds / one.panes:.1f}" for one in found]),
@@ -142,13 +142,13 @@ def report(found: list[Watched]) -> list[str]:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return a quantile; not a number if there is no value."""
+    """Return a quantile; NaN without values."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))] if values else math.nan
 
 
 @contextmanager
 def running(drones: int, options: list[str]) -> Iterator[tuple[Browser, str, dict[str, int]]]:
-    """The simulator, a browser, and the address of a cockpit; and the process of each part."""
+    """Run a simulator, a browser and a cockpit; yield browser, address, and the process of each part."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(
@@ -166,7 +166,7 @@ def running(drones: int, options: list[str]) -> Iterator[tuple[Browser, str, dic
         stack.callback(simulator.terminate)
         assert simulator.stdout is not None
         for _ in range(drones):
-            simulator.stdout.readline()  # says that it is ready
+            simulator.stdout.readline()  # reports that it is ready
         cockpit = stack.enter_context(CockpitProcess(recordings=Path(folder) / "recordings"))
         address = cockpit.address()
         playwright = stack.enter_context(sync_playwright())
@@ -185,7 +185,7 @@ def moment(page: Page, parts: dict[str, int]) -> Moment:
 
 
 def children_of(pid: int) -> list[int]:
-    """Return all processes that descend from one."""
+    """Return all descendants of a process."""
     children: dict[int, list[int]] = {}
     for process in Path("/proc").iterdir():
         if process.name.isdigit() and (fields := _stat(int(process.name))):
@@ -199,20 +199,20 @@ def children_of(pid: int) -> list[int]:
 
 
 def cpu_of(pid: int) -> float:
-    """Return the processor time of a process without its children [s]; 0 if it is gone."""
+    """Return the processor time of a process without its children [s]; 0 if it has ended."""
     fields = _stat(pid)
     return (int(fields[11]) + int(fields[12])) / _TICKS if fields else 0.0
 
 
 def command_of(pid: int) -> str:
-    """Return the command line of a process; empty if it is gone."""
+    """Return the command line of a process; empty if it has ended."""
     with suppress(OSError):
         return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
     return ""
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the fields of ``/proc/PID/stat`` after the name; none if it is gone."""
+    """Return the fields of ``/proc/PID/stat`` after the name; none if it has ended."""
     with suppress(OSError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return []

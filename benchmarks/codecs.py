@@ -1,7 +1,7 @@
-"""``python -m benchmarks.codecs``: what the AR.Drones' video and navdata take of one core.
+"""``python -m benchmarks.codecs``: processor time of the AR.Drones' video and navdata on one core.
 
-It is measured in a process that has only one core from its start on, as libraries start as many threads as they find
-cores. Processor time is counted, without what other programs took meanwhile.
+Measured in a process limited to one core from its start, because libraries start a thread for each core they find.
+Counts processor time, without that of other programs.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 from skyloop.vehicles.emulation.video import GROUP, Encoder
 
-UVLC_PER_S: Final = 15.0  #: what an AR.Drone 1 sends: the target
+UVLC_PER_S: Final = 15.0  #: the target: the rate of an AR.Drone 1
 PICTURES: Final = 2 * GROUP  #: two groups of H.264 pictures, each with a key frame
-UVLC_PICTURES: Final = 6  #: each is complete in itself
-BITRATE_KBPS: Final = 4000  #: of H.264, the most that the drone is asked for
+UVLC_PICTURES: Final = 6  #: each is independent of the others
+BITRATE_KBPS: Final = 4000  #: of H.264, the maximum requested from the drone
 FPS: Final = 30.0
 
 Work = Callable[[], object]
@@ -56,18 +56,18 @@ class CodecResults(msgspec.Struct, frozen=True):
 
     machine: Machine
     rows: list[CodecRow]
-    skipped: dict[str, str]  #: why something was left out
+    skipped: dict[str, str]  #: reasons for omitted parts
 
 
 Progress = Callable[[float], None]
 
 
 def measure(seconds: float, progress: Progress = lambda _: None) -> CodecResults:
-    """Measure in a process of its own, on one core.
+    """Measure in a separate process, on one core.
 
     Args:
-        seconds: About how long, beside the time for drawing the pictures [s].
-        progress: Called with the share that is done, 0 to 1.
+        seconds: Approximate duration, plus the time for drawing the pictures [s].
+        progress: Called with the share done, 0 to 1.
     """
     machine = Machine.here()  # with all its cores
     with Workers() as workers:
@@ -78,11 +78,11 @@ def measure(seconds: float, progress: Progress = lambda _: None) -> CodecResults
 
 
 def measure_here(seconds: float, progress: Progress = lambda _: None) -> CodecResults:
-    """Measure in this process, whatever cores it has.
+    """Measure in this process, with its cores.
 
     Args:
-        seconds: About how long, beside the time for drawing the pictures [s].
-        progress: Called with the share that is done, 0 to 1.
+        seconds: Approximate duration, plus the time for drawing the pictures [s].
+        progress: Called with the share done, 0 to 1.
     """
     rows: list[CodecRow] = []
     skipped: dict[str, str] = {}
@@ -105,7 +105,7 @@ def measure_here(seconds: float, progress: Progress = lambda _: None) -> CodecRe
     try:
         stream = h264(large)
         title = f"a rendered picture, {H264_360P.width}×{H264_360P.height}"
-        # That the first comes again after the last is no matter: it is a key frame.
+        # The first may follow the last: it is a key frame.
         show = partial(PaveVideo().decode, show=True)
         come = [Coded(frame, frame.is_key, 0, 0, 0) for frame in stream]
         add("H.264, decode to BGR", title, [len(f.payload) for f in stream], [partial(show, one) for one in come])
@@ -117,8 +117,8 @@ def measure_here(seconds: float, progress: Progress = lambda _: None) -> CodecRe
 
 
 def timed(work: Sequence[Work], seconds: float, progress: Progress) -> list[int]:
-    """Return the processor time of each call [ns]; all the work is done in its order, over and over."""
-    work[0]()  # the first call makes tables and buffers
+    """Return the processor time of each call [ns], repeating all the work in order."""
+    work[0]()  # the first call creates tables and buffers
     times = []
     for _ in rounds(seconds, progress):
         for call in work:
@@ -141,7 +141,7 @@ def rendered(number: int) -> tuple[list[Image], list[Image]]:
 
 
 def h264(pictures: Sequence[Image]) -> list[PaveFrame]:
-    """Encode pictures as an AR.Drone 2 sends them.
+    """Encode pictures like an AR.Drone 2.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -151,7 +151,7 @@ def h264(pictures: Sequence[Image]) -> list[PaveFrame]:
     frames = []
     for number, image in enumerate(pictures, 1):
         encoded = encoder.encode(image[: image.shape[1] * form.height // form.width])
-        assert encoded is not None  # without delay each picture gives a frame at once
+        assert encoded is not None  # without delay, each picture yields a frame at once
         kind = FrameType.IDR if encoded.key else FrameType.P
         stamp_ms = round(number * 1e3 / FPS)
         frames.append(
@@ -163,7 +163,7 @@ def h264(pictures: Sequence[Image]) -> list[PaveFrame]:
 
 
 def full_navdata() -> bytes:
-    """Return a datagram with every option that is known."""
+    """Return a datagram with every known option."""
     return navdata.encode(navdata.State.FLYING, 1, [kind() for kind in LAYOUTS])
 
 

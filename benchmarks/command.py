@@ -32,10 +32,10 @@ from skyloop.errors import MissingExtraError, UsageError
 
 def peers(
     peers: Annotated[
-        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq, several with commas, all or none")
+        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq (comma-separated), all or none")
     ] = "all",
     ros_python: Annotated[
-        str | None, typer.Option(help="The Python that has rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
+        str | None, typer.Option(help="Python interpreter with rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
     ] = None,
     sizes: Sizes = None,
     seconds: Seconds = None,
@@ -54,7 +54,7 @@ def peers(
 
 
 def loop(sizes: Sizes = None, seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
-    """Measure the way from a frame to the command that it causes, by stage."""
+    """Measure the path from a frame to the resulting command, by stage."""
     from benchmarks.measuring import loop
     from benchmarks.measuring.tables import loop_table
 
@@ -65,34 +65,34 @@ def loop(sizes: Sizes = None, seconds: Seconds = None, minutes: Minutes = None, 
 
 
 def load(
-    observers: Annotated[str | None, typer.Option(help="How many, one case for each number [default: 1,8,32]")] = None,
+    observers: Annotated[str | None, typer.Option(help="Numbers of observers, one case each [default: 1,8,32]")] = None,
     slow_processor: Annotated[
-        bool, typer.Option("--slow-processor/--no-slow-processor", help="One of 200 ms a frame")
+        bool, typer.Option("--slow-processor/--no-slow-processor", help="A processor of 200 ms per frame")
     ] = True,
     stuck: Annotated[bool, typer.Option("--stuck/--no-stuck", help="One of 8 observers stopped")] = True,
     recorder: Annotated[
-        bool, typer.Option("--recorder/--no-recorder", help="Record 640x480 at 30 frames a second")
+        bool, typer.Option("--recorder/--no-recorder", help="Record 640x480 at 30 frames per second")
     ] = True,
     disk_full: Annotated[
-        bool, typer.Option("--disk-full/--no-disk-full", help="The same onto a disk that fills up")
+        bool, typer.Option("--disk-full/--no-disk-full", help="The same to a disk that fills up")
     ] = True,
-    record_to: Annotated[Path | None, typer.Option(help="The folder that the recorder writes to")] = None,
+    record_to: Annotated[Path | None, typer.Option(help="Folder for the recorder")] = None,
     pages: Annotated[
-        int, typer.Option(min=0, max=50, help="Of a cockpit, on 640x480 at 15 frames a second; 0 for none")
+        int, typer.Option(min=0, max=50, help="Pages of a cockpit, with 640x480 at 15 frames per second; 0 for none")
     ] = 10,
     encoded: Annotated[
         bool, typer.Option("--encoded/--no-encoded", help="8 viewers of H.264, one of them stopped")
     ] = True,
     viewed: Annotated[
-        bool, typer.Option("--viewed/--no-viewed", help="A viewer of skyloop view --foxglove, and one that is stopped")
+        bool, typer.Option("--viewed/--no-viewed", help="A viewer of skyloop view --foxglove, and a stopped one")
     ] = True,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure what observers, a slow processor, a recorder, pages of the cockpit and a viewer do to the pilot.
+    """Measure how observers, a slow processor, a recorder, cockpit pages and a viewer affect the pilot.
 
-    It starts up to 35 processes. Nothing else should run meanwhile.
+    Starts up to 35 processes. Close all other programs first.
     """
     from benchmarks import load, tables
     from benchmarks.onlookers import cockpit_problem, recorder_problem, view_problem
@@ -130,7 +130,7 @@ def load(
 
 
 def codecs(seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
-    """Measure what the AR.Drones' video and navdata take of one core."""
+    """Measure the processor time of the AR.Drones' video and navdata on one core."""
     from benchmarks import codecs, tables
 
     wanted_s = duration_s(seconds, minutes)
@@ -141,9 +141,7 @@ def codecs(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
 
 
 def network(
-    losses: Annotated[
-        str | None, typer.Option(help="Shares of the packets that are lost [default: 0,0.01,0.1,0.3]")
-    ] = None,
+    losses: Annotated[str | None, typer.Option(help="Shares of packets lost [default: 0,0.01,0.1,0.3]")] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
@@ -161,12 +159,12 @@ def network(
 def swarm(
     drones: Annotated[int, typer.Option(min=1, max=50, help="How many")] = 10,
     users: Annotated[int, typer.Option(min=1, max=10, help="Processes that share the drones")] = 1,
-    observers: Annotated[str | None, typer.Option(help="How many look on [default: 0]")] = None,
+    observers: Annotated[str | None, typer.Option(help="Numbers of observers [default: 0]")] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Fly simulated drones over the network whose users stand still and die, and count missed failsafes."""
+    """Fly simulated drones over the network with users that stall and die, and count missed failsafes."""
     from benchmarks import swarm, tables
 
     wanted_s, looking_on = duration_s(seconds, minutes), parse_numbers(observers, "0")[0]
@@ -178,12 +176,14 @@ def swarm(
 
 
 def scale(
-    counts: Annotated[str | None, typer.Option(help="Of proxies, and of observers [default: 1,2,5,10,20,50]")] = None,
+    counts: Annotated[
+        str | None, typer.Option(help="Numbers of proxies, and of observers [default: 1,2,5,10,20,50]")
+    ] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure more and more proxies and observers on one host."""
+    """Measure growing numbers of proxies and observers on one host."""
     from benchmarks import scale, tables
     from benchmarks.scale_figure import draw
 
@@ -196,14 +196,16 @@ def scale(
 
 
 def fleet(
-    vehicles: Annotated[int, typer.Option(min=0, max=500, help="How many in one host; 0: none")] = 100,
-    observers: Annotated[int, typer.Option(min=0, max=100, help="Of one of them, in another case; 0: none")] = 50,
-    networked: Annotated[int, typer.Option(min=0, max=500, help="How many over the network; 0: none")] = 50,
+    vehicles: Annotated[int, typer.Option(min=0, max=500, help="Vehicles in one host; 0: none")] = 100,
+    observers: Annotated[
+        int, typer.Option(min=0, max=100, help="Observers of one of them, in another case; 0: none")
+    ] = 50,
+    networked: Annotated[int, typer.Option(min=0, max=500, help="Vehicles over the network; 0: none")] = 50,
     mavlink: Annotated[
         int, typer.Option(min=0, max=500, help="Emulated MAVLink vehicles, half of them in formation; 0: none")
     ] = 40,
     busy_ms: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="Processor time that each driver takes for a command, to overload")
+        float, typer.Option(min=0.0, max=100.0, help="Processor time of each driver for a command, to create overload")
     ] = 0.0,
     seconds: Seconds = None,
     minutes: Minutes = None,

@@ -1,11 +1,11 @@
-"""Compares a run with the last one on the pages, so that a loss shows.
+"""Compare a run with the last one on the pages, to detect regressions.
 
-``python -m benchmarks.compare results`` reads what ``python -m benchmarks.… --output results`` wrote (and ``skyloop
-bench sim --json``, as ``sim.json``), and compares it with ``docs/measured``; with a second folder, with that. Delays
+``python -m benchmarks.compare results`` reads the output of ``python -m benchmarks.… --output results`` (and of
+``skyloop bench sim --json``, as ``sim.json``), and compares it with ``docs/measured``, or with a second folder. Delays
 are compared as multiples of the bare hand-over's in their own run, so that a faster or busier machine changes nothing;
-the simulator, which has no such floor, as it was measured, which says something on one machine only.
+the simulator, which has no such floor, is compared as measured, which is only meaningful on one machine.
 
-What is more than :data:`WORSE` times as slow as before is marked, and the exit status is 1 then.
+Figures more than :data:`WORSE` times as slow as before are marked, and the exit status is then 1.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ WORSE: Final = 1.15  #: medians of one machine vary by less from run to run, as 
 
 
 class Change(NamedTuple):
-    """One figure in both runs: the smaller the better."""
+    """A figure in both runs: the smaller the better."""
 
     what: str
     unit: str
     before: float
     now: float
-    judged: bool = True  #: whether it counts as a loss when it is much larger; 99th percentiles vary too much
+    judged: bool = True  #: whether a large increase counts as a loss; 99th percentiles vary too much
 
     @property
     def ratio(self) -> float:
-        """Now to before."""
+        """The ratio of now to before."""
         return self.now / self.before
 
     @property
@@ -55,15 +55,15 @@ class Change(NamedTuple):
 
 
 def compare(now: Path, before: Path) -> list[Change]:
-    """Return all figures that both folders have.
+    """Return all figures present in both folders.
 
     Args:
-        now: With the results of the new run.
-        before: With those to compare with.
+        now: Folder with the results of the new run.
+        before: Folder with the results to compare with.
 
     Raises:
-        UsageError: They have none in common.
-        FileFormatError: A file holds anything else.
+        UsageError: They have no results in common.
+        FileFormatError: A file is not a results file.
     """
     found = [*_delays(now, before), *_loop(now, before), *_sim(now, before)]
     if not found:
@@ -85,7 +85,7 @@ def _delays(now: Path, before: Path) -> Iterator[Change]:
 
 
 def _to_floor(results: delays.Delays, size: str, channel: str) -> tuple[float, float] | None:
-    """The median and the 99th percentile as multiples of the floor's."""
+    """Return the median and the 99th percentile as multiples of the floor's."""
     ours, floor = (results.summary(name, size, channel) for name in (OURS.name, FLOOR.name))
     if ours is None or floor is None:
         return None
@@ -93,7 +93,7 @@ def _to_floor(results: delays.Delays, size: str, channel: str) -> tuple[float, f
 
 
 def _loop(now: Path, before: Path) -> Iterator[Change]:
-    """The loop, as a multiple of what the bare hand-over takes for its frame and its command."""
+    """Yield the loop, as a multiple of the bare hand-over's time for its frame and its command."""
     if not (_both(now, before, "loop.json") and _both(now, before, "delays.json")):
         return
     new, old = loop.load(now / "loop.json"), loop.load(before / "loop.json")
@@ -151,13 +151,15 @@ def table(changes: list[Change]) -> Table:
 
 def command(
     folder: Annotated[
-        Path, typer.Argument(help="With the JSON files of a run (--output)", exists=True, file_okay=False)
+        Path, typer.Argument(help="Folder with the JSON files of a run (--output)", exists=True, file_okay=False)
     ],
-    before: Annotated[Path, typer.Argument(help="With those of another run", exists=True, file_okay=False)] = MEASURED,
+    before: Annotated[
+        Path, typer.Argument(help="Folder with those of another run", exists=True, file_okay=False)
+    ] = MEASURED,
 ) -> None:
     """Compare a run with the last one in docs/measured.
 
-    Exits with 1 where something has become slower. Example: python -m benchmarks.compare results
+    Exits with 1 if something has become slower. Example: python -m benchmarks.compare results
     """
     changes = compare(folder, before)
     for shown in as_rich([table(changes)], f"{folder} beside {before}"):

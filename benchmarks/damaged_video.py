@@ -1,12 +1,11 @@
-"""``python -m benchmarks.damaged_video``: what is shown of video that loses datagrams, and how much of that is right.
+"""``python -m benchmarks.damaged_video``: how much video is shown after losing datagrams, and how much of it correctly.
 
-The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, ``tests/support/recordings.py``) is sent
-three ways: as it is, in pieces of the stream that its drone sends; encoded anew as the emulated Tello does, at the
-bit rate that it would choose, in that drone's datagrams; and as it is once more, in pieces of an RTP packet's size,
-to the decoder of cameras on the network. Of each, a share of the pieces is lost, by a seed. FFmpeg's own decoder
-(PyAV's, as it comes, with its concealment of errors) gets what is left of the same pictures, cut where they begin,
-which no FFmpeg would know as surely. A picture counts as right if its PSNR beside that of the undamaged stream is 40
-dB or more.
+The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, ``tests/support/recordings.py``) is sent in
+three ways: unchanged, in pieces of the drone's stream; re-encoded like the emulated Tello, at its bit rate and in its
+datagrams; and unchanged again, in pieces of an RTP packet's size, to the decoder of network cameras. A seeded share of
+the pieces is lost each time. FFmpeg's own decoder (PyAV's, with its error concealment) gets the remaining pieces of the
+same pictures, cut at their beginnings, which FFmpeg alone could not do as surely. A picture counts as right if its PSNR
+against that of the undamaged stream is 40 dB or more.
 """
 
 from __future__ import annotations
@@ -46,13 +45,13 @@ _FILM: Final = FIXTURES / "ardrone2" / "video-8s.pave"
 Pixels = NDArray[np.uint8]
 #: Pictures by their numbers.
 Shown = dict[int, Pixels]
-#: What arrives of each picture.
+#: The remaining pieces of each picture.
 Remains = list[list[bytes]]
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What was shown of one stream with one loss, all seeds together."""
+    """The pictures shown of one stream with one loss, over all seeds."""
 
     stream: str
     loss: float
@@ -74,7 +73,7 @@ def cut(data: bytes, size: int) -> list[bytes]:
 
 
 def lost(stream: list[list[bytes]], share: float, seed: int) -> Remains:
-    """Return what is left of pictures when this share of their pieces is lost."""
+    """Return the remaining pieces of pictures after losing this share."""
     chance = random.Random(seed)
     return [[piece for piece in picture if chance.random() >= share] for picture in stream]
 
@@ -83,7 +82,7 @@ def lost(stream: list[list[bytes]], share: float, seed: int) -> Remains:
 
 
 def by_ffmpeg(stream: Remains) -> Shown:
-    """FFmpeg's decoder as it comes."""
+    """Decode with FFmpeg's decoder, unchanged."""
     context = av.CodecContext.create("h264", "r")
     context.thread_count = 1
     shown: Shown = {}
@@ -99,7 +98,7 @@ def by_ffmpeg(stream: Remains) -> Shown:
 
 
 def by_ardrone(stream: Remains) -> Shown:
-    """The AR.Drone 2's driver."""
+    """Decode with the AR.Drone 2's driver."""
     assembly, decoder = PaveAssembly(0), PaveVideo()
     shown: Shown = {}
     for number, picture in enumerate(stream):
@@ -113,7 +112,7 @@ def by_ardrone(stream: Remains) -> Shown:
 
 
 def by_tello(stream: Remains, concealed: int = 0) -> Shown:
-    """The Tello's driver."""
+    """Decode with the Tello's driver."""
     assembly, decoder = Assembly(), TelloVideo(concealed)
     shown: Shown = {}
     for number, picture in enumerate(stream):
@@ -126,7 +125,7 @@ def by_tello(stream: Remains, concealed: int = 0) -> Shown:
 
 
 def by_camera(stream: Remains) -> Shown:
-    """The decoder of cameras on the network."""
+    """Decode with the decoder of network cameras."""
     inspector, decoder = Inspector(), LiveDecoder()
     context: Any = av.CodecContext.create("h264", "r")
     shown: Shown = {}
@@ -154,7 +153,7 @@ def ardrone_stream() -> tuple[list[list[bytes]], list[list[bytes]]]:
 
 
 def tello_stream(kbps: int) -> list[list[bytes]]:
-    """Return the film as the emulated Tello sends it at this bit rate, in its datagrams, picture by picture."""
+    """Return the film as sent by the emulated Tello at this bit rate, in its datagrams, picture by picture."""
     packer, settings = TelloPacker(), OneCamera("front", FPS, kbps)
     packed = [packer.pack(pixels, settings, 0) for pixels in film_pictures()]
     return [pieces(each.data) for each in packed if each is not None]
@@ -218,10 +217,10 @@ def _bgr(image: av.VideoFrame) -> Pixels:
 
 
 def main() -> None:
-    """Measure, print a table, and write it where it is asked for."""
+    """Measure, print a table, and write it if requested."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.damaged_video", description=__doc__)
     parser.add_argument("--seeds", type=int, default=10, metavar="N", help="runs with each loss [default: 10]")
-    parser.add_argument("--output", type=Path, metavar="FOLDER", help="where damaged_video.json is written")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="folder for damaged_video.json")
     given = parser.parse_args()
     if not _FILM.is_file():
         raise SystemExit(f"there is no {_FILM}: set SKYLOOP_FIXTURES to the folder of the recordings")

@@ -1,9 +1,9 @@
-"""``python -m benchmarks.detector``: what the detector of the simulator's figures finds in pictures it does not know.
+"""``python -m benchmarks.detector``: results of the detector of the simulator's figures on unknown pictures.
 
-Of ``street`` and ``yard``, at places and times of seeds that no training uses, as the camera sees them and spoilt. A
-figure counts if it is at least 14 pixels high, at least half visible and, at the picture's edge, 8 pixels of it are in
-view (pixels of a picture 320 wide); that one which does not count is found is neither right nor wrong. Some two minutes
-on one core.
+Pictures of ``street`` and ``yard``, at places and times of seeds never used for training, as the camera sees them and
+degraded. A figure counts if it is at least 14 pixels high, at least half visible and, at the picture's edge, 8 pixels
+of it are in view (pixels of a picture 320 wide); detections of other figures are neither right nor wrong. Takes some
+two minutes on one core.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ WORLDS: Final = ("street", "yard")
 SEEDS: Final = (9001, 9002, 9003, 9004)
 SCORE: Final = 0.4  #: of ``simulated_detector``
 LEAST_PX, LEAST_VISIBLE, LEAST_CUT_PX = 14, 0.5, 8
-_SEEN: Final = 0.02  # a thing of which less is visible is not in the picture
+_SEEN: Final = 0.02  # a thing with a smaller visible share is not in the picture
 _TILT: Final = math.radians(20)
-_LOW: Final = 0.05  # score from which detections count for the average precision
+_LOW: Final = 0.05  # minimum score of detections that count for the average precision
 _HEIGHTS: Final = ((8, 14), (14, 24), (24, 48), (48, 96), (96, 1000))
 _SHARES: Final = ((0.9, 1.01), (0.5, 0.9), (0.25, 0.5))
 
@@ -41,7 +41,7 @@ Judge = Callable[[TargetBox, float], bool]
 
 
 def counts(box: TargetBox, scale: float = 1.0) -> bool:
-    """Whether a thing has to be found; ``scale`` from the picture to one 320 pixels wide."""
+    """Return whether a thing must be found; ``scale`` from the picture to one 320 pixels wide."""
     return scale * box.box[3] >= LEAST_PX and box.visible >= LEAST_VISIBLE and _in_view(box, scale)
 
 
@@ -78,7 +78,7 @@ def _corners(boxes: Sequence[Sequence[float]]) -> Any:
 
 
 def conditions(count: int) -> Iterator[tuple[str, list[Picture]]]:
-    """Yield what the pictures are, and the pictures: ``count`` of each world and seed."""
+    """Yield a description of pictures, and the pictures: ``count`` of each world and seed."""
     rng = np.random.default_rng(1)
     plain = list(held_back(count))
 
@@ -152,7 +152,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.detector", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("file", type=Path, nargs="?", default=SIMULATED_WEIGHTS, help="ONNX file; without: the shipped")
+    parser.add_argument(
+        "file", type=Path, nargs="?", default=SIMULATED_WEIGHTS, help="ONNX file [default: the shipped one]"
+    )
     parser.add_argument("--count", type=int, default=30, help="pictures of each world and seed [default: 30]")
     options = parser.parse_args()
     print_scores(options.file, options.count)

@@ -1,7 +1,7 @@
-"""Pictures of the simulator's figures for a detector: to train it with, and spoilt as a camera or a codec spoils them.
+"""Pictures of the simulator's figures for a detector: for training, and degraded as by a camera or a codec.
 
-Every picture has its true boxes. Figures and crates stand where chance put them, in the shipped worlds and in worlds
-made up for it, so that a detector learns what they look like and not where they are.
+Every picture has its true boxes. Figures and crates stand at random places, in the shipped worlds and in invented ones,
+so that a detector learns their appearance, not their places.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ _SHIPPED: Final = ("room", "empty", "gates", "pillars", "platform", "windy")  # 
 _GROUNDS: Final = ("asphalt", "brick", "carpet", "checker", "concrete", "grass", "metal", "parquet", "tiles", "wood")
 _SIDES: Final = ("brick", "books", "checker", "concrete", "fabric", "grass", "metal", "plaster", "tiles", "wood")
 _HUNG: Final = ("door", "window", "poster_chart", "poster_landscape", "poster_pattern")
-_GAP_M: Final = 0.004  # of what hangs on a wall or lies on the floor, so that it is in front of it
+_GAP_M: Final = 0.004  # of things on a wall or the floor, so that they are in front of it
 _NEAREST_M: Final = 0.8  # of a figure to the camera
-_NEAR_M, _FAR_M = 12.0, 36.0  # so far away are most, and the others; 36 m make a person 12 pixels high
-_PERSON: Final = np.array([[0.35], [0.35], [0.8]])  # what has to be free around one
-_CAR: Final = np.array([[0.75], [0.75], [0.5]])  # and around either half of a car
+_NEAR_M, _FAR_M = 12.0, 36.0  # distances of most, and of the others; at 36 m a person is 12 pixels high
+_PERSON: Final = np.array([[0.35], [0.35], [0.8]])  # space to keep free around one
+_CAR: Final = np.array([[0.75], [0.75], [0.5]])  # and around each half of a car
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture, BGR, and what is to be seen in it."""
+    """A picture, BGR, and its visible contents."""
 
     image: Image
     boxes: tuple[TargetBox, ...]
@@ -74,7 +74,7 @@ def training_pictures(seed: int, count: int) -> Iterator[Picture]:
 
 
 def spoil(image: Image, rng: Rng, strength: float = 1.0) -> Image:
-    """Return the image as a camera and a codec deliver it: light, colours, blur, noise and compression, by chance."""
+    """Degrade an image randomly like a camera and a codec: light, colours, blur, noise and compression."""
     if rng.random() < 0.7:
         image = relit(image, rng.uniform(1 - 0.5 * strength, 1 + 0.35 * strength), rng, 0.08 * strength)
     if rng.random() < 0.3:
@@ -89,7 +89,7 @@ def spoil(image: Image, rng: Rng, strength: float = 1.0) -> Image:
 
 
 def relit(image: Image, light: float, rng: Rng | None = None, tint: float = 0.0) -> Image:
-    """Return the image under other light: a factor, and where there is chance a gamma, a tint and grey added."""
+    """Change an image's light: a factor, and with a random generator also gamma, tint and grey."""
     values = np.arange(256, dtype=np.float32)
     tables = np.empty((1, 256, 3), np.uint8)
     gamma, lift = (1.0, 0.0) if rng is None else (float(rng.uniform(0.75, 1.35)), float(rng.uniform(-12, 25)))
@@ -101,7 +101,7 @@ def relit(image: Image, light: float, rng: Rng | None = None, tint: float = 0.0)
 
 
 def noisy(image: Image, sigma: float, rng: Rng) -> Image:
-    """Return the image with the noise of a sensor; ``sigma`` in steps of 0 to 255."""
+    """Add the noise of a sensor to an image; ``sigma`` in steps of 0 to 255."""
     noise = np.empty(image.shape, np.int16)
     cv2.setRNGSeed(int(rng.integers(1 << 31)))
     cv2.randn(noise, np.zeros(3), np.full(3, sigma))
@@ -109,7 +109,7 @@ def noisy(image: Image, sigma: float, rng: Rng) -> Image:
 
 
 def smeared(image: Image, length: float, angle: float) -> Image:
-    """Return the image of a camera that turned: smeared over a length [px] along a direction [rad]."""
+    """Smear an image like a turning camera: over a length [px] along a direction [rad]."""
     half = math.ceil(length / 2) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for step in np.linspace(-0.5, 0.5, 4 * half + 1) * length:
@@ -118,14 +118,14 @@ def smeared(image: Image, length: float, angle: float) -> Image:
 
 
 def coarse(image: Image, share: float) -> Image:
-    """Return the image as one of fewer pixels, enlarged: a share of the width and height."""
+    """Reduce an image's resolution to a share of the width and height, and enlarge it again."""
     rows, columns = image.shape[:2]
     small = cv2.resize(image, (round(columns * share), round(rows * share)), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def as_jpeg(image: Image, quality: int) -> Image:
-    """Return the image after JPEG; its blocks and missing colours are those of a camera's H.264, too."""
+    """Compress an image as JPEG; its blocks and missing colours also resemble a camera's H.264."""
     coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
 
@@ -135,7 +135,7 @@ def _world(rng: Rng) -> World:
     if kind == "made up":
         return _made_up(rng)
     world = load_world(str(rng.choice(_SHIPPED)) if kind == "shipped" else str(kind), int(rng.integers(1 << 30)))
-    if kind == "shipped":  # half of them remain without figures
+    if kind == "shipped":  # half of them stay without figures
         return world if rng.random() < 0.5 else replace(world, targets=world.targets + _figures(rng, 3, 1))
     return replace(world, targets=tuple(_dressed(target, rng) for target in world.targets))
 
@@ -185,7 +185,7 @@ def _place(rng: Rng, room: Room) -> tuple[float, float]:
 
 
 def _blocks(rng: Rng, room: Room) -> tuple[list[Box], list[Panel]]:
-    """Return boxes of any surface or colour, and what hangs on the large ones."""
+    """Return boxes of any surface or colour, and panels on the large ones."""
     boxes, panels = [], []
     for number in range(int(rng.integers(2, 12))):
         wide, deep, high = (
@@ -244,7 +244,7 @@ def _posters(rng: Rng, room: Room) -> tuple[Panel, ...]:
 
 
 def _carriers(rng: Rng, room: Room) -> list[Target]:
-    """Return what carries a marker: a board, a platform."""
+    """Return carriers of markers: boards and platforms."""
     targets: list[Target] = []
     yaw = FixedYaw(float(rng.uniform(-3, 3)))
     if rng.random() < 0.4:
@@ -305,7 +305,7 @@ def _free_place(world: World, solids: Solids, rng: Rng) -> tuple[NDArray[np.floa
             break
     if rng.random() < 0.1:
         return at, float(rng.uniform(-math.pi, math.pi))
-    # What is to be seen is rather ahead of where there is room.
+    # Visible things are placed mostly ahead, where there is room.
     ahead = math.atan2(-at[1] + rng.normal(0.0, y / 6), -at[0] + rng.normal(0.0, x / 6))
     return at, float(ahead)
 
@@ -341,7 +341,7 @@ def _states(
             ):
                 break
         else:
-            x, y = 500.0, 500.0  # there is no room for it
+            x, y = 500.0, 500.0  # no room for it
         taken.append((x, y, radius))
         walked = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.0, 1.5))
         states.append(TargetState(target.name, 0.0, (x, y, 0.0), heading, (0.0, 0.0, 0.0), walked))

@@ -1,4 +1,4 @@
-"""How well a detector's boxes agree with the true ones: matches, average precision. Pure."""
+"""The agreement of a detector's boxes with the true ones: matches, average precision. Pure."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """What became of the detections and true boxes of one class in one picture.
+    """The outcome of the detections and true boxes of one class in one picture.
 
     Attributes:
-        scores: Of the detections, (n,).
+        scores: Scores of the detections, (n,).
         right: Whether each of them found a true box that counts, (n,).
-        ignored: Whether each of them is neither right nor wrong, as it found one that does not count, (n,).
+        ignored: Whether each of them is neither right nor wrong, because it found one that does not count, (n,).
         best: The score of the detection that found each true box that counts; -1: none did, (boxes that count,).
     """
 
@@ -31,16 +31,16 @@ class Matches:
 
 
 def match(found: Floats, scores: Floats, true: Floats, counts: NDArray[np.bool_], least: float = 0.5) -> Matches:
-    """Match the detections of a class in a picture, the surest first, each with the true box that it overlaps most.
+    """Match the detections of a class in a picture, the most certain first, with the true box they overlap most.
 
     A true box is found once; a detection that finds none is wrong, unless it overlaps one that does not count.
 
     Args:
         found: Corners of the detections, (n, 4).
-        scores: Of the detections, (n,).
+        scores: Scores of the detections, (n,).
         true: Corners of the true boxes, (m, 4).
         counts: Whether each of these must be found, (m,).
-        least: Overlap, shared area over that of both, from which a box is found.
+        least: Minimum overlap of a match: shared area over united area.
     """
     right, ignored = np.zeros(len(found), np.bool_), np.zeros(len(found), np.bool_)
     best = np.full(len(true), -1.0)
@@ -95,5 +95,5 @@ def balanced_score(matches: Sequence[Matches]) -> float:
 
 
 def false_alarms(matches: Sequence[Matches], score: float) -> int:
-    """Return how many detections with at least a score found nothing."""
+    """Return the number of detections with at least a score that found nothing."""
     return sum(int((~each.right & ~each.ignored & (each.scores >= score)).sum()) for each in matches)

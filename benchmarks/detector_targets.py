@@ -1,6 +1,6 @@
-"""What a detector with grids of three strides is to answer for a picture: which place is whose. Pure.
+"""The targets of a detector with grids of three strides: assigns things to places. Pure.
 
-As FCOS does it: a thing belongs to the grids that suit its size, and there to the places about its middle (Tian et al.,
+As in FCOS, a thing belongs to the grids that suit its size, and there to the places around its centre (Tian et al.,
 "FCOS: Fully Convolutional One-Stage Object Detection", ICCV 2019).
 """
 
@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRIDES: Final = (8, 16, 32)
-#: Of each stride: the longer sides of the things that are its own [px].
+#: By stride: the range of the longer sides of its things [px].
 SIZES: Final = ((0.0, 72.0), (40.0, 160.0), (104.0, np.inf))
 NOTHING, IGNORED = -1, -2
-_REACH: Final = 1.0  # strides from a thing's middle
+_REACH: Final = 1.0  # strides from a thing's centre
 _LEAST_REACH: Final = 0.75  # for a thing smaller than a stride
 
 Floats = NDArray[np.float32]
 
 
 def places(width: int, height: int) -> tuple[Floats, Floats]:
-    """Return the middles of all places of an input [px], (n, 2), and their strides, (n,), the finest grid first."""
+    """Return the centres of all places of an input [px], (n, 2), and their strides, (n,), the finest grid first."""
     middles, strides = [], []
     for stride in STRIDES:
         y, x = np.mgrid[0 : height // stride, 0 : width // stride]
@@ -32,15 +32,15 @@ def places(width: int, height: int) -> tuple[Floats, Floats]:
 
 
 def assign(boxes: Floats, classes: NDArray[np.int64], grid: tuple[Floats, Floats]) -> tuple[NDArray[np.int64], Floats]:
-    """Give each place the class that it is to answer, and the box.
+    """Give each place its target class and box.
 
-    Where two things claim a place it is the smaller one's, which has fewer. Things that need not be found take what
-    is left of their places out of the count.
+    If two things claim a place, the smaller one gets it, as it has fewer. Things that need not be found exclude their
+    remaining places from the count.
 
     Args:
-        boxes: Middle and size of the things [px], (m, 4).
-        classes: Of the things, ``IGNORED`` for one that need not be found, (m,).
-        grid: Of :func:`places`.
+        boxes: Centre and size of the things [px], (m, 4).
+        classes: Classes of the things, ``IGNORED`` for one that need not be found, (m,).
+        grid: From :func:`places`.
 
     Returns:
         Class, ``NOTHING`` or ``IGNORED`` of each place, (n,), and its box, (n, 4).

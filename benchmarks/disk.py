@@ -14,18 +14,18 @@ from typing import Final
 from skyloop.errors import UsageError
 
 DISK_MB: Final = 3  #: noise of 640x480, recorded as JPEG 30 times a second, fills it within half a second
-MOST_FREE_MB: Final = 16  #: of a folder that stands in for it
+MOST_FREE_MB: Final = 16  #: of a folder used instead
 
 
 @contextmanager
 def small_disk(instead: Path | None = None) -> Iterator[Path]:
-    """Make a file system in memory, in a folder that only this user can enter, for the time of the ``with`` block.
+    """Create a file system in memory, in a folder only this user can enter, for the ``with`` block.
 
     Args:
-        instead: Used where this user may not mount one, if it is nearly full already.
+        instead: A nearly full disk to use where this user may not mount one.
 
     Raises:
-        UsageError: There is neither; with both reasons.
+        UsageError: Neither is available; with both reasons.
     """
     folder = Path(tempfile.mkdtemp(prefix="bench-disk-"))
     mounted = False
@@ -40,7 +40,7 @@ def small_disk(instead: Path | None = None) -> Iterator[Path]:
 
 
 def _mount(folder: Path) -> str:
-    """Mount it; return why that is not possible, empty if it is mounted."""
+    """Mount it; return the reason of a failure, empty on success."""
     if os.geteuid() != 0:
         return "only root may mount a small disk"
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m,mode=0700", "tmpfs", str(folder)]
@@ -53,7 +53,7 @@ def _mount(folder: Path) -> str:
 
 def _checked(instead: Path | None, problem: str) -> Path:
     if instead is None:
-        raise UsageError(f"{problem}, and --record-to names no nearly full one")
+        raise UsageError(f"{problem}, and --record-to does not name a nearly full one")
     free_mb = shutil.disk_usage(instead).free / 1e6
     if free_mb > MOST_FREE_MB:
         raise UsageError(f"{problem}, and {instead} has {free_mb:.0f} MB left, more than the {MOST_FREE_MB} to fill")

@@ -1,4 +1,4 @@
-"""A hundred vehicles in one host, flown from one process: what arrives, how late, and what it costs."""
+"""A hundred vehicles in one host, flown from one process: arrivals, delays and costs."""
 
 from __future__ import annotations
 
@@ -56,17 +56,17 @@ Progress = Callable[[float, str], None]
 
 
 class Case(NamedTuple):
-    """What is measured at once."""
+    """A combination to measure."""
 
     vehicles: int
     observers: int = 0  #: of the feedback and video of the first vehicle
-    network: str = ""  #: over the fabric: where the host listens; empty: over the local transport
-    busy_s: float = 0.0  #: processor time that each vehicle's driver takes for a command [s]
+    network: str = ""  #: the host's address on the fabric; empty: the local transport
+    busy_s: float = 0.0  #: processor time of each vehicle's driver for a command [s]
 
     @property
     def name(self) -> str:
         watched = f", {self.observers} observers of one" if self.observers else ""
-        busy = f", {1e3 * self.busy_s:g} ms a command" if self.busy_s else ""
+        busy = f", {1e3 * self.busy_s:g} ms per command" if self.busy_s else ""
         return f"{self.vehicles} vehicles{watched}{busy}, {'fabric' if self.network else 'local'}"
 
 
@@ -81,8 +81,8 @@ class CaseResult(msgspec.Struct, frozen=True):
     cpu: dict[str, float]  #: cores in use by host, pilot and observers
     vehicle_mb: float  #: memory of the host for each vehicle, beyond that of a host with one
     threads: dict[str, int]
-    opened_s: float  #: that the pilot took to connect to all
-    busy_s: float = 0.0  #: processor time that each vehicle's driver took for a command [s]
+    opened_s: float  #: the pilot took to connect to all
+    busy_s: float = 0.0  #: processor time of each vehicle's driver for a command [s]
 
 
 class HostedFleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
@@ -110,10 +110,10 @@ def measure(
     """Measure each case.
 
     Args:
-        seconds: How long each case is measured [s].
+        seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
-        mavlink: How many emulated MAVLink vehicles are flown in another case; 0: none.
+        progress: Called with the share done, 0 to 1, and the next step.
+        mavlink: Number of emulated MAVLink vehicles in another case; 0: none.
     """
     machine, results = Machine.here(), []
     count = len(cases) + bool(mavlink)
@@ -186,7 +186,7 @@ def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
 
 
 class _BusyVehicle(BenchVehicle):
-    """A vehicle whose driver computes for a while with each command."""
+    """A vehicle whose driver computes for some time with each command."""
 
     def __init__(self, received: Received, busy_s: float) -> None:
         super().__init__(received)
@@ -200,18 +200,18 @@ class _BusyVehicle(BenchVehicle):
 
 
 class _Recorder:
-    """Keeps what was received as numbers: a hundred thousand tuples would keep Python's collector busy for 60 ms."""
+    """Keeps arrivals as numbers: a hundred thousand tuples would keep Python's collector busy for 60 ms."""
 
     def __init__(self) -> None:
         self._stamps: dict[str, array[int]] = {channel: array("q") for channel in CHANNELS}
 
     def received(self, channel: str, sent_ns: int) -> None:
-        """Note that a sample of a channel was received now. Any thread."""
+        """Record that a sample of a channel arrived now. Any thread."""
         self._stamps[channel].extend((sent_ns, time.monotonic_ns()))
 
     @property
     def arrivals(self) -> Arrivals:
-        """What was received."""
+        """The arrivals so far."""
         return {channel: list(zip(kept[::2], kept[1::2], strict=True)) for channel, kept in self._stamps.items()}
 
 
@@ -263,7 +263,7 @@ def serve(pipe: Pipe, case: Case) -> None:
 
 
 def _publish(vehicles: Sequence[BenchVehicle], turn: Turn, begin_ns: int) -> None:
-    """Let all vehicles give feedback at its rate, one after the other through the period, as those of a fleet do."""
+    """Make all vehicles publish feedback at its rate, spread over the period as in a fleet."""
     apart_ns = turn.period_s(FEEDBACK) * 1e9 / len(vehicles)
     moments = (
         at + round(number * apart_ns) for at in turn.deadlines_ns(FEEDBACK, begin_ns) for number in range(len(vehicles))
@@ -279,9 +279,9 @@ def _show(vehicle: BenchVehicle, turn: Turn, begin_ns: int) -> None:
 
 
 def fly_all(pipe: Pipe, case: Case) -> None:
-    """Run the pilot's process: one program flies all, with a command for each in the same moment."""
+    """Run the pilot's process: one program flies all, with a command for each at the same moment."""
     recorder = _Recorder()
-    if case.network:  # elsewhere: who finds the proxies on this host does not ask the network
+    if case.network:  # in another directory: proxies found on this host would not be searched on the network
         os.environ[DIRECTORY_VARIABLE] = f"/tmp/skyloop-{os.getpid()}-nobody"
     opening_s = time.monotonic()
     with ExitStack() as stack:
@@ -296,10 +296,10 @@ def fly_all(pipe: Pipe, case: Case) -> None:
             return
         turn, begin_ns = asked
         gc.collect()
-        gc.freeze()  # else the collector looks through all that a hundred connections are made of, for 60 ms
+        gc.freeze()  # otherwise the collector scans the objects of a hundred connections for 60 ms
         for _, (forward, left, yaw_rate) in zip(paced(turn.deadlines_ns(COMMAND, begin_ns)), fly(), strict=False):
             for drone in drones:
-                with suppress(SkyloopError):  # not sent, so not applied: it is counted as lost
+                with suppress(SkyloopError):  # not sent, so not applied: counted as lost
                     drone.velocity(forward=forward, left=left, up=stamped(time.monotonic_ns()), yaw_rate=yaw_rate)
         time.sleep(SETTLE_S)
         pipe.send((recorder.arrivals, threading.active_count()))

@@ -1,4 +1,4 @@
-"""Gymnasium environments: how fast they step, and how many pictures of 84×84 they give a second, on one core."""
+"""Gymnasium environments: steps and pictures of 84×84 per second on one core."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from skyloop.sim.render.compiled import COMPILER
 
 STEP_S: Final = 0.04  #: simulated, of a step of an environment
 PICTURE_PX: Final = 84
-REAL_TIME_TARGET: Final = 100.0  #: simulated seconds a second of one environment without pictures
-PICTURES_TARGET: Final = 400.0  #: a second, of an environment with many drones
+REAL_TIME_TARGET: Final = 100.0  #: simulated seconds per second of one environment without pictures
+PICTURES_TARGET: Final = 400.0  #: per second, of an environment with many drones
 
 Progress = Callable[[float], None]
 
 
 class Case(NamedTuple):
-    """An environment: with how many drones, and with pictures or without."""
+    """An environment: its number of drones, with or without pictures."""
 
     drones: int
     pictures: bool
@@ -39,7 +39,7 @@ class LearningRow(msgspec.Struct, frozen=True):
     drones: int
     pictures: bool
     step_us: float
-    real_time: float  #: simulated seconds of flight a second, of all drones together
+    real_time: float  #: simulated seconds of flight per second, of all drones together
     pictures_per_s: float | None
 
 
@@ -54,9 +54,9 @@ def measure(seconds: float, cases: tuple[Case, ...] = CASES, progress: Progress 
     """Step each environment with random actions, in the calling thread.
 
     Args:
-        seconds: About how long in all [s].
-        cases: Which environments.
-        progress: Called with the share that is done, 0 to 1.
+        seconds: Approximate total duration [s].
+        cases: The environments.
+        progress: Called with the share done, 0 to 1.
     """
     machine = Machine.here()
     COMPILER.start().join()

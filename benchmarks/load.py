@@ -1,4 +1,4 @@
-"""The pilot's delays when other applications watch, are slow, stand still or record."""
+"""The pilot's delays with other applications that watch, are slow, stall or record."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from skyloop.files import MAX_RESULTS, read_json
 TURN_S: Final = 5.0
 RECORDED_PERIOD_S: Final = 1 / 30
 STUCK_AMONG: Final = 8  #: observers, one of which is stopped
-ENCODED: Final = "8 viewers of H.264, one of them stopped"  #: half of one form, the others of one of their own
+ENCODED: Final = "8 viewers of H.264, one of them stopped"  #: half share one form, the others have one each
 _ANSWERS_WITHIN_S: Final = 20.0
 
 ALONE: Final = "nobody else"
 SLOW: Final = "a processor of 200 ms a frame"
-#: Whose processor time is measured. The pages are without a browser: see :mod:`skyloop.cockpit.testing`.
+#: The parts whose processor time is measured. The pages have no browser: see :mod:`skyloop.cockpit.testing`.
 PARTS: Final = ("proxy", "pilot", "observers", "recorder", "cockpit", "pages", "view")
 RECORDED: Final = "recorder"
 KILLED: Final = "recorder, killed half-way"
@@ -46,7 +46,7 @@ Progress = Callable[[float, str], None]
 
 
 class Case(NamedTuple):
-    """Who else is connected."""
+    """The other applications connected."""
 
     name: str
     observers: int = 0
@@ -57,7 +57,7 @@ class Case(NamedTuple):
     killed: bool = False  #: the recorder, half-way through
     disk_full: bool = False  #: the recorder's
     pages: int = 0  #: of a cockpit
-    viewed: bool = False  #: by one who has subscribed to all of a Foxglove server, and who may be stopped
+    viewed: bool = False  #: by a viewer subscribed to everything on a Foxglove server, possibly stopped
     size: Size = SMALL
     frame_period_s: float = FRAME_PERIOD_S
 
@@ -70,10 +70,10 @@ class CaseResult(msgspec.Struct, frozen=True):
     frames_per_s: float
     observers: int
     channels: dict[str, Summary]
-    cpu: dict[str, float]  #: cores in use by each part: 1.0 is one core all the time
+    cpu: dict[str, float]  #: cores in use by each part: 1.0 is one full core
     recorder_lost: dict[str, int] | None = None  #: samples by channel that a recorder dropped or missed
-    recorder_stopped: str = ""  #: why a recorder stood still at the end of a turn, such as a full disk
-    pages: int = 0  #: of a cockpit; what they get is the channel ``video, pages``
+    recorder_stopped: str = ""  #: why a recorder had paused at the end of a turn, such as a full disk
+    pages: int = 0  #: of a cockpit; their channel is ``video, pages``
 
 
 class Load(msgspec.Struct, frozen=True, tag_field="what", tag="load"):
@@ -82,7 +82,7 @@ class Load(msgspec.Struct, frozen=True, tag_field="what", tag="load"):
     machine: Machine
     seconds: float
     cases: list[CaseResult]
-    skipped: dict[str, str]  #: why a case was left out, by its name
+    skipped: dict[str, str]  #: reasons for omitted cases, by name
 
     def case(self, name: str, size: Size = SMALL, frame_period_s: float = FRAME_PERIOD_S) -> CaseResult | None:
         """Return a case's result; None if it was not measured."""
@@ -163,14 +163,14 @@ def measure(
 ) -> Load:
     """Measure each case, in turns.
 
-    A case for which there is no disk to fill is left out, and the result's ``skipped`` says why.
+    Without a disk to fill, its case is omitted, with the reason in the result's ``skipped``.
 
     Args:
-        seconds: How long each case is measured [s].
+        seconds: Duration of each case [s].
         cases: The cases.
-        record_to: The folder that the recorder writes to.
-        skipped: Cases that the caller left out, and why, for the result.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        record_to: The folder for the recorder.
+        skipped: Cases omitted by the caller, with reasons, for the result.
+        progress: Called with the share done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
@@ -195,7 +195,7 @@ def measure(
 
 
 class _Tally:
-    """What was measured of one case so far."""
+    """The measurements of one case so far."""
 
     def __init__(self, case: Case) -> None:
         self.case = case
@@ -208,7 +208,7 @@ class _Tally:
         self._period_s: dict[str, float] = {}
 
     def add(self, turn: Turn, arrivals: Arrivals, *, of: str = "", times: int = 1) -> None:
-        """Samples that arrived at the pilot, or at ``times`` others."""
+        """Add samples that arrived at the pilot, or at ``times`` others."""
         for channel, pairs in arrivals.items():
             name = f"{channel}, {of}" if of else channel
             kind = channel.partition(",")[0]
@@ -217,13 +217,13 @@ class _Tally:
             self.sent[name] = self.sent.get(name, 0) + times * turn.count(kind)
 
     def use(self, turn: Turn, before_s: Mapping[str, float], after_s: Mapping[str, float]) -> None:
-        """Processor time that the parts had used at both ends of a turn."""
+        """Add the processor time that the parts used in a turn."""
         self.seconds += turn.seconds
         for part, used_s in after_s.items():
             self.cpu_s[part] = self.cpu_s.get(part, 0.0) + used_s - before_s[part]
 
     def recorded(self, samples: Mapping[str, int], stopped: str) -> None:
-        """Samples by channel that a recorder left out in a turn, and why it stood still in the end."""
+        """Add the samples by channel that a recorder left out in a turn, and why it had paused at the end."""
         self.recorder_stopped = stopped or self.recorder_stopped
         before = self.recorder_lost or {}
         self.recorder_lost = {name: before.get(name, 0) + samples.get(name, 0) for name in {*before, *samples}}
@@ -251,10 +251,10 @@ class _Tally:
 
 
 class _Stage:
-    """The processes of all cases; those that a case does not need are not connected meanwhile."""
+    """The processes of all cases; a case connects only those it needs."""
 
     def __init__(self, workers: Workers, folder: str, cases: Sequence[Case], folders: Mapping[bool, Path]) -> None:
-        """``folders``: for recordings, False: with room for them, True: that they fill."""
+        """``folders``: for recordings, False: with room, True: to be filled."""
         self._workers = workers
         self._proxy = proxy_name(folder)
         self._folders = folders
@@ -268,7 +268,7 @@ class _Stage:
             worker.answer(STARTS_WITHIN_S)
 
     def play(self, tally: _Tally, turn: Turn) -> None:
-        """One turn of a case."""
+        """Run one turn of a case."""
         case = tally.case
         pair = self._pairs[case.slow]
         observers = self._observers[: case.observers]
@@ -320,7 +320,7 @@ class _Stage:
 
 
 def _tell(workers: Sequence[Worker], words: Sequence[str]) -> None:
-    """All at once, these words in turn, then all their answers."""
+    """Send these words to all at once, one by one, then collect their answers."""
     for worker, word in zip(workers, cycle(words), strict=False):
         worker.pipe.send(word)
     for worker in workers:
@@ -329,7 +329,7 @@ def _tell(workers: Sequence[Worker], words: Sequence[str]) -> None:
 
 @contextmanager
 def _stopped(workers: Sequence[Worker]) -> Iterator[None]:
-    """As if their users had pressed Ctrl-Z."""
+    """Suspend processes during the block, like Ctrl-Z."""
     for worker in workers:
         os.kill(worker.pid, signal.SIGSTOP)
     try:
@@ -340,12 +340,12 @@ def _stopped(workers: Sequence[Worker]) -> Iterator[None]:
 
 
 def _used_s(parts: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    """Processor time so far of the processes of each part, without parts that have none."""
+    """Return the processor time so far of each part's processes, without parts that have none."""
     return {part: sum(map(cpu_time_s, pids)) for part, pids in parts.items() if pids}
 
 
 def _end(worker: Worker) -> Any:
-    """Let it end; what it has to say then."""
+    """End a worker, and return its last message."""
     worker.pipe.send("end")
     return worker.answer(_ANSWERS_WITHIN_S)
 
@@ -358,7 +358,7 @@ def load(path: Path) -> Load:
     """Read ``load.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Load, "the results of benchmarks.load", MAX_RESULTS)
 

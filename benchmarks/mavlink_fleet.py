@@ -35,9 +35,9 @@ from skyloop.vehicles.emulation.datagrams import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
 RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands
-EMULATED_HZ: Final = 20.0  #: how often an emulated autopilot flies and sends
+EMULATED_HZ: Final = 20.0  #: rate of an emulated autopilot
 WORLD: Final = 200  #: vehicles of one emulating process, which share a world
-LEG_M: Final = 1.0  #: the formation goes so far to each side of where it began
+LEG_M: Final = 1.0  #: distance of the formation to each side of its start
 PERIOD_S: Final = 12.0  #: there and back
 TICKS_HZ: Final = 10.0  #: of the formation's set-points
 _TAKE_OFF_S: Final = 40.0
@@ -47,23 +47,23 @@ _LOOK_S: Final = 0.2
 
 
 class MavlinkResult(msgspec.Struct, frozen=True):
-    """What came of it. A vehicle's link counts as lost if it broke while it was measured, or was not up at its end."""
+    """The result. A vehicle's link counts as lost if it broke during the measurement or was down at its end."""
 
     vehicles: int
-    flown: int  #: in the air in formation when it began
-    up: int  #: links that were up when it began
+    flown: int  #: in the air in formation at the start
+    up: int  #: links up at the start
     lost: int  #: of these
     share: float  #: of the states that the vehicles report, :data:`RATE_HZ` a second each, that the program received
     age_median_ms: float  #: from a state's capture to its arrival in the program
     age_p99_ms: float
-    error_p99_m: float | None  #: of a vehicle from its place in the formation, at each tick; None: nothing flew
+    error_p99_m: float | None  #: of a vehicle from its place in the formation, at each tick; None: none flew
     error_most_m: float | None
     failed: dict[str, str]  #: vehicles that left their formation, and why
     cpu: dict[str, float]  #: cores in use by host, pilot and emulators
 
 
 class Flown(NamedTuple):
-    """What the pilot reports."""
+    """The pilot's report."""
 
     states: int
     ages_ns: Sequence[int]
@@ -75,14 +75,14 @@ def measure(vehicles: int, seconds: float) -> MavlinkResult:
     """Measure.
 
     Args:
-        vehicles: How many; every second one flies.
-        seconds: How long [s].
+        vehicles: Number of vehicles; every second one flies.
+        seconds: Duration [s].
 
     Raises:
-        NoAnswerError: A process did not come up, or ended.
+        NoAnswerError: A process did not start, or ended.
     """
     with Workers() as workers:
-        ports = Ports.several(Kind.ARDUCOPTER, 0, vehicles)  # all at once: processes would get each other's
+        ports = Ports.several(Kind.ARDUCOPTER, 0, vehicles)  # all at once: separate processes would get the same ones
         emulators = [workers.start(emulate, ports[first : first + WORLD]) for first in range(0, vehicles, WORLD)]
         addresses = [emulator.answer(_ANSWERS_WITHIN_S) for emulator in emulators]
         host = workers.start(serve, [address for each in addresses for address in each])
@@ -131,7 +131,7 @@ def emulate(pipe: Pipe, ports: Sequence[Ports]) -> None:
         for firmware in made:
             stack.enter_context(firmware)
         gc.collect()
-        gc.freeze()  # vehicles have no collector that stops all of them
+        gc.freeze()  # real vehicles have no common collector that pauses them
         loop.start()
         stack.callback(loop.stop)
         pipe.send([firmware.address for firmware in made])
@@ -176,29 +176,29 @@ def _up(host: Host) -> list[SharedVehicle]:
 
 
 class _Ages:
-    """Notes how old each new state of one vehicle is when it arrives."""
+    """Records the age of each new state of one vehicle on arrival."""
 
     def __init__(self) -> None:
         self.stamps: array[int] = array("q")  # captured, arrived
         self._newest_ns = 0
 
     def received(self, feedback: Feedback) -> None:
-        """Take a sample; the proxy repeats the newest state of a vehicle that is silent, which is none."""
+        """Add a sample; a silent vehicle's repeated state does not count."""
         if feedback.captured_ns > self._newest_ns:
             self._newest_ns = feedback.captured_ns
             self.stamps.extend((feedback.captured_ns, time.monotonic_ns()))
 
     def within(self, begin_ns: int, end_ns: int) -> list[int]:
-        """Return the ages [ns] of what arrived in a time."""
+        """Return the ages [ns] of arrivals within a time."""
         pairs = zip(self.stamps[::2], self.stamps[1::2], strict=True)
         return [arrived - captured for captured, arrived in pairs if begin_ns <= arrived < end_ns]
 
 
 class _Formation:
-    """Every second vehicle, all in one formation that goes from one side to the other and back.
+    """Every second vehicle, all in one formation that moves from one side to the other and back.
 
-    Each vehicle's place is the one where it hovers after its take-off, moved by what the formation has moved: each has
-    world axes of its own, which begin where it started, and vehicles of different worlds know nothing of each other.
+    Each vehicle's place is its hover after take-off, moved with the formation: each has its own world axes, which begin
+    at its start, and vehicles of different worlds know nothing of each other.
     """
 
     def __init__(self, drones: Swarm) -> None:
@@ -206,8 +206,8 @@ class _Formation:
         self.errors_m: list[float] = []  #: of each vehicle at each tick
 
     def take_off(self) -> None:
-        """Take off, and wait until all hover; those that don't are set aside."""
-        with suppress(SkyloopError):  # no drone is left; each says why
+        """Take off, and wait until all hover; set aside those that don't."""
+        with suppress(SkyloopError):  # no drone is left; each reports why
             self.drones.takeoff(timeout_s=_TAKE_OFF_S)
 
     def fly(self, seconds: float) -> None:
@@ -216,7 +216,7 @@ class _Formation:
         if not places:
             time.sleep(seconds)
             return
-        with suppress(SkyloopError):  # no drone is left; each says why
+        with suppress(SkyloopError):  # no drone is left; each reports why
             self._fly(places, seconds)
 
     def _fly(self, places: Mapping[str, NDArray[np.float64]], seconds: float) -> None:
@@ -253,7 +253,7 @@ def fly(pipe: Pipe, count: int, seconds: float) -> None:
                 drones[drone.name] = drone
             else:
                 stack.callback(drone.close)
-        stack.enter_context(suppress(SkyloopError))  # at its end the swarm tells again who failed
+        stack.enter_context(suppress(SkyloopError))  # the swarm reports its failed drones again at the end
         formation = _Formation(stack.enter_context(Swarm(drones)))
         gc.collect()
         gc.freeze()  # once it is connected, as docs/host.md advises

@@ -1,7 +1,8 @@
-"""What a moving camera sees, for all who send video: pictures that follow from their stamps. Needs NumPy alone.
+"""A moving camera's view, shared by all senders of video: pictures determined by their stamps. Needs NumPy alone.
 
-A window of a large picture, with detail at all scales and some noise, moves as a drone that looks around. Each picture
-carries its stamp in its upper left corner, in a form that survives any encoder: there are transports that keep none.
+A window of a large picture, with detail at all scales and some noise, moves like a drone that looks around. Each
+picture carries its stamp in its upper left corner, in a form that survives any encoder, because some transports keep
+none.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class MovingScene:
     """The scene of one camera.
 
     Args:
-        size: Of its pictures.
+        size: Size of its pictures.
     """
 
     def __init__(self, size: Size) -> None:
@@ -43,7 +44,7 @@ class MovingScene:
         self._noise = rng.normal(0.0, _NOISE, (2 * size.height, 2 * size.width, 3)).astype(np.int16)
 
     def picture(self, stamp_ns: int) -> Image:
-        """Return what is seen at a time [ns, of which multiples of :data:`STAMP_NS` count], with the stamp in it.
+        """Return the view at a time [ns, in multiples of :data:`STAMP_NS`], with its stamp.
 
         Returns:
             Shape (height, width, 3), dtype uint8.
@@ -79,6 +80,6 @@ def stamp_in(image: Image, now_ns: int) -> int:
 
 
 def psnr_db(image: Image, original: Image) -> float:
-    """Return how near a picture is to its original: the peak signal-to-noise ratio [dB]."""
+    """Return a picture's similarity to its original: the peak signal-to-noise ratio [dB]."""
     error = np.mean((image.astype(np.float32) - original) ** 2)
     return float(10.0 * np.log10(255.0**2 / max(error, 1e-3)))

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.network``: two hosts with a lossy path between, by datagrams beside TCP and by TCP alone."""
+"""``python -m benchmarks.network``: two hosts with a lossy path between, by datagrams and TCP, or TCP alone."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from skyloop.files import MAX_RESULTS, read_json
 LOSSES: Final = (0.0, 0.01, 0.1, 0.3)
 DATAGRAMS: Final = "datagrams and TCP"
 TCP: Final = "TCP only"
-#: The vehicle's side of each way, at the first end of the path. Without keys an address stands for UDP beside TCP.
+#: The vehicle's side of each connection, at the first end of the path. Without keys an address means UDP beside TCP.
 WAYS: Final = {DATAGRAMS: "{address}:7447", TCP: "tcp/{address}:7447"}
 #: Besides the loss: a wireless network of a few walls.
 PATH: Final = Impairments(delay_s=0.005, jitter_s=0.001, reorder=0.01, reorder_s=0.005)
@@ -41,10 +41,10 @@ Progress = Callable[[float, str], None]
 
 
 class Channel(msgspec.Struct, frozen=True):
-    """The samples of one channel that were sent and that arrived."""
+    """The samples of one channel sent and received."""
 
     sent: int
-    arrived: int  #: of commands: were executed
+    arrived: int  #: commands: executed
     age: Summary | None  #: None if nothing arrived
 
     @property
@@ -53,7 +53,7 @@ class Channel(msgspec.Struct, frozen=True):
 
 
 class CaseResult(msgspec.Struct, frozen=True):
-    """One way with one rate of loss. ``relay``: how late the path was by its own doing."""
+    """One kind of connection with one rate of loss. ``relay``: delays added by the path's own process."""
 
     way: str
     loss: float
@@ -68,7 +68,7 @@ class Wire(msgspec.Struct, frozen=True):
     command: float
     feedback: float
     frame: float
-    frame_back: float  #: to the proxy, by which the viewer says that it has it
+    frame_back: float  #: to the proxy, the viewer's acknowledgement
 
 
 class Network(msgspec.Struct, frozen=True, tag_field="what", tag="network"):
@@ -79,7 +79,7 @@ class Network(msgspec.Struct, frozen=True, tag_field="what", tag="network"):
     path: str
     cases: list[CaseResult]
     wire: Wire | None = None
-    megabytes_per_s: float = 0.0  #: that the path's own process can pass on, by one TCP connection
+    megabytes_per_s: float = 0.0  #: capacity of the path's own process, with one TCP connection
 
     def case(self, way: str, loss: float) -> CaseResult | None:
         """Return a case's result; None if it was not measured."""
@@ -92,16 +92,16 @@ def measure(
     ways: Sequence[str] = tuple(WAYS),
     progress: Progress = lambda _share, _what: None,
 ) -> Network:
-    """Measure each way with each rate of loss, in turns.
+    """Measure each connection with each rate of loss, in turns.
 
     Args:
-        seconds: How long each case is measured [s].
-        losses: Shares of the packets that are lost.
+        seconds: Duration of each case [s].
+        losses: Shares of packets lost.
         ways: The ways to connect, by name.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        progress: Called with the share done, 0 to 1, and the next step.
 
     Raises:
-        UnsupportedError: No hosts can be made here.
+        UnsupportedError: No hosts can be created here.
     """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
@@ -121,7 +121,7 @@ def measure(
 
 
 class _Stage:
-    """A path, and both ends of one way to use it."""
+    """A path, and both ends of one kind of connection."""
 
     def __init__(self, lab: Lab, workers: Workers, hosts: tuple[Host, Host], way: str) -> None:
         self._path = Path(lab, *hosts, seed=_SEED, impairments=PATH)
@@ -135,7 +135,7 @@ class _Stage:
         )
 
     def play(self, turn: Turn, loss: float) -> tuple[Arrivals, list[int]]:
-        """A turn: they connect before anything is lost. What arrived, and by how much the relay was late [ns]."""
+        """Run a turn, connecting before any loss; return the arrivals, and the relay's own delays [ns]."""
         self._path.set(PATH)
         self._pair.open(turn)
         self._path.tell()
@@ -145,7 +145,7 @@ class _Stage:
         return arrivals, there.late_ns + back.late_ns
 
     def weigh(self) -> Wire:
-        """Bytes for each sample, from a turn with video and one with next to none."""
+        """Return the bytes for each sample, from a turn with video and one with almost none."""
         sizes: list[tuple[int, int]] = []
         turns = [Turn(0, _WEIGHED_S, frame_period_s=period_s) for period_s in (10 * _WEIGHED_S, FRAME_PERIOD_S)]
         for turn in turns:
@@ -169,7 +169,7 @@ class _Stage:
 
 
 def stream(lab: Lab, workers: Workers, first: Host, second: Host) -> float:
-    """Return how fast a TCP connection passes a perfect path [MB/s]: the most that this harness can carry."""
+    """Return the speed of a TCP connection over a perfect path [MB/s]: the limit of this harness."""
     path = Path(lab, first, second, seed=_SEED)
     there = workers.start(drain, path.first, prefix=first.prefix)
     there.answer(STARTS_WITHIN_S)
@@ -180,7 +180,7 @@ def stream(lab: Lab, workers: Workers, first: Host, second: Host) -> float:
 
 
 def drain(pipe: Pipe, address: str) -> None:
-    """Receive what comes by one connection; send back how many bytes, and in what time [s]."""
+    """Receive from one connection; send back the number of bytes and the time [s]."""
     with socket.create_server((address, _STREAM_PORT)) as listener:
         pipe.send("ready")
         connection, _ = listener.accept()
@@ -201,7 +201,7 @@ def pour(pipe: Pipe, address: str) -> None:
 
 
 class _Tally:
-    """What was measured of one case so far."""
+    """The measurements of one case so far."""
 
     def __init__(self, way: str, loss: float) -> None:
         self.way = way
@@ -239,7 +239,7 @@ def describe(path: Impairments) -> str:
 def load(path: File) -> Network:
     """Read ``network.json``.
 
-    Raises:
+    FileFormatError: It is not such a file.
         FileFormatError: It is anything else.
     """
     return read_json(path, Network, "the results of benchmarks.network", MAX_RESULTS)

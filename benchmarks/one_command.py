@@ -1,4 +1,4 @@
-"""The command line of a program that does one thing."""
+"""The command line of a program with one command."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import typer
 
 
 def one_command(function: Callable[..., Any]) -> typer.Typer:
-    """Return the command line whose only command is a function.
+    """Return the command line with a function as its only command.
 
     Args:
-        function: Its parameters are the options, its docstring is the help.
+        function: Its parameters are the options, and its docstring the help.
     """
     app = typer.Typer(
         add_completion=False,

@@ -1,4 +1,4 @@
-"""The process of ``benchmarks.codecs``. Nothing that starts threads may be imported before it has its one core."""
+"""The process of ``benchmarks.codecs``. Import nothing that starts threads before it is limited to one core."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from benchmarks.measuring.workers import Pipe
 
 
 def codecs_on_one_core(pipe: Pipe, seconds: float) -> None:
-    """Send the shares of the work that are done, and the results in the end."""
+    """Send the share of the work done, and finally the results."""
     if hasattr(os, "sched_setaffinity"):  # elsewhere the libraries' threads are counted too
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from benchmarks.codecs import measure_here

@@ -1,4 +1,4 @@
-"""Processes that watch while the pilot flies: observers, a recorder, pages of a cockpit, a viewer of Foxglove's."""
+"""Processes that watch while the pilot flies: observers, a recorder, cockpit pages, a Foxglove viewer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from skyloop.errors import LinkError, MissingExtraError
 if TYPE_CHECKING:
     from skyloop.cockpit.testing import Pages
 
-#: What an observer is told that is to take H.264: all of one form, or each of its own.
+#: The message that makes an observer receive H.264: all of one form, or one form each.
 SHARED: Final = "h264"
 OWN: Final = "h264, own"
 _KBIT_S: Final = 1000
@@ -29,7 +29,7 @@ _LOOK_S: Final = 0.02  #: shorter than the pause between two frames of a page
 
 
 def observe(pipe: Pipe, proxy: str) -> None:
-    """Run an observer of feedback and video, which connects when told to and sends at the end what it received."""
+    """Run an observer of feedback and video, which connects on request and finally sends its arrivals."""
     pipe.send("ready")
     while (word := pipe.recv()) is not None:
         recorder = Recorder()
@@ -47,13 +47,13 @@ def observe(pipe: Pipe, proxy: str) -> None:
 
 
 def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:
-    """Run a recorder of everything; it sends at the end what it could not record, by channel, and why it stood still.
+    """Run a recorder of everything; it finally sends the unrecorded samples by channel, and why it paused.
 
     Args:
         pipe: To the measuring process.
         proxy: The proxy's name.
         file: Where to record.
-        fill: Whether to record up to the disk's last byte; the file is deleted afterwards.
+        fill: Whether to fill the disk to its last byte; the file is deleted afterwards.
     """
     from skyloop import recording
     from skyloop.recording.options import Options
@@ -73,7 +73,7 @@ def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:
 
 
 def show(pipe: Pipe, proxy: str, number: int) -> None:
-    """Run a cockpit; send its process id when ``number`` pages are open, and at the end how old the frames came."""
+    """Run a cockpit; send its process id once ``number`` pages are open, and finally the age of their frames."""
     from skyloop.cockpit.child import CockpitProcess
     from skyloop.cockpit.testing import Pages
 
@@ -101,7 +101,7 @@ def serve(pipe: Pipe, proxy: str) -> None:
 
 
 def look(pipe: Pipe, url: str) -> None:
-    """Run a viewer that subscribes to all that is served and reads it; it sends at the end how many messages came."""
+    """Run a viewer that subscribes to everything served; it finally sends the number of messages."""
     from websockets.sync.client import connect as dial
     from websockets.typing import Subprotocol
 
@@ -128,7 +128,7 @@ def look(pipe: Pipe, url: str) -> None:
 
 
 def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
-    """Return what the pages get, until something comes through the pipe."""
+    """Return the frames that the pages receive, until a message arrives through the pipe."""
     arrivals: Arrivals = {VIDEO: []}
     seen = [0] * len(pages.clients)
     while not pipe.poll(_LOOK_S):
@@ -145,7 +145,7 @@ def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
 
 
 def recorder_problem() -> str:
-    """Return why nothing can be recorded here; empty if it can."""
+    """Return why recording is impossible here; empty if it is possible."""
     try:
         from skyloop.recording.recorder import check_installed
 
@@ -156,7 +156,7 @@ def recorder_problem() -> str:
 
 
 def view_problem() -> str:
-    """Return why nothing can be viewed in Foxglove here; empty if it can."""
+    """Return why viewing in Foxglove is impossible here; empty if it is possible."""
     missing = [name for name in ("foxglove", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]
     if missing:
         return str(MissingExtraError("viewing in Foxglove", "foxglove", cause=f"no {', '.join(missing)}"))
@@ -164,6 +164,6 @@ def view_problem() -> str:
 
 
 def cockpit_problem() -> str:
-    """Return why no cockpit can be opened here; empty if it can."""
+    """Return why a cockpit can't be opened here; empty if it can."""
     missing = [name for name in ("starlette", "uvicorn", "websockets", "cv2") if find_spec(name) is None]
     return str(MissingExtraError("the cockpit", "cockpit", cause=f"no {', '.join(missing)}")) if missing else ""

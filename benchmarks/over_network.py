@@ -1,4 +1,4 @@
-"""Skyloop's own ends over the network, on hosts that have no more in common than a path."""
+"""Skyloop's own ends over the network, on hosts that share only a path."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def address(name: str, *places: str, listens: bool = True) -> str:
 
     Args:
         name: The proxy's name.
-        *places: Addresses as of :class:`FabricSettings`; applications connect to them all.
-        listens: Whether the proxy listens at the first one; else it connects to all, too.
+        *places: Addresses as for :class:`FabricSettings`; applications connect to all of them.
+        listens: Whether the proxy listens on the first one; otherwise it connects to all, too.
     """
     return json.dumps([name, places, listens])
 
 
 def settings_of(address: str, *, serves: bool) -> tuple[str, FabricSettings]:
-    """Return the name in an address of :func:`address`, and how the proxy or an application joins the network."""
+    """Return the name in an address from :func:`address`, and the network settings of the proxy or an application."""
     name, places, listens = json.loads(address)
     if serves and listens:
         return name, FabricSettings(listen=tuple(places[:1]), multicast=False)
@@ -50,19 +50,19 @@ def settings_of(address: str, *, serves: bool) -> tuple[str, FabricSettings]:
 
 
 class Vehicle(ours.Vehicle):
-    """The vehicle's end, whose frames are a picture instead of noise."""
+    """The vehicle's end, whose frames are a photo-like picture instead of noise."""
 
     def _server(self, address: str) -> tuple[str, TransportServer]:
         name, settings = settings_of(address, serves=True)
         return name, FabricServer(name, settings)
 
     def frame(self, sent_ns: int, image: Image) -> None:  # noqa: ARG002  (noise is no picture, and no JPEG is longer)
-        """Send the picture; noise is not like a picture, and no JPEG is longer."""
+        """Send the picture instead of noise, which makes the longest JPEGs."""
         super().frame(sent_ns, scenery())
 
 
 class Application(ours.Application):
-    """The pilot, who goes on while the link is lost, as a controller does."""
+    """The pilot, who continues while the link is lost, like a controller."""
 
     video = JPEG
 
@@ -70,10 +70,10 @@ class Application(ours.Application):
         return connect(address)
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:
-        """Send a command; one that is not sent counts as lost."""
+        """Send a command; one that can't be sent counts as lost."""
         try:
             super().command(sent_ns, setpoint)
-        except SkyloopError:  # not sent, so not executed: it is counted as lost
+        except SkyloopError:  # not sent, so not executed: counted as lost
             return
 
 
@@ -84,7 +84,7 @@ class Pilot(Application):
 
 
 def connect(address: str, access: Access = "pilot", *, lease_s: float = LEASE_S) -> Drone:
-    """Connect to a drone over the network, trying for a while on a machine that is busy.
+    """Connect to a drone over the network, retrying for a while on a busy machine.
 
     Raises:
         LinkError: It did not answer.
@@ -105,7 +105,7 @@ def connect(address: str, access: Access = "pilot", *, lease_s: float = LEASE_S)
 
 @cache
 def scenery() -> Image:
-    """Return a picture with as much in it as a camera's in a room: as a JPEG of quality 80 it has about 14 kB."""
+    """Return a picture as detailed as a camera's in a room: as a JPEG of quality 80 it has about 14 kB."""
     rng = np.random.default_rng(1)
     coarse = rng.integers(30, 225, (SMALL.height // 20, SMALL.width // 20, 3))
     image = np.kron(coarse, np.ones((20, 20, 1))) + rng.normal(0.0, 4.0, (SMALL.height, SMALL.width, 3))

@@ -24,7 +24,7 @@ FPS: Final = 30.0
 NO_VIDEO: Final = "no video"
 FIXED_KBIT_S: Final = 1000
 LEASE_S: Final = 10.0
-PATIENT: Final = f"H.264, adaptive, lease {LEASE_S:g} s"  #: the pilot waits longer for a drone of which nothing comes
+PATIENT: Final = f"H.264, adaptive, lease {LEASE_S:g} s"  #: the pilot waits longer for a silent drone
 FORMS: Final[Mapping[str, VideoOptions | None]] = MappingProxyType(
     {
         NO_VIDEO: None,
@@ -61,7 +61,7 @@ class Vehicle(over_network.Vehicle):
         return name, FabricServer(name, replace(settings, lease_s=self._lease_s))
 
     def frame(self, sent_ns: int, image: Image) -> None:  # noqa: ARG002  (a moving scene instead)
-        """Send what the camera sees."""
+        """Send the camera's view."""
         self._vehicle.show(sent_ns, self._scene.picture(sent_ns))
 
 

@@ -1,7 +1,7 @@
-"""A recording of ten minutes, and how long it takes to open, to look at, to seek in and to export it.
+"""A recording of ten minutes, and the time to open, inspect, seek and export it.
 
-The video is H.264 of a simulated flight, 640×360, 30 pictures a second, a key picture each second. Half a minute of
-it is drawn and encoded; the recording repeats that with the times of a whole flight.
+The video is H.264 of a simulated flight, 640×360, 30 pictures a second, a key picture each second. Half a minute of it
+is drawn and encoded; the recording repeats that with the times of a whole flight.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from skyloop.vehicles.replay.source import ReplaySource
 FPS: Final = 30
 FEEDBACK_HZ: Final = 50
 COMMAND_HZ: Final = 32
-DRAWN_S: Final = 30  #: of video that is drawn
+DRAWN_S: Final = 30  #: of video drawn
 BITRATE_KBPS: Final = 2000
 EXPORT_TARGET_S: Final = 5.0  #: for a flight of ten minutes
 DRONE: Final = "alpha"
@@ -63,7 +63,7 @@ _CAPABILITIES: Final = Capabilities(
 
 
 class RecordingRow(msgspec.Struct, frozen=True):
-    """One thing that is done with the recording. ``target_s`` is for the time that passes."""
+    """An operation on the recording. ``target_s`` applies to elapsed time."""
 
     what: str
     passed_s: float
@@ -75,19 +75,19 @@ class Recordings(msgspec.Struct, frozen=True):
     """A whole run, as in ``recordings.json``."""
 
     machine: Machine
-    seconds: float  #: how long the recorded flight is
+    seconds: float  #: duration of the recorded flight
     frames: int
     bytes: int  #: of the file
     rows: list[RecordingRow]
 
 
 def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda _: None) -> Recordings:
-    """Write a recording into a temporary folder, and measure in the calling thread what is done with it.
+    """Write a recording to a temporary folder, and measure operations on it in the calling thread.
 
     Args:
-        seconds: How long the recorded flight is [s].
-        encode: Whether the export that decodes and encodes each picture is measured as well.
-        progress: Called with the share that is done, 0 to 1.
+        seconds: Duration of the recorded flight [s].
+        encode: Whether to also measure the export that decodes and encodes each picture.
+        progress: Called with the share done, 0 to 1.
     """
     machine = Machine.here()
     with tempfile.TemporaryDirectory() as folder:
@@ -128,25 +128,25 @@ def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda 
 
 
 def drawn(seconds: float) -> list[Encoded]:
-    """Draw and encode what a circling drone's camera sees."""
+    """Draw and encode the view of a circling drone's camera."""
     flight = Flight(1, [(0, FRONT_CAMERA.scaled(2.0))])
     encoder = Encoder(H264_360P, FPS, BITRATE_KBPS, group=FPS)
     units = []
     for _ in range(max(FPS, round(seconds) * FPS)):
         flight.draw(0)
         unit = encoder.encode(flight.picture[: flight.picture.shape[1] * H264_360P.height // H264_360P.width])
-        assert unit is not None  # without delay each picture gives one at once
+        assert unit is not None  # without delay, each picture yields one at once
         units.append(unit)
     return units
 
 
 def write_recording(path: Path, seconds: float, units: Sequence[Encoded]) -> None:
-    """Write a flight as the recorder does: its messages, and a chunk each half second.
+    """Write a flight like the recorder: its messages, and a chunk every half second.
 
     Args:
         path: The file.
-        seconds: How long the flight is [s].
-        units: Its pictures, which are repeated. The first is a key picture.
+        seconds: Duration of the flight [s].
+        units: Its pictures, repeated as needed. The first is a key picture.
     """
     clock = ClockPair(NS_PER_S, 1_760_000_000 * NS_PER_S, 1)
     translator = Translator(DRONE, _CAPABILITIES, clock)
@@ -163,7 +163,7 @@ def write_recording(path: Path, seconds: float, units: Sequence[Encoded]) -> Non
 
 
 def _items(begin_ns: int, seconds: float, units: Sequence[Encoded]) -> Iterator[Item]:
-    """Yield a flight's samples in the order of their times."""
+    """Yield a flight's samples in order of time."""
     times = [
         (number * NS_PER_S // rate, kind, number)
         for kind, rate in ((Channel.FEEDBACK, FEEDBACK_HZ), (Channel.COMMANDS, COMMAND_HZ), (Channel.FRAMES, FPS))

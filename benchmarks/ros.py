@@ -1,7 +1,7 @@
-"""``python -m benchmarks.ros``: what the bridge to ROS 2 adds to the delays, in one run with Skyloop's own.
+"""``python -m benchmarks.ros``: the delay added by the bridge to ROS 2, in one run with Skyloop's own.
 
 Four processes: a simulated drone's proxy, the bridge, a program of rclpy that flies by ``cmd_vel`` and receives images,
-and this one, which receives the same images and the echoes of the commands as Skyloop's client does.
+and this one, which receives the same images and the echoes of the commands like any Skyloop client.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ STARTS_WITHIN_S: Final = 30.0
 class RosDelays(msgspec.Struct, frozen=True):
     """A whole run, as in ``ros.json``.
 
-    ``command``: Twist published to applied; ``command_own``: of that, sent by the bridge to applied, which is what a
-    Skyloop application has. ``image``: captured to the callback of rclpy; ``image_own``: to that of Skyloop.
+    ``command``: Twist published to applied; ``command_own``: of that, sent by the bridge to applied, as for a Skyloop
+    application. ``image``: captured to the callback of rclpy; ``image_own``: to that of Skyloop.
     """
 
     machine: Machine
@@ -56,16 +56,16 @@ def measure(
     ros_python: str | None = None,
     progress: Callable[[float, str], None] = lambda _share, _what: None,
 ) -> RosDelays:
-    """Fly for so long.
+    """Fly for this time, and measure.
 
     Args:
-        seconds: [s]
+        seconds: The duration [s].
         ros_python: An interpreter with rclpy and Skyloop; None: that of ``SKYLOOP_ROS_PYTHON``, or this one.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        progress: Called with the share done, 0 to 1, and the next step.
 
     Raises:
         NoAnswerError: A process did not start, or failed.
-        UnsupportedError: There is no rclpy.
+        UnsupportedError: rclpy is not installed.
     """
     python = ros_python or os.environ.get("SKYLOOP_ROS_PYTHON", sys.executable)
     if subprocess.run([python, "-c", "import rclpy, skyloop"], capture_output=True, check=False).returncode:
@@ -89,7 +89,7 @@ def measure(
 
 
 def table(results: RosDelays) -> Table:
-    """Return the delays of both channels, Skyloop's own, and what the bridge adds to the median."""
+    """Return the delays of both channels, Skyloop's own, and the bridge's addition to the median."""
     rows = []
     for name, whole, own in (
         ("command: Twist published → applied", results.command, results.command_own),
@@ -102,7 +102,7 @@ def table(results: RosDelays) -> Table:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return an environment in which neither ROS 2 nor Skyloop meets anything else on this machine."""
+    """Return an environment that isolates ROS 2 and Skyloop from the rest of this machine."""
     profile = folder / "loopback.xml"
     profile.write_text(LOOPBACK_PROFILE)
     places = {PROFILES_VARIABLE: str(profile), "SKYLOOP_RUNTIME_DIR": str(folder / "run")}
@@ -110,7 +110,7 @@ def _environment(folder: Path) -> dict[str, str]:
 
 
 def _watch(drone: Drone) -> tuple[dict[int, Applied], list[int]]:
-    """Return what fills with the echoes, by the number of their velocity, and the ages of frames [ns]."""
+    """Return the echoes, by the number of their velocity, and the ages of frames [ns], both filled later."""
     echoes: dict[int, Applied] = {}
     ages_ns: list[int] = []
 
@@ -147,7 +147,7 @@ def _judged(
 
 @contextmanager
 def _running(command: list[str], environment: dict[str, str], ready: str) -> Iterator[None]:
-    """Run a process from its line that begins with ``ready`` on."""
+    """Run a process, from its line that begins with ``ready``."""
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
         try:

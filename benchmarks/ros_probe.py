@@ -2,7 +2,7 @@
 
     python ros_probe.py /alpha SECONDS
 
-Takes off, flies for so long, lands. Prints as JSON when each velocity was published, by its yaw rate, and the age of
+Takes off, flies for this time, lands. Prints as JSON when each velocity was published, by its yaw rate, and the age of
 each image when its callback ran, by its stamp [ns].
 """
 
@@ -17,7 +17,7 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 PERIOD_S = 1 / 32
-STEP = 1e-4  # the n-th velocity turns by n times this [rad/s], by which its echo is found again
+STEP = 1e-4  # the n-th velocity turns by n times this [rad/s], which identifies its echo
 
 
 def main() -> None:
@@ -46,7 +46,7 @@ def main() -> None:
     end = time.monotonic() + 10.0
     while len(ages_ns) < 30:  # found, and warm
         if time.monotonic() > end:
-            raise TimeoutError(f"{len(ages_ns)} images came within 10 s")
+            raise TimeoutError(f"{len(ages_ns)} images arrived within 10 s")
         rclpy.spin_once(node, timeout_sec=0.1)
     ages_ns.clear()
     due = time.monotonic()

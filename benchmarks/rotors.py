@@ -1,7 +1,7 @@
-"""How the rotor-level vehicles respond, beside what others published of real ones.
+"""Responses of the rotor-level vehicles, compared with published ones of real vehicles.
 
-``python -m benchmarks.rotors`` measures in the simulator and prints what docs/rotors.md has. Nothing depends on the
-machine's speed, and the same code gives the same figures everywhere.
+``python -m benchmarks.rotors`` measures in the simulator and prints the figures of docs/rotors.md. The results do not
+depend on the machine's speed, and are the same everywhere.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _UP_S, _SETTLED_S, _SHOWN_S, _COAST_M_S = 5.0, 3.0, 1.2, 1.0
 
 
 class Identified(NamedTuple):
-    """A real Crazyflie, as drone-models 0.1.0 (MIT) has it from flights: the motors and propellers are in its name.
+    """A real Crazyflie identified from flights in drone-models 0.1.0 (MIT): its name gives the motors and propellers.
 
     Attitude: angle'' = stiffness · angle + damping · angle' + gain · command.
     """
@@ -44,7 +44,7 @@ class Identified(NamedTuple):
     damping: float
     gain: float
     thrust_s: float  #: time constant of the thrust
-    drag_n_s_m: float  #: across
+    drag_n_s_m: float  #: lateral
 
 
 IDENTIFIED: Final = (
@@ -55,7 +55,7 @@ IDENTIFIED: Final = (
 
 
 class Response(NamedTuple):
-    """When a response has reached shares of its end, and how far it goes beyond."""
+    """The times at which a response reaches shares of its final value, and its overshoot."""
 
     tenth_s: float
     half_s: float
@@ -63,13 +63,13 @@ class Response(NamedTuple):
     overshoot: float
 
     def cells(self) -> list[str]:
-        """Return it as text."""
+        """Return the response as text."""
         times = [f"{seconds * 1e3:.0f} ms" for seconds in self[:3]]
         return [*times, f"{max(0.0, self.overshoot):.0%}"]
 
 
 def response(values: Sequence[float], end: float, period_s: float) -> Response:
-    """Return the figures of a response, whose first value is one period after the command."""
+    """Return the figures of a response whose first value is one period after the command."""
 
     def reached(share: float) -> float:
         before = 0.0
@@ -94,7 +94,7 @@ def attitude_step(vehicle: VehicleParameters) -> Response:
 
 
 def identified_step(one: Identified) -> Response:
-    """Return the response of an identified vehicle, as a share of where it ends: its gain is not 1."""
+    """Return the response of an identified vehicle, as a share of its final value: its gain is not 1."""
     angle = rate = 0.0
     angles = []
     fine_s = PLANT_STEP_S / 10
@@ -107,7 +107,7 @@ def identified_step(one: Identified) -> Response:
 
 
 def thrust_lag_s(vehicle: VehicleParameters) -> float:
-    """Return after how long the thrust has done 63 % of a step by a tenth, the body held as on a test stand."""
+    """Return the time for 63 % of a step of the thrust by a tenth, with the body fixed as on a test stand."""
     constants, rotors = constants_of(vehicle), rotors_of(vehicle)
     still, untouched = (0.0, 0.0, 0.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     speed = math.sqrt(vehicle.mass_kg * GRAVITY_M_S2 / 4 / rotors.thrust_n_s2)
@@ -122,7 +122,7 @@ def thrust_lag_s(vehicle: VehicleParameters) -> float:
 
 
 def drag_per_s(vehicle: VehicleParameters) -> float:
-    """Return by which share of its speed a level vehicle slows down in a second, at 1 m/s."""
+    """Return the share of its speed that a level vehicle loses in a second, at 1 m/s."""
     simulation = hovering(vehicle)
     simulation.command(0, Attitude(pitch=0.1))
     while simulation.truth(0).velocity_m_s[0] < 1.2 * _COAST_M_S:
@@ -141,13 +141,13 @@ def hovering(vehicle: VehicleParameters) -> Simulation:
     simulation.command(0, Takeoff())
     simulation.step(round(_UP_S / STEP_S))
     if simulation.state(0) is not FlightState.HOVERING:
-        raise RuntimeError(f"it should hover, and is {simulation.state(0)}")
+        raise RuntimeError(f"it should hover, but is {simulation.state(0)}")
     simulation.step(round(_SETTLED_S / STEP_S))
     return simulation
 
 
 class Hover(NamedTuple):
-    """What hovering takes."""
+    """The requirements of hovering."""
 
     rotor_speed_rad_s: float
     power_w: float
@@ -155,7 +155,7 @@ class Hover(NamedTuple):
 
 
 def hover(vehicle: VehicleParameters) -> Hover:
-    """Measure a vehicle in hover; its battery's charge by the current then is how long it lasts."""
+    """Measure a vehicle in hover; the endurance is its battery's charge divided by the current."""
     simulation = hovering(vehicle)
     bodies = simulation._rotors
     assert bodies is not None
@@ -192,7 +192,7 @@ def tables(progress: Callable[[str], None] = lambda _: None) -> list[Table]:
 
 
 def command() -> None:
-    """Measure the rotor-level vehicles beside published ones.
+    """Compare the rotor-level vehicles with published ones.
 
     Example: python -m benchmarks.rotors
     """

@@ -1,4 +1,4 @@
-"""More and more proxies and observers on one host, until it is overloaded; and what each costs."""
+"""Growing numbers of proxies and observers on one host, until it is overloaded; and the cost of each."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ COUNTS: Final = (1, 2, 5, 10, 20, 50)
 FRAME_PERIOD_S: Final = 0.1
 TURN_S: Final = 10.0
 PARTS: Final = ("proxies", "pilot", "observers", "router")
-#: What bends: fewer samples arrive, they are older than with one, or no processor is left.
+#: Signs of overload: fewer samples arrive, they are older than with one, or no processor is left.
 LEAST_SHARE: Final = 0.99
 MOST_P99: Final = 5.0
 MOST_CORES: Final = 0.9
-OBSERVED: Final = 10  #: observers of the cases from which the costs of one are computed
-_AT_ONCE: Final = 10  # processes that connect in the same moment
+OBSERVED: Final = 10  #: observers in the cases that give the costs of one
+_AT_ONCE: Final = 10  # processes that connect at the same moment
 _AHEAD_NS: Final = 200_000_000
 _ANSWERS_WITHIN_S: Final = 120.0
 
@@ -46,15 +46,15 @@ Progress = Callable[[float, str], None]
 
 
 class Case(NamedTuple):
-    """How many there are.
+    """The numbers of a case.
 
     One process flies all proxies' vehicles; the observers are spread over the proxies in turn.
     """
 
     proxies: int
     observers: int
-    video: bool = True  #: observers get it too
-    router: bool = False  #: the observers are on another segment, with a router between
+    video: bool = True  #: whether observers get it too
+    router: bool = False  #: whether the observers are on another segment, behind a router
 
     @property
     def name(self) -> str:
@@ -75,9 +75,9 @@ class CaseResult(msgspec.Struct, frozen=True):
     router: bool
     channels: dict[str, Summary]
     shares: dict[str, float]  #: of the samples of each channel that arrived
-    cpu: dict[str, float]  #: cores in use by each part: 1.0 is one core all the time
-    memory_mb: dict[str, float]  #: of one process of each part, that which it does not share
-    opened_s: float  #: that the pilot took to connect to all proxies, one after the other
+    cpu: dict[str, float]  #: cores in use by each part: 1.0 is one full core
+    memory_mb: dict[str, float]  #: unshared memory of one process of each part
+    opened_s: float  #: the pilot took to connect to all proxies in sequence
 
 
 class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
@@ -93,7 +93,7 @@ class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
         """Return a series of cases.
 
         Args:
-            many: ``"proxies"``: more and more of them, each with its observer; ``"observers"``: of one proxy.
+            many: ``"proxies"``: growing numbers of them, each with its observer; ``"observers"``: of one proxy.
         """
         found = [case for case in self.cases if case.video and not case.router and case.observers]
         wanted = [
@@ -109,7 +109,7 @@ class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
 
 
 def bends(series: Sequence[CaseResult], cores: int) -> tuple[CaseResult, str] | None:
-    """Return the first case of a series that is overloaded, and why; None if none is.
+    """Return the first overloaded case of a series, and why; None if none is.
 
     Overloaded means that too few samples arrive, that the 99th percentile of a delay is too many times the first
     case's, or that too many cores are in use.
@@ -128,7 +128,7 @@ def bends(series: Sequence[CaseResult], cores: int) -> tuple[CaseResult, str] | 
     return None
 
 
-#: What the costs of one are computed from: see :mod:`benchmarks.units`.
+#: The cases that give the costs of one: see :mod:`benchmarks.units`.
 UNIT_CASES: Final = (
     Case(1, 0, video=False),
     Case(1, OBSERVED, video=False),
@@ -147,12 +147,12 @@ def cases_of(counts: Sequence[int]) -> list[Case]:
 def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _share, _what: None) -> Scale:
     """Measure each case.
 
-    Cases with a router need hosts of their own, and are left out without.
+    Cases with a router need separate hosts, and are omitted without them.
 
     Args:
-        seconds: How long each case is measured [s].
+        seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        progress: Called with the share done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     skipped: dict[str, str] = {}
@@ -165,7 +165,7 @@ def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _
         try:
             with _stage(case) as stage:
                 results.append(stage.play(seconds))
-        except (LinkError, NoAnswerError) as error:  # far too many for this machine: the other cases are worth having
+        except (LinkError, NoAnswerError) as error:  # far too many for this machine: keep the other cases
             skipped[case.name] = str(error)
     return Scale(machine, seconds, results, skipped, over_network.jpeg_us())
 
@@ -200,7 +200,7 @@ class _Stage:
         return [worker for part in PARTS for worker in self.parts[part]]
 
     def play(self, seconds: float) -> CaseResult:
-        """Open everything, measure, close."""
+        """Open everything, measure, and close."""
         turn = Turn(0, seconds, frame_period_s=FRAME_PERIOD_S)
         producers = [*self.parts["proxies"], *self.parts["pilot"]]
         _tell(self.parts["proxies"], turn)
@@ -246,7 +246,7 @@ class _Stage:
 
 
 class _Places(NamedTuple):
-    """Where the parts run, if not all here on the loopback."""
+    """The places of the parts, if they are not all on this host's loopback."""
 
     router: tuple[str, ...] = ()  #: addresses of a router, on the proxies' segment and the observers'
     prefixes: Mapping[str, Sequence[str]] = MappingProxyType({})
@@ -269,7 +269,7 @@ def _stage(case: Case) -> Iterator[_Stage]:
 
 
 class _Tally:
-    """What arrived in a case."""
+    """The arrivals of a case."""
 
     def __init__(self, turn: Turn, begin_ns: int) -> None:
         self._turn = turn
@@ -287,7 +287,7 @@ class _Tally:
         return {
             name: summarize(delays, sent=self._sent[name], period_s=self._turn.period_s(name.partition(",")[0]))
             for name, delays in self._delays_ns.items()
-            if delays  # on a machine that is far too full nothing may arrive of one
+            if delays  # on a heavily overloaded machine nothing may arrive on a channel
         }
 
     def shares(self) -> dict[str, float]:
@@ -295,12 +295,12 @@ class _Tally:
 
 
 def loopback(number: int) -> str:
-    """Return an address of this host that no other proxy of this run has, nor any other run."""
+    """Return an address of this host used by no other proxy of this or any other run."""
     return f"127.{20 + os.getpid() % 200}.{number // 250}.{1 + number % 250}:{DEFAULT_PORT}"
 
 
 def fly_all(pipe: Pipe, addresses: Sequence[str]) -> None:
-    """Run the pilot's process: it flies all drones, each with the same period, all at the same moment."""
+    """Run the pilot's process: it flies all drones, with the same period and at the same moment."""
     pipe.send("ready")
     while (turn := pipe.recv()) is not None:
         recorder = Recorder()
@@ -317,11 +317,11 @@ def fly_all(pipe: Pipe, addresses: Sequence[str]) -> None:
                 for application in applications:
                     application.command(time.monotonic_ns(), setpoint)
             time.sleep(SETTLE_S)
-            pipe.send(recorder.arrivals)  # before they close, which takes long on a machine that is far too full
+            pipe.send(recorder.arrivals)  # before they close, which takes long on a heavily overloaded machine
 
 
 def observe(pipe: Pipe, address: str, video: bool) -> None:
-    """Run an observer of feedback and, if wanted, video, which sends at the end of a turn what it received."""
+    """Run an observer of feedback and, if wanted, video, which sends its arrivals at the end of a turn."""
     pipe.send("ready")
     while pipe.recv() is not None:
         recorder = Recorder()
@@ -346,7 +346,7 @@ def route(pipe: Pipe, places: Sequence[str]) -> None:
 
 
 def _tell(workers: Sequence[Worker], turn: Turn) -> list[Any]:
-    """Let them open for a turn, a few at a time; what they say."""
+    """Make the workers open for a turn, a few at a time; return their answers."""
     said = []
     for first in range(0, len(workers), _AT_ONCE):
         some = workers[first : first + _AT_ONCE]
@@ -360,7 +360,7 @@ def load(path: Path) -> Scale:
     """Read ``scale.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Scale, "the results of benchmarks.scale", MAX_RESULTS)
 

@@ -1,4 +1,4 @@
-"""A diagram of how delays and processor time grow with proxies and observers. matplotlib is imported when used."""
+"""A diagram of delays and processor time over the number of proxies and observers. Imports matplotlib when used."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _processor(axes: Axes, results: Scale, many: str) -> None:
 
 
 def _plain(axes: Axes, counts: list[int]) -> None:
-    """The numbers that were measured, as they are."""
+    """Label the measured numbers as plain numbers."""
     from matplotlib.ticker import NullLocator
 
     axes.set_xticks(counts, [str(count) for count in counts])

@@ -1,4 +1,4 @@
-"""The pilot's application with a processor that takes 200 ms a frame, in a thread of its own as by default."""
+"""The pilot's application with a processor that takes 200 ms a frame, on its own thread as by default."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Application(ours.Application):
             received(SLOW_VIDEO, frame.captured_ns)
             until = time.monotonic() + SLOW_S
             mean = np.zeros(frame.shape, np.float32)
-            while time.monotonic() < until:  # what image processing does: long work on arrays
+            while time.monotonic() < until:  # like image processing: long work on arrays
                 mean += 0.1 * (frame - mean)
 
         self._drone.on_frame(slow, camera=CAMERA)

@@ -1,4 +1,4 @@
-"""Simulated drones over the network, each flown by its own controller, whose users fail."""
+"""Simulated drones over the network, each flown by its own controller, with users that fail."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from skyloop.files import MAX_RESULTS, read_json
 from skyloop.network.config import DEFAULT_PORT, free_port
 
 STOPPED_S: Final = 1.2  #: longer than ``failsafe.hover_after_s``, and shorter than ``failsafe.land_after_s``
-#: A step of the ladder is looked for so long after it was caused; 0.5 s of it are the rule.
+#: A step of the ladder is expected within this time of its cause; 0.5 s of it are the rule.
 WITHIN_S: Final = 2.0
 SEED: Final = 4
 _STARTS_WITHIN_S: Final = 60.0
@@ -35,18 +35,18 @@ Progress = Callable[[float, str], None]
 
 
 class Expected(NamedTuple):
-    """A user stopped at this time, so this drone has to fail safe."""
+    """A user stopped at this time, so this drone must fail safe."""
 
     drone: str
     since_ns: int
 
 
 class Verdict(msgspec.Struct, frozen=True):
-    """What became of the failsafes that were due."""
+    """The outcome of the expected failsafes."""
 
     expected: int
     missed: int
-    needless: int  #: taken although nobody had stopped
+    needless: int  #: taken although no user had stopped
     delay: Spread | None  #: from the user's last moment to the step; None if there was none
 
 
@@ -58,18 +58,18 @@ class Swarm(msgspec.Struct, frozen=True, tag_field="what", tag="swarm"):
     drones: int
     users: int
     observers: int
-    hosts: bool  #: whether they were on hosts of their own, else all on the loopback of one
+    hosts: bool  #: whether they were on separate hosts, or all on the loopback of one
     command: Spread  #: from sending to applying
     feedback: Spread  #: from the capture to the user
     feedback_at_observers: Spread | None
-    commands_per_s: float  #: executed, of each drone, the time without its user included
+    commands_per_s: float  #: executed by each drone, including the time without its user
     frames_per_s: float  #: at an observer, of each drone; 0 without observers
     failsafe: Verdict
     cpu: dict[str, float]  #: cores in use by each part
 
 
 def judge(expected: Sequence[Expected], steps: Sequence[Step]) -> Verdict:
-    """Return which of the failsafes that were due were taken, and which were taken besides."""
+    """Return the expected failsafes that were taken, and the unexpected ones."""
     left = sorted(steps, key=lambda step: step.at_ns)
     delays_ns = []
     for wish in expected:
@@ -83,7 +83,7 @@ def judge(expected: Sequence[Expected], steps: Sequence[Step]) -> Verdict:
 
 
 def stops_of(users: int, seconds: float, seed: int = SEED) -> list[float]:
-    """Return when each user stops for a while, one after the other [s from the beginning]."""
+    """Return the times at which each user stops for a while, one after another [s from the beginning]."""
     rng = random.Random(seed)
     room_s = seconds / users
     return [(user + rng.uniform(0.2, 0.6)) * room_s for user in range(users)]
@@ -96,17 +96,16 @@ def measure(
     observers: int = 0,
     progress: Progress = lambda _share, _what: None,
 ) -> Swarm:
-    """Let processes share the drones and fly them.
+    """Make processes share the drones and fly them.
 
-    Each process is stopped once meanwhile, and in the end the first one is killed. With root each part has a host of
-    its own.
+    Each process is stopped once meanwhile, and finally the first one is killed. With root each part has its own host.
 
     Args:
-        seconds: How long [s].
-        drones: How many drones.
-        users: How many processes fly them.
-        observers: How many watch all of them.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        seconds: Duration [s].
+        drones: Number of drones.
+        users: Number of processes that fly them.
+        observers: Number of processes that watch all of them.
+        progress: Called with the share done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     with _stage(drones, users, observers) as stage:
@@ -131,7 +130,7 @@ def measure(
 
 
 class Flight(NamedTuple):
-    """What was seen of a run; delays in ns."""
+    """The observations of a run; delays in ns."""
 
     commands_ns: list[int]
     feedback_ns: list[int]
@@ -157,7 +156,7 @@ class _Stage:
         self._witness = start("witness", swarming.bear_witness, self.names)
 
     def take_off(self) -> None:
-        """Connect everybody, and let all drones fly."""
+        """Connect everyone, and make all drones fly."""
         everybody = [self._witness, *self._users, *self._observers]
         for worker in everybody:
             worker.pipe.send("go")
@@ -165,16 +164,16 @@ class _Stage:
             worker.answer(_STARTS_WITHIN_S)
 
     def play(self, seconds: float, progress: Progress) -> Flight:
-        """Stop users and let them go on; in the end ask them all what they saw, and kill the first."""
+        """Stop and resume users; finally collect everyone's observations, and kill the first."""
         users = len(self._users)
         expected: list[Expected] = []
         for worker in (*self._users, *self._observers):
-            _ask(worker, "tell")  # and so forget what was before
+            _ask(worker, "tell")  # which discards earlier observations
         begin_ns = time.monotonic_ns()
         before_s = self._used_s()
         for user, at_s in enumerate(stops_of(users, seconds)):
             sleep_until(begin_ns + round(at_s * 1e9))
-            progress(at_s / seconds, f"user {user + 1} stands still")
+            progress(at_s / seconds, f"user {user + 1} is stopped")
             expected += self._expect(user)
             os.kill(self._users[user].pid, signal.SIGSTOP)
             time.sleep(STOPPED_S)
@@ -199,7 +198,7 @@ class _Stage:
         )
 
     def _expect(self, user: int) -> list[Expected]:
-        """Of those drones that fly: others have no reason to fail safe."""
+        """Return the expected failsafes of the flying drones: others have no reason to fail safe."""
         flying = _ask(self._witness, "flying")
         now_ns = time.monotonic_ns()
         return [Expected(drone, now_ns) for drone in self.shares[user] if drone in flying]
@@ -239,7 +238,7 @@ def load(path: Path) -> Swarm:
     """Read ``swarm.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Swarm, "the results of benchmarks.swarm", MAX_RESULTS)
 

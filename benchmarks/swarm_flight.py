@@ -1,15 +1,15 @@
-"""Several drones, each flown by its own controller, all from one process; then all are let go of in the air.
+"""Several drones, each flown by its own controller from one process; finally all are abandoned in the air.
 
 ::
 
     skyloop sim --drones 10 --name drone --world empty --option cameras=front --option width=64 --option fps=10
     python -m benchmarks.swarm_flight "drone*" --seconds 60
 
-What is measured: the delay of each command from its sending until the driver had taken it, the delay of feedback, how
-many frames came, failsafe steps that nobody wanted, and at the end, when the pilot's connections go away in flight,
-after how long each proxy brought its drone to hover and whether it landed by itself.
+Measured are the delay of each command from sending until the driver has it, the delay of feedback, the number of
+frames, unwanted failsafe steps, and at the end, when the pilot's connections close in flight, the time until each proxy
+makes its drone hover, and whether it lands.
 
-It ends with 1 if a failsafe was missed when the drones were let go of in the air at the end.
+It exits with 1 if a failsafe was missed after the drones were abandoned in the air.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from skyloop.errors import SkyloopError
 from skyloop.extend import Known
 from skyloop.messages import Applied, Event, EventKind, Failsafe, Feedback
 
-LAND_AFTER_S: Final = 5.0  #: as is usual of ``failsafe.land_after_s``
-_HOVER_WITHIN_S: Final = 5.0  # looked for so long
+LAND_AFTER_S: Final = 5.0  #: the usual value of ``failsafe.land_after_s``
+_HOVER_WITHIN_S: Final = 5.0  # longest wait for the hover
 _LAND_WITHIN_S: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class SwarmFlight:
-    """How one drone's flight went. Delays in s."""
+    """The result of one drone's flight. Delays in s."""
 
     name: str
     commands: int  #: of this program that were applied
     command: Distribution | None  #: from sending to the driver
     feedback: Distribution | None  #: from the proxy's publishing to this program; the last 1024
-    frames: int  #: that its controller was called with
+    frames: int  #: passed to its controller
     refused: int  #: commands
     unwanted: int  #: failsafe steps while it was flown
-    hover_s: float | None  #: from letting go of it until the failsafe's hover was told; None: missed
-    landed: bool  #: by itself, afterwards
+    hover_s: float | None  #: from abandoning it until the failsafe's hover was reported; None: missed
+    landed: bool  #: automatically, afterwards
 
 
 class Rounds(Controller):
@@ -62,7 +62,7 @@ class Rounds(Controller):
 
 
 class LookingRounds(Rounds):
-    """Flies the same rounds, and receives each frame, as a controller with a camera does."""
+    """Flies the same rounds, and receives each frame, like a controller with a camera."""
 
     brightness = 0.0
 
@@ -72,7 +72,7 @@ class LookingRounds(Rounds):
 
 
 class _Notes:
-    """What is noted of one drone while it is flown."""
+    """The notes on one drone while it is flown."""
 
     def __init__(self, drone: Drone) -> None:
         self.delays_ns: list[int] = []
@@ -98,18 +98,18 @@ class _Notes:
 
 
 def fly(*targets: Target, seconds: float, land_after_s: float = LAND_AFTER_S) -> list[SwarmFlight]:
-    """Fly all drones, then let go of them in the air.
+    """Fly all drones, then abandon them in the air.
 
     Args:
-        *targets: Names, patterns or addresses, as of :func:`skyloop.swarm`.
-        seconds: How long to fly [s].
-        land_after_s: After how long a drone that nobody flies should land by itself [s].
+        *targets: Names, patterns or addresses, as for :func:`skyloop.swarm`.
+        seconds: Duration of the flight [s].
+        land_after_s: When an abandoned drone should land [s].
 
     Raises:
-        SwarmError: Some drones could not be flown; these are landed.
+        SwarmError: Some drones could not be flown; they are landed.
     """
     with swarm(*targets, access="observe") as watchers:
-        # Over each proxy's name, so that the watcher and the pilot of an address share its private proxy.
+        # By proxy name, so that the watcher and the pilot of an address share its private proxy.
         reach = {name: Known(drone).reach or drone.name for name, drone in watchers.items()}
         pilots = swarm(reach, on_error="raise", on_exit="land")
         try:
@@ -144,7 +144,7 @@ def _fly(pilots: Swarm, seconds: float) -> dict[str, SwarmFlight]:
 
 
 def _let_go(pilots: Swarm) -> dict[str, float]:
-    """Close each connection in flight; when, by name [s, ``time.monotonic``]."""
+    """Close each connection in flight; return the times, by name [s, ``time.monotonic``]."""
     let_go_s = {}
     for name, drone in pilots.items():
         drone.velocity(forward=0.2, yaw_rate=0.8)
@@ -186,12 +186,12 @@ def _judge(watchers: Swarm, flown: Mapping[str, SwarmFlight], let_go_s: Mapping[
 
 
 def missed(flights: list[SwarmFlight]) -> list[str]:
-    """Return the names of the drones whose failsafe did not come, or did not land them."""
+    """Return the names of the drones whose failsafe was missing, or did not land them."""
     return [flight.name for flight in flights if flight.hover_s is None or not flight.landed]
 
 
 def report(flights: list[SwarmFlight]) -> list[list[str]]:
-    """Return the table, its head first."""
+    """Return the table, with its head first."""
     head = ["drone", "commands", "delay ms: median", "p99", "max", "feedback ms: median", "p99"]
     rows = [[*head, "frames", "refused", "unwanted failsafes", "hover after ms", "landed"]]
     for flight in flights:

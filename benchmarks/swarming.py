@@ -19,7 +19,7 @@ from skyloop.sim.host import SimHost
 from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.options import options_of
 
-#: Small pictures: what is measured is not how fast this machine draws.
+#: Small pictures: the speed of drawing on this machine does not matter here.
 VEHICLES: Final = "sim://?world=empty&cameras=front&width=160&height=120&fps=5"
 QUALITY: Final = 70
 _RADIUS_M: Final = 0.5
@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
 
 class Circle(Controller):
-    """Flies a circle, commanded anew with each sample of feedback, and notes how old those are."""
+    """Flies a circle with a new command for each sample of feedback, and records the samples' ages."""
 
     def __init__(self, drone: Drone, delays_ns: list[int]) -> None:
         super().__init__(drone)
@@ -65,9 +65,9 @@ def simulate(pipe: Pipe, place: str, names: list[str]) -> None:
 
 
 def fly(pipe: Pipe, place: str, names: list[str]) -> None:
-    """Run a user, who flies each of these drones by a controller of its own, all in this process.
+    """Run a user, who flies each of these drones with a separate controller, all in this process.
 
-    When asked, it sends how old the feedback came [ns] since it was asked before.
+    On request, it sends the ages of feedback [ns] since the previous request.
     """
     pipe.send("ready")
     delays_ns: list[int] = []
@@ -96,7 +96,7 @@ def fly(pipe: Pipe, place: str, names: list[str]) -> None:
 
 
 def _hover(drone: Drone) -> None:
-    """Wait until it hovers, and ask anew meanwhile: what was asked before a link was lost is not sent again."""
+    """Wait until it hovers, repeating the request: one made before a link was lost is not sent again."""
     deadline = time.monotonic() + _CONNECTS_WITHIN_S
     while True:
         try:
@@ -105,14 +105,14 @@ def _hover(drone: Drone) -> None:
         except NoAnswerError:
             if time.monotonic() > deadline:
                 raise
-            with suppress(LinkError, AuthorityError):  # the link is lost once more, or not yet ours again
+            with suppress(LinkError, AuthorityError):  # the link is lost once more, or control is not back yet
                 drone.takeoff(wait=False)
 
 
 def look_on(pipe: Pipe, place: str, names: list[str]) -> None:
     """Run an observer of all drones, with their video.
 
-    When asked, it sends how old the feedback came [ns], and how many frames, since it was asked before.
+    On request, it sends the ages of feedback [ns] and the number of frames since the previous request.
     """
     pipe.send("ready")
     if pipe.recv() is None:
@@ -138,9 +138,9 @@ def look_on(pipe: Pipe, place: str, names: list[str]) -> None:
 
 
 def bear_witness(pipe: Pipe, place: str, names: list[str]) -> None:
-    """Note when vehicles begin to fail safe, and when each command was applied and how old it was then [ns].
+    """Record when vehicles begin to fail safe, and the time and age of each applied command [ns].
 
-    When asked ``"flying"``, it sends which drones fly at this moment.
+    On the request ``"flying"``, it sends the drones that fly at this moment.
     """
     pipe.send("ready")
     if pipe.recv() is None:
@@ -154,7 +154,7 @@ def bear_witness(pipe: Pipe, place: str, names: list[str]) -> None:
             commands.append((echo.applied_ns, echo.applied_ns - echo.sent_ns))
 
     def watch(name: str, drone: Drone) -> None:
-        # Each sample of feedback tells of the ladder, so one that is lost hides nothing.
+        # Each sample of feedback contains the ladder's state, so a lost one hides nothing.
         def told(feedback: Feedback) -> None:
             before = newest.get(name)
             if feedback.failsafe is not Failsafe.NONE and before is not None and before.failsafe is Failsafe.NONE:

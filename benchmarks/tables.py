@@ -40,7 +40,7 @@ def load_table(results: Load) -> Table:
 
 
 def cpu_table(results: Load) -> Table:
-    """Return what each part of a case takes of the processor."""
+    """Return the processor time of each part of a case."""
     rows = [
         [case.case, f"{case.size}, {case.frames_per_s:.0f}/s", *(_share(case.cpu.get(part)) for part in LOAD_PARTS)]
         for case in results.cases
@@ -49,7 +49,7 @@ def cpu_table(results: Load) -> Table:
 
 
 def codecs_table(results: CodecResults) -> Table:
-    """Return what each kind of work takes of the processor."""
+    """Return the processor time of each kind of work."""
     rows = [
         [
             row.what,
@@ -67,7 +67,7 @@ def codecs_table(results: CodecResults) -> Table:
 
 
 def network_table(results: Network) -> Table:
-    """Return what arrives, and how old it is then, by way and loss."""
+    """Return the shares and ages of arrivals, by connection and loss."""
     rows = [
         [
             f"{case.loss:.0%}",
@@ -95,7 +95,7 @@ def network_table(results: Network) -> Table:
 
 
 def path_table(results: Network) -> Table:
-    """Return the path's own figures, and how many bytes a sample takes on it."""
+    """Return the path's own figures, and the bytes of a sample on it."""
     rows = [["maximum throughput", f"{results.megabytes_per_s:.0f} MB/s"]]
     late = max(case.relay.p99_us for case in results.cases)
     typical = max(case.relay.median_us for case in results.cases)
@@ -138,7 +138,7 @@ def swarm_table(results: Sequence[Swarm]) -> Table:
 
 
 def scale_table(results: Scale, many: str) -> Table:
-    """Return the cases with more and more ``"proxies"``, each with its observer, or ``"observers"`` of one proxy."""
+    """Return the cases of growing ``"proxies"``, each with its observer, or ``"observers"`` of one proxy."""
     series = results.series(many)
     rows = [[str(case.observers), *_scale_cells(case)] for case in series]
     columns = [
@@ -162,7 +162,7 @@ def _scale_cells(case: CaseResult) -> list[str]:
 
 
 def fleet_table(results: HostedFleet) -> Table:
-    """Return what many vehicles in one host cost, and how late their samples are."""
+    """Return the costs of many vehicles in one host, and the delays of their samples."""
     rows = [
         [
             str(case.vehicles),
@@ -181,7 +181,7 @@ def fleet_table(results: HostedFleet) -> Table:
 
 
 def mavlink_table(case: MavlinkResult) -> Table:
-    """Return how emulated MAVLink vehicles fared in one host."""
+    """Return the results of emulated MAVLink vehicles in one host."""
     row = [
         str(case.vehicles),
         str(case.flown),
@@ -202,7 +202,7 @@ def mavlink_table(case: MavlinkResult) -> Table:
 
 
 def bend_text(results: Scale, many: str) -> str:
-    """Return from where on a series is not as good as at its beginning, in words."""
+    """Return in words where a series becomes worse than its beginning."""
     series = results.series(many)
     bend = bends(series, results.machine.cores)
     if bend is None:
@@ -233,7 +233,7 @@ def units_table(units: Units) -> Table:
 
 
 def needs_table(fleet: Fleet, found: Needs) -> Table:
-    """Return what a fleet needs."""
+    """Return the requirements of a fleet."""
     rows = [
         ["cores for proxies", f"{found.proxy_cores:.1f}", f"{fleet.drones} of them"],
         ["cores for pilots", f"{found.pilot_cores:.1f}", ""],

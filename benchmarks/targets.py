@@ -23,11 +23,11 @@ OBSERVED_P99: Final = 2.0  #: the pilot's command, with that many observers to n
 MOST_PAGES: Final = 10
 PAGED_P99: Final = 1.5  #: the pilot's command, with that many pages of a cockpit to none
 RECORDED_MEDIAN: Final = 1.1  #: the pilot's command, with a recorder to none
-STUCK_MEDIAN: Final = 1.1  #: feedback of the observers that go on, with one stopped to none: as good as nothing
+STUCK_MEDIAN: Final = 1.1  #: feedback of the other observers, with one stopped to none: practically no change
 
 
 def judge_load(results: Load) -> list[Verdict]:
-    """Return the verdicts on the targets of which this run has all figures."""
+    """Return the verdicts on the targets for which this run has all figures."""
     verdicts = []
     alone = results.case(ALONE)
     crowd = results.case(observers_name(MOST_OBSERVERS))

@@ -1,8 +1,8 @@
-"""``python -m benchmarks.tracking``: our trackers beside OpenCV's own that need no weights, on the same images.
+"""``python -m benchmarks.tracking``: our trackers beside OpenCV's weight-free ones, on the same images.
 
-Success: the share of images with the target in view in which the box overlaps the true one by a half or more.
-Precision: that in which their middles are at most 20 pixels apart. A tracker that says lost while the target is in view
-fails in both. Each tracker has one core, and its processor time is counted.
+Success is the share of images with the target in view whose box overlaps the true one by half or more; precision is the
+share with centres at most 20 pixels apart. A tracker that reports a loss while the target is in view fails in both.
+Each tracker has one core, and its processor time is counted.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ Make = Callable[[], Tracker]
 
 
 class OpenCvTracker(Tracker):
-    """One of OpenCV's own trackers, which has no score and is never lost unless it says so."""
+    """One of OpenCV's own trackers, which has no score and is never lost unless it reports so."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
-        """Keep how it is made: it can be started once only."""
+        """Keep the constructor, because a tracker can be started only once."""
         self._make = make
 
     def _start(self, image: Image, box: Box) -> None:
@@ -87,7 +87,7 @@ class TrackingResults(msgspec.Struct, frozen=True):
 
 
 def trackers() -> dict[str, Make]:
-    """Return ours, and those that this OpenCV has and that need no weights."""
+    """Return ours, and the weight-free ones of this OpenCV."""
     found: dict[str, Make] = {
         "LongTermTracker": LongTermTracker,
         "CorrelationTracker": CorrelationTracker,
@@ -101,13 +101,13 @@ def trackers() -> dict[str, Make]:
 
 
 def groups(film: Path | None, quick: bool = False) -> dict[str, list[Sequence]]:
-    """Return the sequences: the drawn ones and, with a film, its own and those made from it."""
+    """Return the sequences: the drawn ones and, with a film, its own and those derived from it."""
     count = 24 if quick else 90
     found = {"drawn": [scene(kind, seed, count) for kind in KINDS for seed in range(100, 101 if quick else 102)]}
     if film is not None:
         labels = read_labels()
         frames = read_film(film, 24 if quick else None)
-        # Each second frame: the run should take about a minute.
+        # Every second frame: the run should take about a minute.
         halved = {name: {n // 2: box for n, box in boxes.items()} for name, boxes in labels.objects.items()}
         found["film"] = [fixed(name, frames[::2], boxes) for name, boxes in halved.items()]
         found["film, moved"] = [
@@ -173,7 +173,7 @@ def _row(group: str, name: str, make: Make, sequences: Iterable[Sequence]) -> Tr
 
 
 def _distance(found: TrackResult, truth: Box) -> float:
-    """Return how far the middles are apart [px]; infinity while lost."""
+    """Return the distance of the centres [px]; infinity while lost."""
     if found.centre is None:
         return math.inf
     return math.dist(found.centre, (truth[0] + (truth[2] - 1) / 2, truth[1] + (truth[3] - 1) / 2))
@@ -198,7 +198,7 @@ def table(results: TrackingResults) -> Table:
 
 
 def score_table(results: TrackingResults) -> Table:
-    """Return what a score of the long-term tracker is worth."""
+    """Return the meaning of the long-term tracker's scores."""
     rows = []
     for n, (low, high) in enumerate(pairwise(BINS)):
         counts = [row.scores[n] for row in results.rows if row.tracker == "LongTermTracker"]
@@ -231,12 +231,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="benchmarks.tracking", description=__doc__)
     fixtures = LABELS.parents[4] / "shared" / "fixtures"
     parser.add_argument("--fixtures", type=Path, default=fixtures, help="the folder with the recorded film")
-    parser.add_argument("--output", type=Path, help="write tracking.json and tracking.png into this folder")
-    parser.add_argument("--quick", action="store_true", help="few images, to see that it works")
+    parser.add_argument("--output", type=Path, help="folder for tracking.json and tracking.png")
+    parser.add_argument("--quick", action="store_true", help="few images, to check that it works")
     options = parser.parse_args(arguments)
     film = options.fixtures / read_labels().film
     if not film.is_file():
-        print(f"{film} is not there: only drawn images are used")
+        print(f"{film} is missing: using only drawn images")
         film = None
     results = measure(groups(film, options.quick), trackers(), lambda what: print(f"… {what}", flush=True))
     print(results.machine)

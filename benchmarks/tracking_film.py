@@ -1,4 +1,4 @@
-"""A recorded film as an array, and the boxes that were labelled in it by hand."""
+"""A recorded film as an array, and its hand-labelled boxes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Labels(msgspec.Struct, frozen=True):
 
     film: str  #: its place among the recorded fixtures
     size: tuple[int, int]  #: width and height of a frame [px]
-    how: str  #: the boxes were made
+    how: str  #: how the boxes were made
     objects: dict[str, dict[int, Box]]  #: name → number of the frame → x, y, width, height [px]
 
 
@@ -37,11 +37,11 @@ def read_labels(path: Path = LABELS) -> Labels:
 
 
 def read_film(path: Path, most: int | None = None) -> NDArray[np.uint8]:
-    """Decode the film that an AR.Drone 2 sent, (n, h, w, 3) BGR.
+    """Decode a film sent by an AR.Drone 2, (n, h, w, 3) BGR.
 
     Args:
         path: The PaVE stream.
-        most: Frames, the first ones; None: all.
+        most: Number of frames, from the first; None: all.
 
     Raises:
         UsageError: There is no such file.

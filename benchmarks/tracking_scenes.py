@@ -1,6 +1,6 @@
-"""Image sequences with known boxes, drawn from a seed: something with texture that moves over something with texture.
+"""Image sequences with known boxes, drawn from a seed: something textured that moves over a textured background.
 
-Also a film seen by a camera that pans and zooms: the film's own pixels and labels, with a motion that is known.
+Also a film seen by a camera that pans and zooms: the film's own pixels and labels, with a known motion.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from skyloop.vision.tracking import Box, Image
 KINDS: Final = ("plain", "light", "hidden", "leaves", "look-alike")
 SIZE: Final = (640, 480)  #: width and height of the drawn images
 _MARGIN: Final = 160  # pixels of background around the first image, for the camera to pan over
-_NOISE: Final = 64  # pixels by which the noise is larger than an image
-Truth = Box | None  #: None while nothing of the target is in view
+_NOISE: Final = 64  # extra size of the noise over an image [pixels]
+Truth = Box | None  #: None while the target is out of view
 
 
 Step = tuple[Image, Truth, bool]
 
 
 class Sequence(NamedTuple):
-    """One target in a series of images; in the first one it is in view.
+    """One target in a series of images; the first one shows it.
 
     ``frames`` gives each image, the target's box in it, and whether that box is known well enough to count.
     """
@@ -45,15 +45,14 @@ def texture(rng: np.random.Generator, width: int, height: int, mean: Iterable[fl
 
 
 def scene(kind: str, seed: int, count: int = 120) -> Sequence:
-    """Return a drawn sequence of ``count`` images, the same each time it is drawn.
+    """Return a drawn sequence of ``count`` images, reproducibly.
 
     Args:
         kind: ``plain``: it moves and changes its size; ``light``: the light changes, too; ``hidden``: a pillar hides it
-        for a
-            fifth of the time; ``leaves``: it leaves the image and comes back; ``look-alike``: another thing of the same
-            colours crosses its way, and stays in view while a pillar hides the target.
-        seed: Of everything that is random.
-        count: Images.
+          a fifth of the time; ``leaves``: it leaves the image and comes back; ``look-alike``: another thing of the same
+          colours crosses its path, and stays in view while a pillar hides the target.
+        seed: Seed of all randomness.
+        count: Number of images.
     """
     return Sequence(f"{kind} {seed}", lambda: _drawn(kind, seed, count))
 
@@ -99,12 +98,12 @@ def _drawn(kind: str, seed: int, count: int) -> Iterator[Step]:
 
 
 def _bump(share: float) -> float:
-    """0, 1 in the middle, and 0 again, smoothly."""
+    """Return 0, 1 in the middle, and 0 again, smoothly."""
     return math.sin(math.pi * min(max((share - 0.3) / 0.5, 0.0), 1.0)) ** 2
 
 
 def _paste(image: Image, what: Image, box: Box) -> None:
-    """Draw a patch over a box of an image, at parts of pixels."""
+    """Draw a patch over a box of an image, with subpixel accuracy."""
     x, y, width, height = box
     across, down = width / what.shape[1], height / what.shape[0]
     turn = np.array([[across, 0, x + across / 2 - 0.5], [0, down, y + down / 2 - 0.5]])
@@ -113,19 +112,19 @@ def _paste(image: Image, what: Image, box: Box) -> None:
 
 
 def fixed(name: str, film: NDArray[np.uint8], labels: dict[int, Box]) -> Sequence:
-    """Return a film as it is; only the frames that are labelled count."""
+    """Return a film unchanged; only labelled frames count."""
     return Sequence(name, lambda: ((image, labels.get(n), n in labels) for n, image in enumerate(film)))
 
 
 def moved(name: str, film: NDArray[np.uint8], labels: dict[int, Box], count: int, seed: int) -> Sequence:
-    """Return a film as seen by a camera that pans and zooms over it; beyond its edges they are repeated.
+    """Return a film as seen by a camera that pans and zooms over it; edge pixels are repeated beyond it.
 
     Args:
-        name: Of the target.
+        name: Name of the target.
         film: Its frames, (n, h, w, 3).
-        labels: The target's box in some of them, by their number; the nearest one holds for those between.
-        count: Images.
-        seed: Of the motion.
+        labels: The target's box in some of them, by number; frames in between use the nearest one.
+        count: Number of images.
+        seed: Seed of the motion.
     """
     return Sequence(f"{name}, moved", lambda: _moved(film, labels, count, seed))
 

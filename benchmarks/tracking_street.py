@@ -1,8 +1,8 @@
-"""``python -m benchmarks.tracking_street``: what a score of the long-term tracker is worth, fitted and held back.
+"""``python -m benchmarks.tracking_street``: the meaning of the long-term tracker's scores, fitted and validated.
 
-Figures of the simulator's outdoor worlds, seen by a camera that goes round them, with their true boxes. The fit is
-monotone, from score to the share of boxes that overlap the true one by a half or more, on some seeds; the table is of
-others.
+Figures of the simulator's outdoor worlds, seen by a camera that circles them, with their true boxes. The fit is
+monotone, from the score to the share of boxes that overlap the true one by half or more, on some seeds; the table is
+from others.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ FIT_SEEDS: Final = range(8)
 HELD_BACK_SEEDS: Final = range(100, 108)
 PERIOD_S: Final = 0.1
 OVERLAP: Final = 0.5
-KNOTS: Final = (0.45, 0.55, 0.65, 0.75, 0.85, 0.95)  #: middles of the bins of scores
+KNOTS: Final = (0.45, 0.55, 0.65, 0.75, 0.85, 0.95)  #: centres of the score bins
 _LEAST_PX: Final = 24  # height of a target at the start
 _MODEL: Final = CameraModel("bench", 320, 240, 10.0, 240.0, 240.0, 159.5, 119.5)
 
 
 def street(world_name: str, seed: int, count: int = 60) -> Sequence:
-    """Return one figure of a world, seen by a camera that goes round it, chosen by the seed; 10 images a second."""
+    """Return one figure of a world, chosen by the seed, seen by a camera that circles it; 10 images a second."""
     return Sequence(f"{world_name} {seed}", lambda: _seen(world_name, seed, count))
 
 
@@ -98,7 +98,7 @@ def scored(sequences: Iterable[Sequence]) -> list[tuple[float, bool]]:
 
 
 def fitted(pairs: list[tuple[float, bool]]) -> tuple[float, ...]:
-    """Return a monotone share for each of KNOTS: that of its bin, drawn to a half by two boxes, and pooled."""
+    """Return a monotone share for each of KNOTS: that of its bin, pulled towards a half by two boxes, and pooled."""
     blocks: list[list[float]] = []  # share, weight, knots
     for knot in KNOTS:
         goods = [good for score, good in pairs if abs(score - knot) <= 0.05]
@@ -124,9 +124,9 @@ def reliability(pairs: list[tuple[float, bool]], shares: tuple[float, ...]) -> l
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Fit, and print the table of the sequences that were held back."""
+    """Fit, and print the table of the validation sequences."""
     parser = argparse.ArgumentParser(prog="benchmarks.tracking_street", description=__doc__)
-    parser.add_argument("--images", type=int, default=60, help="of each sequence")
+    parser.add_argument("--images", type=int, default=60, help="images of each sequence")
     options = parser.parse_args(arguments)
     cv2.setNumThreads(1)
     fit, held = (

@@ -1,4 +1,4 @@
-"""What each sample costs, from ``benchmarks.scale`` and ``network``, and what a fleet needs by those costs."""
+"""The cost of each sample, from ``benchmarks.scale`` and ``network``, and the needs of a fleet at those costs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Units(msgspec.Struct, frozen=True):
     proxy_us_per_s: float  #: of a proxy with a pilot, each second, with its commands and its feedback to the pilot
     pilot_us_per_s: float  #: of a pilot, each second and drone
     feedback_sent_us: float  #: by a proxy, for each further observer
-    feedback_received_us: float  #: by an observer's process, with all that it does besides
-    jpeg_us: float  #: to encode one frame, once for all who want it so
+    feedback_received_us: float  #: by an observer's process, including its other work
+    jpeg_us: float  #: to encode one frame, once for all clients of the same form
     frame_sent_us: float  #: by a proxy, for each observer
     frame_received_us: float  #: by an observer, decoding included
     feedback_routed_us: float  #: by a router, for each observer
@@ -40,7 +40,7 @@ class Units(msgspec.Struct, frozen=True):
 def derive(scale: Scale, network: Network) -> Units:
     """Return the costs, as differences between cases.
 
-    Differences of small figures can come out below zero on a busy machine; then they are given as zero.
+    Differences of small figures can fall below zero on a busy machine; they are then reported as zero.
 
     Raises:
         UsageError: One of the cases is missing.
@@ -85,18 +85,18 @@ def derive(scale: Scale, network: Network) -> Units:
 
 
 class Fleet(msgspec.Struct, frozen=True):
-    """Who is connected: each drone has a pilot, and others watch it."""
+    """The connections of a fleet: each drone has a pilot and observers."""
 
     drones: int = 1000
-    sites: int = 20  #: each a network segment with a router, joined through a router in the middle
-    observers: int = 2  #: of each drone, who get feedback; half of them at another site
-    viewers: int = 1  #: of these, who get video too
+    sites: int = 20  #: network segments with a router each, joined through a central router
+    observers: int = 2  #: of each drone, for feedback; half of them at another site
+    viewers: int = 1  #: of these, also for video
     frames_per_s: float = 10.0
-    busy: float = 0.6  #: how much of a core may be in use
+    busy: float = 0.6  #: maximum use of a core
 
 
 class Needs(msgspec.Struct, frozen=True):
-    """What a fleet needs. Bandwidths in Mbit/s."""
+    """The needs of a fleet. Bandwidths in Mbit/s."""
 
     proxy_cores: float  #: all proxies together
     pilot_cores: float
@@ -105,19 +105,19 @@ class Needs(msgspec.Struct, frozen=True):
     middle_cores: float  #: of the router in the middle
     drone_uplink: float  #: one proxy's link: feedback and video out
     drone_downlink: float  #: commands in
-    site_link: float  #: between a site and the middle, the busier way
-    tokens: int  #: liveliness tokens: one a proxy, one a connection
+    site_link: float  #: between a site and the centre, the busier direction
+    tokens: int  #: liveliness tokens: one per proxy, one per connection
     proxy_memory_gb: float
     observer_memory_gb: float
-    cores: int  #: in all, if none is to be busier than it may
+    cores: int  #: in all, with none busier than allowed
     mesh_links: int  #: links if all called one another instead of their site's router
 
 
 def needs(fleet: Fleet, units: Units) -> Needs:
-    """Return what a fleet needs, by the costs of one of each.
+    """Return the needs of a fleet, from the costs of one of each.
 
-    What is not linear (a crowded machine's scheduler, its caches) is not in it. Proxies connect to their site's router,
-    so each sends everything once; the router multiplies it. Pilots are at the site of their drone; half of the
+    Non-linear effects (a crowded machine's scheduler, its caches) are not included. Proxies connect to their site's
+    router, so each sends everything once; the router multiplies it. Pilots are at the site of their drone; half of the
     observers, and of the viewers among them, are at other sites.
     """
     site_drones = fleet.drones / fleet.sites
@@ -126,12 +126,12 @@ def needs(fleet: Fleet, units: Units) -> Needs:
     proxy_us = units.proxy_us_per_s + frame_rate * (units.jpeg_us + units.frame_sent_us)
     observer_us = _PACKETS_PER_S * units.feedback_received_us * fleet.observers
     observer_us += frame_rate * units.frame_received_us * fleet.viewers
-    # For each drone: its command and its feedback to the pilot, and what observers get, at home or from the middle.
+    # For each drone: its command and its feedback to the pilot, and the observers' data, local or from the centre.
     routed_us = _PACKETS_PER_S * units.feedback_routed_us * (2 + fleet.observers)
     routed_us += frame_rate * units.frame_routed_us * fleet.viewers
     passed_us = _PACKETS_PER_S * units.feedback_routed_us * away_observers
     passed_us += frame_rate * units.frame_routed_us * away_viewers
-    # On its way out of a site, and on the way into another, a stream passes once however many there want it.
+    # A stream leaves a site once, and enters another once, for any number of receivers.
     leaving_bits = 8 * _PACKETS_PER_S * units.feedback_bytes * min(1.0, away_observers)
     leaving_bits += 8 * frame_rate * units.frame_bytes * min(1.0, away_viewers)
     feedback_bits, frame_bits = 8 * _PACKETS_PER_S * units.feedback_bytes, 8 * frame_rate * units.frame_bytes

@@ -1,4 +1,4 @@
-"""How good the pictures are that arrive, in any contender's application. Needs NumPy alone."""
+"""The quality of arriving pictures, in any contender's application. Needs NumPy alone."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from benchmarks.measuring.schedule import MIDDLE
 from benchmarks.moving_scene import MovingScene, psnr_db
 
 SIZE: Final = MIDDLE  #: of the camera's pictures
-JUDGED: Final = 10  #: the quality of one picture in so many is measured
-QUALITY: Final = "quality "  #: and told as a channel for each decibel
+JUDGED: Final = 10  #: one picture in this many is measured
+QUALITY: Final = "quality "  #: prefix of the channels, one per decibel
 
 
 class Judge:
-    """Measures how good some of the pictures are.
+    """Measures the quality of some of the pictures.
 
     Args:
-        received: Told of each.
+        received: Called for each.
     """
 
     def __init__(self, received: Received) -> None:
@@ -26,7 +26,7 @@ class Judge:
         self._count = 0
 
     def look(self, image: Image, stamp_ns: int) -> None:
-        """Look at a picture, after it counted as shown."""
+        """Judge a picture, after it counted as shown."""
         self._count += 1
         if self._count % JUDGED:
             return

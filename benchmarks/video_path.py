@@ -31,9 +31,9 @@ from skyloop.files import MAX_RESULTS, read_json
 WEBRTC: Final = "WebRTC (aiortc)"
 CONTENDERS: Final = (*FORMS, WEBRTC)
 PYTHON_VARIABLE: Final = "SKYLOOP_AIORTC_PYTHON"
-DELAY_S: Final = 0.02  #: each way, besides the wait for the path
-GOOD_KBIT_S: Final = 300.0  #: the path is judged in the seconds of a trace that carry as much
-FROZEN_MS: Final = 250.0 + 1000.0 / FPS  #: the picture is frozen while the newest that was shown is older
+DELAY_S: Final = 0.02  #: each way, in addition to the wait for capacity
+GOOD_KBIT_S: Final = 300.0  #: the path is judged in those seconds of a trace that carry this much
+FROZEN_MS: Final = 250.0 + 1000.0 / FPS  #: the picture counts as frozen while the newest one shown is older
 _PATH: Final = Impairments(delay_s=DELAY_S)
 _SEED: Final = 8
 _SECOND_MS: Final = 1000
@@ -45,7 +45,7 @@ Progress = Callable[[float, str], None]
 
 
 class Ages(msgspec.Struct, frozen=True):
-    """Ages of what arrived while the path carried enough [ms]."""
+    """Ages of arrivals while the path carried enough [ms]."""
 
     p50: float
     p95: float
@@ -58,19 +58,19 @@ class PathCase(msgspec.Struct, frozen=True):
     trace: str
     contender: str
     carried_kbit_s: float  #: by the path, on average over all the time
-    sent_kbit_s: float  #: of it that were used by all that the vehicle sent
-    good_share: float  #: of the time, in which the path carried enough; what follows is of that time, but for two
-    video: Ages | None  #: age of each picture when the application has it; None: there was none
+    sent_kbit_s: float  #: of it, used by everything the vehicle sent
+    good_share: float  #: share of the time with enough capacity; the fields below refer to it, except two
+    video: Ages | None  #: age of each picture on arrival at the application; None: none arrived
     frozen_share: float | None
-    unavoidable_share: float  #: in which nobody could have shown a picture that is not frozen
-    frozen_of_all: float | None  #: of all the time, however little the path carried …
-    unavoidable_of_all: float  #: … and as much of that as nobody could have avoided
+    unavoidable_share: float  #: share in which a frozen picture was unavoidable
+    frozen_of_all: float | None  #: of the whole time, at any capacity …
+    unavoidable_of_all: float  #: … and the unavoidable part of that
     pictures_per_s: float
     psnr_db: float | None
     feedback: Ages | None
     command: Ages | None
-    commands_share: float  #: of those sent at any time that were executed
-    shown: list[tuple[int, int]] = []  #: of each picture: when it came [ms], and how old it was; of one trace only
+    commands_share: float  #: share executed, of those sent at any time
+    shown: list[tuple[int, int]] = []  #: time of arrival [ms] and age of each picture; of one trace only
 
 
 class VideoPath(msgspec.Struct, frozen=True, tag_field="what", tag="video_path"):
@@ -83,7 +83,7 @@ class VideoPath(msgspec.Struct, frozen=True, tag_field="what", tag="video_path")
 
 
 def aiortc_python() -> tuple[str, str]:
-    """Return the interpreter that has aiortc, and why there is none; one of the two is empty."""
+    """Return the interpreter with aiortc, and the reason if there is none; one of the two is empty."""
     python = os.environ.get(PYTHON_VARIABLE) or sys.executable
     try:
         ended = subprocess.run(
@@ -106,13 +106,13 @@ def measure(
     """Measure each contender on each trace.
 
     Args:
-        seconds: How long each case is measured, from the beginning of the trace [s].
-        traces: What the way to the pilot carries.
+        seconds: Duration of each case, from the beginning of the trace [s].
+        traces: Capacities of the path to the pilot.
         contenders: Of :data:`CONTENDERS`.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        progress: Called with the share done, 0 to 1, and the next step.
 
     Raises:
-        UnsupportedError: No hosts can be made here.
+        UnsupportedError: No hosts can be created here.
     """
     machine, skipped, cases = Machine.here(), {}, []
     python, why = aiortc_python() if WEBRTC in contenders else ("", "")
@@ -121,7 +121,7 @@ def measure(
     wanted = [(trace, contender) for trace in traces for contender in contenders if contender not in skipped]
     for index, (trace, contender) in enumerate(wanted):
         progress(index / len(wanted), f"{trace.name}, {contender}")
-        with Lab() as lab, Workers() as workers:  # a lab for each: WebRTC takes whichever path there is
+        with Lab() as lab, Workers() as workers:  # a lab for each: WebRTC uses any path it finds
             hosts = lab.host("vehicle"), lab.host("pilot")
             case = _Stage(lab, workers, hosts, contender, python).play(trace, seconds)
         if trace.name != wanted[0][0].name:
@@ -144,7 +144,7 @@ class _Stage:
             self._pair = Pair(workers, "benchmarks.over_path", address(contender, place), prefixes=prefixes)
 
     def play(self, trace: Trace, seconds: float) -> PathCase:
-        """They connect before the trace begins, and part after its end."""
+        """Connect before the trace begins, and disconnect after its end."""
         turn = Turn(0, seconds, SIZE, 1.0 / FPS)
         self._pair.open(turn)
         begin_ns = self._pair.begin()
@@ -159,14 +159,14 @@ class _Stage:
 
 
 def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals: Arrivals, sent_bytes: int) -> PathCase:
-    """Make the figures of what arrived. Pure.
+    """Compute the figures of the arrivals. Pure.
 
     Args:
         contender: Its name.
-        trace: What the path carried.
-        seconds: For how long [s].
-        begin_ns: When it began.
-        arrivals: When what was sent and received, by channel [ns].
+        trace: The path's capacity.
+        seconds: Duration [s].
+        begin_ns: Start time.
+        arrivals: Times of sending and receiving, by channel [ns].
         sent_bytes: Bytes that passed the path to the pilot.
     """
     good = [
@@ -177,7 +177,7 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
     in_time = [age for at, age in shown if good[int(at // _SECOND_MS)]]
     qualities = [(float(name.removeprefix(QUALITY)), pairs) for name, pairs in arrivals.items() if QUALITY in name]
     judged = sum(len(pairs) for _, pairs in qualities)
-    # What was captured before the begin is not known: until it would count as frozen, nothing does.
+    # Pictures captured before the start are unknown: nothing counts as frozen until they would.
     steps = np.arange(FROZEN_MS, seconds * _SECOND_MS, _STEP_MS)
     counts = np.array([good[int(ms // _SECOND_MS)] for ms in steps])
     commands, delay_ms = arrivals.get(COMMAND, []), DELAY_S * 1e3
@@ -204,7 +204,7 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
 
 
 def _newest_first(pairs: list[tuple[int, int]], begin_ns: int, seconds: float) -> list[tuple[float, float]]:
-    """Return when each picture came, from the begin [ms], and how old it was; none that was overtaken."""
+    """Return the arrival time of each picture, from the start [ms], and its age; without overtaken ones."""
     found, newest_ns = [], -1
     for sent_ns, received_ns in sorted(pairs, key=lambda pair: pair[1]):
         at_ms = (received_ns - begin_ns) / 1e6
@@ -215,7 +215,7 @@ def _newest_first(pairs: list[tuple[int, int]], begin_ns: int, seconds: float) -
 
 
 def _in_good(pairs: list[tuple[int, int]], good: Sequence[bool], begin_ns: int) -> list[float]:
-    """Return the ages of what came while the path carried enough [ms]."""
+    """Return the ages of arrivals while the path carried enough [ms]."""
     found = []
     for sent_ns, received_ns in pairs:
         second = int((received_ns - begin_ns) / 1e6 // _SECOND_MS)
@@ -278,7 +278,7 @@ def load(path: File) -> VideoPath:
     """Read ``video_path.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, VideoPath, "the results of benchmarks.video_path", MAX_RESULTS)
 

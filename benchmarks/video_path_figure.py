@@ -1,4 +1,4 @@
-"""A diagram of how old the newest picture is, over what the path carries. matplotlib is imported when used."""
+"""A diagram of the newest picture's age over the path's capacity. Imports matplotlib when used."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST_MS: Final = 10_000.0
 
 
 def draw(results: VideoPath, folder: Path) -> list[Path]:
-    """Draw ``video-path.png``: the first trace, and all who showed pictures on it.
+    """Draw ``video-path.png``: the first trace, and all contenders that showed pictures on it.
 
     Raises:
         MissingExtraError: matplotlib is not installed.

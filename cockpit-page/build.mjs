@@ -1,7 +1,7 @@
 // Builds the page into src/skyloop/cockpit/static, or (--tests) the tests into build/tests.
 //
-// What is built is committed, so that the cockpit works where there is no npm. static/manifest.json has a hash of the
-// sources and one of each file: tests/cockpit/test_page_build.py finds out when they do not belong together.
+// The output is committed, so that the cockpit works without npm. static/manifest.json has a hash of the sources and one
+// of each file: tests/cockpit/test_page_build.py fails if they do not belong together.
 
 import { createHash } from "node:crypto";
 import { cp, mkdir, readdir, readFile, rm, writeFile } from "node:fs/promises";
@@ -39,7 +39,7 @@ async function buildPage() {
     outdir: target,
     bundle: true,
     format: "esm",
-    splitting: true, // the 3-D view is loaded when somebody wants to see it
+    splitting: true, // the 3-D view is loaded on first use
     chunkNames: "[name]-[hash]",
     minify: true,
     legalComments: "inline",

@@ -1,21 +1,21 @@
-// Finds words that the page shows and that are not in the language file: `npm run check` fails on them.
+// Finds texts on the page that are not in the language file: `npm run check` fails on them.
 
 import fs from "node:fs";
 import path from "node:path";
 import ts from "typescript";
 
-/** Attributes of elements that are read by people; all others are for the browser. */
+/** Attributes of elements that people read; all others are for the browser. */
 const READ = new Set(["aria-label", "aria-description", "aria-valuetext", "aria-roledescription", "title", "placeholder", "alt", "label"]);
-/** Calls whose strings are names: of elements, events, styles, and of what is stored. */
+/** Calls whose strings are names: of elements, events, styles, and stored values. */
 const NAMES = new Set(["querySelector", "querySelectorAll", "getElementById", "addEventListener", "removeEventListener", "setProperty", "getPropertyValue", "getContext", "createElement", "createElementNS", "closest", "matches", "get", "set", "on", "has", "unique", "colour", "startsWith", "endsWith", "includes", "toBlob", "isTypeSupported", "matchMedia", "replaceAll", "replace", "split", "join", "fetch", "setTone", "removeProperty", "getAttribute", "removeAttribute", "removeItem", "getItem", "setItem"]);
-/** Elements' makers, and where their children begin. */
+/** Functions that create elements, and where their children begin. */
 const MAKERS = { h: 2, svg: 2, holdButton: 3 };
 /** Names of keys, fonts, media queries and selectors. */
 const TECHNICAL = /^Skyloop$|^(Arrow|Numpad|Digit|Control\+)|px (system-ui|sans-serif)|^\((pointer|orientation|prefers)|\[\w+\]$/;
 const SENTENCE = /\p{L}[,;:.…?!]? +[\p{L}“(]|^\p{Lu}\p{Ll}/u;
 const WORD = /\p{L}{2}/u;
 
-/** The literals of a source that look like words for people: `[{line, text, node}]`. */
+/** The literals of a source that look like text for people: `[{line, text, node}]`. */
 export function wordsIn(name, text) {
   const source = ts.createSourceFile(name, text, ts.ScriptTarget.ES2022, true);
   const found = [];
@@ -41,7 +41,7 @@ function isShown(node) {
   return place === "shown" || SENTENCE.test(text);
 }
 
-/** Where a literal stands: surely "shown" to people, surely a "name", or null: it depends on how it looks. */
+/** The use of a literal: surely "shown" to people, surely a "name", or null: decided by its look. */
 function placeOf(node) {
   const parent = node.parent;
   if (ts.isParenthesizedExpression(parent) || ts.isAsExpression(parent) || ts.isNonNullExpression(parent)) return placeOf(parent);

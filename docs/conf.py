@@ -114,7 +114,7 @@ def _classes(module: str, left_out: str | None) -> list[str]:
 
 
 def _split(text: str) -> str:
-    """The text of a page of ``api`` with each class on a page of its own, and a table of them in its place."""
+    """Return a page of ``api`` with each class moved to a separate page, and replaced by a table of links."""
 
     def of_module(match: re.Match[str]) -> str:
         module, left_out = match[1], match[2]

@@ -1,9 +1,9 @@
-"""Write the stub of `skyloop.aio`, by which type checkers and editors see what is made of tables: `make stubs`.
+"""Write the stub of `skyloop.aio`, which type checkers and editors read instead of its tables: `make stubs`.
 
     python scripts/aio_stub.py    # src/skyloop/aio/__init__.pyi, which ruff then formats
 
-Each public class and function is written with the arguments and the text that it has at run time. A test checks that
-the file says the same as the code.
+The stub has each public class and function with its arguments and docstring at run time. A test compares it with the
+code.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from skyloop import aio
 
 STUB: Final = Path(__file__).parents[1] / "src" / "skyloop" / "aio" / "__init__.pyi"
 _HEAD: Final = "# Made by scripts/aio_stub.py (`make stubs`) of bridge.py and of the synchronous classes.\n\n"
-_imports: dict[str, set[str]] = defaultdict(set)  #: names in what was written, by the module that they are from
+_imports: dict[str, set[str]] = defaultdict(set)  #: names used in the stub, by their module
 
 
 class _Source:
-    """Is shown as this text in a signature."""
+    """A value shown as this text in a signature."""
 
     def __init__(self, text: str) -> None:
         self.text = text
@@ -87,11 +87,11 @@ def _text(documented: Any, indent: str) -> Iterator[str]:
 
 
 def _member(value: Enum) -> _Source:
-    return _Source(f"{type(value).__name__}.{value.name}")  # which the annotation names, too
+    return _Source(f"{type(value).__name__}.{value.name}")  # also named by the annotation
 
 
 def _named(annotation: str, home: str, theirs: bool = False) -> str:
-    """Return an annotation of module ``home``, and note where its names are from."""
+    """Return an annotation of module ``home``, and record the modules of its names."""
     tree = ast.parse(annotation, mode="eval")
     for node in ast.walk(tree):
         if isinstance(node, ast.Name) and node.id in aio.__all__ and theirs:
@@ -111,7 +111,7 @@ def _tree(module: str) -> ast.Module:
 
 @cache
 def _sources(module: str) -> dict[str, str]:
-    """Return the module that each name of a module's top is from."""
+    """Return the module of each top-level name in a module."""
     found: dict[str, str] = {}
     for node in ast.walk(_tree(module)):
         if isinstance(node, ast.ImportFrom):

@@ -1,9 +1,9 @@
-"""How well behaviours fly: ``python scripts/behaviours.py [follow] [gates] [landing] … [--seeds 20] [--gust 0 1]``.
+"""Judge how well behaviours fly: ``python scripts/behaviours.py [follow] [gates] … [--seeds 20] [--gust 0 1]``.
 
-Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with its sensors' noise and biases and its
-cameras' noise, blur and latency at 15 pictures a second; commands 40 ms, feedback and pictures 20 ms on the way, 5 % of
-each lost; in calm air and in gusts. Every error is that of the truth. ``follow-target`` stands for the four that follow
-people and cars (``follow_flights.py``); their commands are 100 ms on the way.
+Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with noise and biases of its sensors, and
+noise, blur and latency of its cameras at 15 pictures a second; commands take 40 ms, feedback and pictures 20 ms, and 5
+% of each are lost; in calm air and in gusts. All errors are against the truth. ``follow-target`` stands for the four
+that follow people and cars (``follow_flights.py``); their commands take 100 ms.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from skyloop.vision import simulated_detector
 
 FOLLOW_S: Final = 40.0
 FOLLOW_RMS_M: Final = 0.25
-SETTLED_NS: Final = 5_000_000_000  # after the first sighting, from when on the distance counts
+SETTLED_NS: Final = 5_000_000_000  # after the first sighting; from then on the distance counts
 LANDING_M: Final = 0.2
 RACE_FPS: Final = 15.0
 
@@ -54,16 +54,16 @@ RACE_FPS: Final = 15.0
 class Flight(NamedTuple):
     """One flight."""
 
-    good: bool  #: it did what it should
-    error_m: float  #: what the table shows: see there
-    seconds: float  #: simulated, from the behaviour's begin to its end
-    note: str = ""  #: why it was no good
-    unsafe: str | None = None  #: how it ended unsafely; empty if it did not; None: not checked
+    good: bool  #: it succeeded
+    error_m: float  #: the error shown in the table: see there
+    seconds: float  #: simulated duration of the behaviour
+    note: str = ""  #: why it failed
+    unsafe: str | None = None  #: how it ended unsafely; empty if safely; None: not checked
 
 
 @contextmanager
 def flying(world: str, camera: str, seed: int, gust_m_s: float, fps: float = 15.0) -> Iterator[Drone]:
-    """A drone of a world, taken off, in nothing but gusts."""
+    """Yield a drone of a world, in the air, in gusts only."""
     uri = f"sim://?world={world}&cameras={camera}&fps={fps:g}&seed={seed}"
     with rehearse(uri, radio=Radio(seed=seed)) as drone:
         drone.config["sim.wind"] = (0.0, 0.0, 0.0)
@@ -73,7 +73,7 @@ def flying(world: str, camera: str, seed: int, gust_m_s: float, fps: float = 15.
 
 
 def truth(feedback: Feedback, of: str = "truth") -> tuple[float, float, float]:
-    """A true position [m]; ``of`` a target: ``truth.target``."""
+    """Return a true position [m]; ``of`` a target: ``truth.target``."""
     assert feedback.native is not None
     x, y, z = (feedback.native[f"{of}.{axis}"] for axis in "xyz")
     assert isinstance(x, float)
@@ -83,7 +83,7 @@ def truth(feedback: Feedback, of: str = "truth") -> tuple[float, float, float]:
 
 
 def follow(seed: int, gust_m_s: float, seconds: float = FOLLOW_S) -> Flight:
-    """Follow the carried board at 1.5 m; the error is the RMS of the true distance, 5 s after the first sighting on."""
+    """Follow the carried board at 1.5 m; the error is the RMS of the true distance from 5 s after sighting it on."""
     errors: list[float] = []
     with flying("room", "front", seed, gust_m_s) as drone:
         follower = FollowMarker(drone, 7)
@@ -103,12 +103,12 @@ def follow(seed: int, gust_m_s: float, seconds: float = FOLLOW_S) -> Flight:
 
 
 class Crossings:
-    """Which gates were flown through, in order, and how far from the middle."""
+    """Records which gates were passed, in order, and how far from the centre."""
 
     def __init__(self, gates: tuple[Gate, ...]) -> None:
         self._gates = gates
         self._last: tuple[float, float, float] | None = None
-        self.passed: list[tuple[int, float]] = []  #: number of the gate, distance from its middle [m]
+        self.passed: list[tuple[int, float]] = []  #: number of the gate, distance from its centre [m]
 
     def look(self, feedback: Feedback) -> None:
         place, last = truth(feedback), self._last
@@ -123,14 +123,14 @@ class Crossings:
 
 
 def _along(gate: Gate, place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Along the way through the gate, to its left, and above its middle [m]."""
+    """Return a place along the gate's passage, to its left, and above its centre [m]."""
     east, north, up = (a - b for a, b in zip(place, gate.position_m, strict=True))
     c, s = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
     return c * east + s * north, c * north - s * east, up
 
 
 def gates(seed: int, gust_m_s: float) -> Flight:
-    """The course of five gates in order, without touching anything; the error is the largest from a gate's middle."""
+    """Fly the course of five gates in order, touching nothing; the error is the largest from a gate's centre."""
     course = load_world("gates").gates
     crossings = Crossings(course)
     with flying("gates", "front", seed, gust_m_s) as drone:
@@ -146,12 +146,12 @@ def gates(seed: int, gust_m_s: float) -> Flight:
 
 
 def race(level: int) -> Callable[[int, float], Flight]:
-    """Return the flight of a race track by the racer's camera; the error is the largest from a gate's middle."""
+    """Return the flight of a race track with the racer's camera; the error is the largest from a gate's centre."""
     return lambda seed, gust_m_s: fly_race(level, seed, gust_m_s)
 
 
 def fly_race(level: int, seed: int, gust_m_s: float) -> Flight:
-    """The race track of a level, all gates in order and in their direction, without touching anything."""
+    """Fly the race track of a level: all gates in order and direction, without touching anything."""
     world = load_world(f"race{level}", seed)
     crossings = Crossings(world.gates)
     with flying(f"race{level}", "fpv", seed, gust_m_s, RACE_FPS) as drone:
@@ -169,16 +169,16 @@ def fly_race(level: int, seed: int, gust_m_s: float) -> Flight:
 
 def landing(speed: float, ground: str = "walk") -> Callable[[int, float], Flight]:
     """Return the flight that lands on a platform; the error is the distance of the vehicle's centre from the marker's
-    two seconds after the end."""
+    centre two seconds after the end."""
     return lambda seed, gust_m_s: land(speed, ground, seed, gust_m_s)
 
 
 def land(speed: float, ground: str, seed: int, gust_m_s: float) -> Flight:
-    """Land on a platform: ``walk`` about a room, ``straight`` along a runway, or ``turning`` on a circle."""
+    """Land on a platform: ``walk`` around a room, ``straight`` along a runway, or ``turning`` in a circle."""
     wait = ground != "walk"
     fast = speed > 2.0
     settings = LandingSettings(give_up_s=LANDING_S[wait] - 5.0)
-    if wait:  # above the road, as high as it may
+    if wait:  # above the road, at the maximum height
         settings = replace(settings, wait_s=60.0, search_height_m=FAST_HEIGHT_M if fast else 2.8)
     places: list[Place] = []
     with TemporaryDirectory() as folder:
@@ -203,13 +203,13 @@ def land(speed: float, ground: str, seed: int, gust_m_s: float) -> Flight:
 
 
 class Place(NamedTuple):
-    """Where the vehicle truly is."""
+    """The vehicle's true place."""
 
     captured_ns: int
     state: FlightState
-    off: float  #: horizontally from the platform's centre [m]
-    above: float  #: its centre over the platform's top [m]
-    height: float  #: its centre over the floor [m]
+    off: float  #: horizontal distance from the platform's centre [m]
+    above: float  #: height of its centre over the platform's top [m]
+    height: float  #: height of its centre over the floor [m]
 
     @classmethod
     def of(cls, feedback: Feedback) -> Place:
@@ -226,7 +226,7 @@ class Place(NamedTuple):
 
 
 def unsafe_end(places: list[Place]) -> str:
-    """Why a landing's flight ended unsafely; empty if it stands, or flies at a height where it is safe to hover."""
+    """Return how a landing ended unsafely; empty if it stands, or flies where hovering is safe."""
     newest = places[-1]
     landed = [place for place in places if place.state is FlightState.LANDED]
     if any(place.state is FlightState.EMERGENCY for place in places):
@@ -236,12 +236,12 @@ def unsafe_end(places: list[Place]) -> str:
     if landed and landed[0].on_platform and not newest.on_platform:
         return "fell off the platform"
     if newest.state is not FlightState.LANDED and newest.height < SAFE_HEIGHT_M:
-        return f"flies on at {newest.height:.1f} m"
+        return f"still flies at {newest.height:.1f} m"
     return ""
 
 
 def platform_world(speed: float, ground: str, seed: int) -> str:
-    """The text of a world file with a platform of 1 m that passes the drone some 14 s after its start."""
+    """Return a world file with a platform of 1 m that passes the drone some 14 s after its start."""
     shipped = resources.files("skyloop.sim") / "worlds" / "platform.toml"
     if ground == "walk":
         return shipped.read_text(encoding="utf-8").replace("speed = [0.3, 0.3]", f"speed = [{speed}, {speed}]")
@@ -259,9 +259,8 @@ def platform_world(speed: float, ground: str, seed: int) -> str:
 
 
 TURN_M: Final = 10.0
-#: Above 2 m/s the drag of the vehicle leaves too little of the usual 0.21 rad, its loop flies 4 m/s only by set-points
-#: of more than the usual 5 m/s, and from below the usual 3 m it sees what passes for too short a time to tell how it
-#: turns.
+#: Above 2 m/s the vehicle's drag leaves too little of the usual 0.21 rad, its loop flies 4 m/s only with set-points of
+#: more than the usual 5 m/s, and from below the usual 3 m it sees the platform too briefly to tell how it turns.
 FAST_LIMITS: Final = {"tilt": 0.5, "speed": 8.0, "altitude": 4.0}
 FAST_HEIGHT_M: Final = 3.6
 SAFE_HEIGHT_M: Final = 1.5
@@ -286,7 +285,7 @@ yaw = {{ mode = "along", turn_rate_deg_s = 90 }}
 
 
 class Hits:
-    """Counts what the vehicle touches."""
+    """Counts the vehicle's collisions."""
 
     def __init__(self, drone: Drone) -> None:
         self.count = 0
@@ -296,12 +295,12 @@ class Hits:
         self.count += event.kind is EventKind.COLLISION
 
 
-#: The marker on the south wall of the world ``room``: where it is, and that it looks north.
+#: The marker on the south wall of the world ``room``: its position, facing north.
 WALL_MARKER: Final = (12, (0.2, -3.0, 1.5), 0.25)
 
 
 def approach(seed: int, gust_m_s: float) -> Flight:
-    """To 1 m before a marker on a wall; the error is the true distance from that place on arrival."""
+    """Fly to 1 m before a marker on a wall; the error is the true distance from that place on arrival."""
     number, (x, y, z), size = WALL_MARKER
     with flying("room", "front", seed, gust_m_s) as drone:
         pilot = ApproachMarker(drone, number, distance_m=1.0, size_m=size)
@@ -311,7 +310,7 @@ def approach(seed: int, gust_m_s: float) -> Flight:
 
 
 def servo(seed: int, gust_m_s: float) -> Flight:
-    """Before the same marker by its picture alone; the error is the RMS of the true distance of the camera from 1.5 m
+    """Hover before the same marker by its picture alone; the error is the RMS of the camera's true distance from 1.5 m
     before it, from 15 s after the first sighting on."""
     number, (x, y, z), size = WALL_MARKER
     errors: list[float] = []
@@ -332,7 +331,7 @@ def servo(seed: int, gust_m_s: float) -> Flight:
 
 
 def orbit(seed: int, gust_m_s: float) -> Flight:
-    """Swing round the same marker at 1.5 m; the error is the RMS of the true distance, less 1.5 m."""
+    """Swing around the same marker at 1.5 m; the error is the RMS of the true distance, minus 1.5 m."""
     number, place, size = WALL_MARKER
     errors: list[float] = []
     angles: list[float] = []
@@ -356,7 +355,7 @@ def orbit(seed: int, gust_m_s: float) -> Flight:
 
 
 def flow(seed: int, gust_m_s: float) -> Flight:
-    """Hold the place for a minute by the ground's picture and attitude alone; the error is the RMS of the way off."""
+    """Hold the place for a minute by the ground's picture and attitude alone; the error is the RMS deviation."""
     with flying("room", "bottom", seed, gust_m_s) as drone:
         begin = truth(drone.feedback())[:2]
         off: list[float] = []
@@ -367,7 +366,7 @@ def flow(seed: int, gust_m_s: float) -> Flight:
 
 
 def avoid(seed: int, gust_m_s: float) -> Flight:
-    """12.5 m ahead among four pillars without touching one; the error is the way off to the side at the end."""
+    """Fly 12.5 m ahead among four pillars without touching one; the error is the lateral deviation at the end."""
     sys.path.append(str(Path(__file__).parents[1] / "examples" / "behaviours"))
     from see_and_avoid import SeeAndAvoid
 
@@ -380,12 +379,12 @@ def avoid(seed: int, gust_m_s: float) -> Flight:
 
 
 def following(name: str) -> Callable[[int, float], Flight]:
-    """Follow somebody or something; the error is the RMS of the true distance's."""
+    """Return the flight that follows a person or car; the error is the RMS of the true distance's."""
 
     def fly(seed: int, gust_m_s: float) -> Flight:
         detector = simulated_detector()
         outcome = follow_flights.fly(follow_flights.CASES[name], seed, gust_m_s, detector)
-        note = f"{outcome.note}, {'another one in the box' if outcome.swapped else 'always itself'}"
+        note = f"{outcome.note}, {'another one in the box' if outcome.swapped else 'never another'}"
         if outcome.hidden_s >= 1.0:
             note += f", hidden for {outcome.hidden_s:.1f} s"
         return Flight(outcome.good, outcome.rms_m, outcome.seconds, note)
@@ -394,12 +393,12 @@ def following(name: str) -> Callable[[int, float], Flight]:
 
 
 class Goal(NamedTuple):
-    """What is to come out."""
+    """The goal of a behaviour."""
 
     fly: Callable[[int, float], Flight]
     what: str
     error: str
-    of_20: int  #: good flights of twenty
+    of_20: int  #: good flights out of twenty
 
 
 FOLLOWED: Final = "followed: in view 90 %, never mixed up, RMS of the distance within 0.5 m, nothing touched"
@@ -425,7 +424,7 @@ GOALS: Final = {
     "flow": Goal(flow, "held the place for a minute by the ground's picture, at most 0.75 m off", "RMS", 18),
     "follow-walker": Goal(following("walker"), f"a person at 1.5 m/s {FOLLOWED}", "RMS", 19),
     "follow-car": Goal(following("car"), f"a car at 3 m/s {FOLLOWED}", "RMS", 19),
-    "follow-hidden": Goal(following("hidden"), f"a person whom walls hide for 3 s {FOLLOWED}", "RMS", 19),
+    "follow-hidden": Goal(following("hidden"), f"a person hidden by walls for 3 s {FOLLOWED}", "RMS", 19),
     "follow-twin": Goal(following("twin"), f"a person whose twin crosses {FOLLOWED}", "RMS", 19),
     "avoid": Goal(avoid, "12.5 m ahead among four pillars, none touched", "to the side at the end", 18),
 }
@@ -459,7 +458,7 @@ def main() -> None:
 
 
 def summary(goal: Goal, gust_m_s: float, flights: list[Flight]) -> str:
-    """One line of what came out."""
+    """Return one line with the results."""
     good = [flight for flight in flights if flight.good]
     met = len(good) * 20 >= goal.of_20 * len(flights)
     checked = [flight.unsafe for flight in flights if flight.unsafe is not None]

@@ -20,13 +20,13 @@ _START_S = 30.0
 
 
 def find() -> str | None:
-    """Where Chromium is, if it is installed."""
+    """Return the path of Chromium, None if it is not installed."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
     return next((path for name in names if (path := shutil.which(name))), None)
 
 
 class Page:
-    """One open page. A context manager: the browser and its profile are gone at the end."""
+    """One open page. A context manager: leaving it removes the browser and its profile."""
 
     def __init__(self, program: str, address: str, *, width: int, height: int) -> None:
         self._profile = tempfile.TemporaryDirectory(prefix="skyloop-browser-", ignore_cleanup_errors=True)
@@ -49,12 +49,12 @@ class Page:
         self._call("Page.navigate", url=address)
 
     def screenshot(self) -> bytes:
-        """The page as it is now, as PNG."""
+        """Return the page's present picture, as PNG."""
         answer = self._call("Page.captureScreenshot", format="png")
         return base64.b64decode(answer["data"])
 
     def _debugger(self) -> str:
-        """The WebSocket address of its first tab; the browser writes the port that it took into its profile."""
+        """Return the WebSocket address of its first tab; the browser writes its port into its profile."""
         told = Path(self._profile.name) / "DevToolsActivePort"
         deadline = time.monotonic() + _START_S
         while not (told.exists() and "\n" in told.read_text()):

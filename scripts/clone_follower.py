@@ -1,13 +1,13 @@
-"""Clones a controller: the marker follower teaches a network that sees pictures and state, and the network flies.
+"""Clone a controller: the marker follower teaches a network, which sees pictures and state, and then flies.
 
     skyloop install all && pip install torch onnx
     python -m scripts.clone_follower clone                                   # into this folder
     python -m scripts.clone_follower clone --rounds 1 --flights 1 --epochs 1 # does it work here?
 
-The lessons are flights in simulated time. In the first round the teacher flies, in all others mostly the network as it
-is by then, and always the teacher's answer to each picture is what is learnt: so the network learns from its own
-mistakes (DAgger: Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret
-online learning", AISTATS 2011). The recordings are like any others: a real drone's are learnt from in the same way.
+The lessons are flights in simulated time. In the first round the teacher flies, in later ones mostly the present
+network; the network always learns the teacher's answer to each picture, and so from its own mistakes (DAgger: Ross,
+Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret online learning", AISTATS
+2011). The recordings are ordinary ones: a real drone's work in the same way.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from skyloop.vision import MarkerDetector
 from skyloop.vision.planar import pixels_of
 
 TASK = "follow the marker"
-MARKER = 7  # that somebody carries about in the simulated room
+MARKER = 7  # carried around in the simulated room
 FPS = 15
-WIDTH, HEIGHT = 64, 48  # of the pictures that the network takes
-MEMORY = 64  # numbers that it keeps from picture to picture
-STREAMS, STEPS = 12, 8  # learnt from at once: so many parts of flights, so many pictures of each
+WIDTH, HEIGHT = 64, 48  # of the network's input pictures
+MEMORY = 64  # numbers kept from picture to picture
+STREAMS, STEPS = 12, 8  # batch: parts of flights, and pictures of each
 KNOWN = ["roll_rad", "pitch_rad", "altitude_m", "velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"]
 ACTION = ACTIONS["velocity"]
 DIRECT = Radio(command_delay_s=0, feedback_delay_s=0, picture_delay_s=0, drop=0, position_noise_m=0)
 
 
 class Lesson(FollowMarker):
-    """The teacher answers each picture; by turns its answer is flown, the pupil's, or a push aside."""
+    """The teacher answers each picture; by turns its answer, the pupil's, or a random push is flown."""
 
     def __init__(self, drone: skyloop.Drone, seed: int, pupil: PolicyNetwork | None) -> None:
         super().__init__(drone, MARKER)
@@ -69,7 +69,7 @@ class Lesson(FollowMarker):
 
     def look(self, frame: skyloop.Frame) -> list[Shape]:
         row = None if frame.feedback is None else state_row(frame.feedback, KNOWN)
-        # Whoever flies, the pupil looks on, so that it remembers.
+        # The pupil always watches, so that it remembers.
         self.answer = None if self.pupil is None or row is None else self.pupil(pixels_of(frame), row)
         self.captured_ns = frame.captured_ns
         return super().look(frame)
@@ -91,7 +91,7 @@ class Lesson(FollowMarker):
 
 
 def fly_lesson(path: Path, seed: int, seconds: float, policy: Path | None) -> float:
-    """Record a lesson, in noise and gusts of its own; return the share of frames that show the marker."""
+    """Record a lesson, with its own noise and gusts; return the share of frames that show the marker."""
     with rehearse(f"sim://?cameras=front&fps={FPS}&wind=2&seed={seed}", radio=DIRECT) as drone:
         drone.takeoff()
         with skyloop.record(drone, path, channels=["feedback", "commands", "logs", "video"], overwrite=True):
@@ -102,7 +102,7 @@ def fly_lesson(path: Path, seed: int, seconds: float, policy: Path | None) -> fl
 
 
 def record(folder: Path, seeds: range, seconds: float, policy: Path | None) -> Path:
-    """Fly lessons, as many at a time as there are cores, and export them; return the data set."""
+    """Fly lessons, one per core at a time, and export them; return the data set."""
     paths = [folder / f"flight-{seed}.mcap" for seed in seeds]
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
         each = repeat(seconds), repeat(policy)
@@ -118,7 +118,7 @@ Rows = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32], NDArra
 
 
 def rows_of(dataset: Path) -> Rows:
-    """Pictures (n, 3, HEIGHT, WIDTH) in red, green, blue; states (n, 6); actions (n, 4); where episodes begin (n,)."""
+    """Return pictures (n, 3, HEIGHT, WIDTH) in red, green, blue; states (n, 6); actions (n, 4); episode starts (n,)."""
     table = pq.read_table(dataset / "data" / "chunk-000" / "file-000.parquet")
     names = json.loads((dataset / "meta" / "info.json").read_text())["features"]["observation.state"]["names"]
     state = np.array(table["observation.state"].to_pylist(), np.float32)[:, [names.index(name) for name in KNOWN]]
@@ -130,7 +130,7 @@ def rows_of(dataset: Path) -> Rows:
 
 
 def new_network(state: NDArray[np.float32], action: NDArray[np.float32]) -> Any:
-    """A network that has not learnt yet, for numbers like these."""
+    """Return an untrained network, scaled for numbers like these."""
     import torch
     from torch import nn
 
@@ -167,7 +167,7 @@ def new_network(state: NDArray[np.float32], action: NDArray[np.float32]) -> Any:
 
 
 def train(network: Any, rows: Rows, epochs: int) -> None:
-    """Learn the teacher's actions from flights as they went, part by part."""
+    """Learn the teacher's actions from flights in sequence, part by part."""
     import torch
 
     pictures, state, action, first = (torch.from_numpy(each) for each in rows)
@@ -206,7 +206,7 @@ def train(network: Any, rows: Rows, epochs: int) -> None:
 
 
 def write(network: Any, policy: Path) -> None:
-    """Write the network with the names of what it takes and gives."""
+    """Write the network with the names of its inputs and outputs."""
     import onnx
     import torch
 
@@ -219,11 +219,11 @@ def write(network: Any, policy: Path) -> None:
 
 
 def learn(folder: Path, rounds: int, flights: int, seconds: float, epochs: int) -> None:
-    """Record and learn, round by round, from all that was recorded so far; write the network after each."""
+    """Record and learn, round by round, from all recordings so far; write the network after each round."""
     import torch
 
     torch.manual_seed(0)
-    torch.set_num_threads(1)  # for so small a network more are slower
+    torch.set_num_threads(1)  # more are slower for such a small network
     policy, network = folder / "policy.onnx", None
     folder.mkdir(parents=True, exist_ok=True)
     known: list[Rows] = []
@@ -237,7 +237,7 @@ def learn(folder: Path, rounds: int, flights: int, seconds: float, epochs: int) 
 
 
 class Judged(OnnxPolicy):
-    """The policy, with a judge that knows where the marker is."""
+    """The policy, with a judge that knows the marker's position."""
 
     def __init__(self, drone: skyloop.Drone, policy: Path) -> None:
         super().__init__(drone, policy)
@@ -251,7 +251,7 @@ class Judged(OnnxPolicy):
 
 
 def fly(policy: Path, seconds: float, seed: int, rehearsed: bool) -> float:
-    """Fly what was learnt, from before the marker on; return the share of frames that show the marker."""
+    """Fly the learnt policy, starting before the marker; return the share of frames that show the marker."""
     uri = f"sim://?cameras=front&fps={FPS}&seed={seed}"
     with rehearse(uri, radio=DIRECT) if rehearsed else skyloop.connect(uri) as drone:
         drone.takeoff()
@@ -264,20 +264,22 @@ def fly(policy: Path, seconds: float, seed: int, rehearsed: bool) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="of recordings, data sets and policy")
+    parser.add_argument("folder", type=Path, help="for recordings, data sets and policy")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--flights", type=int, default=12, help="of each round")
-    parser.add_argument("--seconds", type=float, default=45.0, help="of each flight")
-    parser.add_argument("--epochs", type=int, default=12, help="of each round")
-    parser.add_argument("--seeds", type=int, nargs="*", default=range(1000, 1006), help="flights of what was learnt")
-    parser.add_argument("--rehearsed", action="store_true", help="those flights in simulated time: the same each time")
-    parser.add_argument("--part", choices=["learn", "fly"], help="only this; else both")
+    parser.add_argument("--flights", type=int, default=12, help="flights of each round")
+    parser.add_argument("--seconds", type=float, default=45.0, help="duration of each flight")
+    parser.add_argument("--epochs", type=int, default=12, help="epochs of each round")
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", default=range(1000, 1006), help="seeds of the flights with the learnt policy"
+    )
+    parser.add_argument("--rehearsed", action="store_true", help="fly these in simulated time, reproducibly")
+    parser.add_argument("--part", choices=["learn", "fly"], help="only this part [default: both]")
     given = parser.parse_args()
     if given.part != "fly":
         learn(given.folder, given.rounds, given.flights, given.seconds, given.epochs)
     if given.part != "learn":
         shares = [fly(given.folder / "policy.onnx", 30.0, seed, given.rehearsed) for seed in given.seeds]
-        print("flown by what was learnt, the marker in view:", ", ".join(f"{share:.0%}" for share in shares))
+        print("flown by the learnt policy, the marker in view:", ", ".join(f"{share:.0%}" for share in shares))
         print(f"mean of {len(shares)} flights: {np.mean(shares):.0%}")
 
 

@@ -1,4 +1,4 @@
-"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``fleet``, ``swarm``,
+"""Photograph the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``fleet``, ``swarm``,
 ``asked``, ``phone``, ``target`` or ``film`` for a part.
 
 =======================================  ===========================================================================
@@ -12,7 +12,7 @@
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
 ``cockpit-target-dark.png``,             a person in a park who was detected, pressed and is followed; on a telephone
 ``cockpit-target-phone.png``             pressed with a finger, before anything flies
-``cockpit-follow.webp``                  a film: a box is drawn around a person in a park, who is followed
+``cockpit-follow.webp``                  a film: a box drawn around a person in a park, and the flight after it
 =======================================  ===========================================================================
 
 Needs Chromium and ``pip install playwright pillow``.
@@ -59,12 +59,12 @@ TOUCHED = (PHONE, PHONE_ON_ITS_SIDE)
 MOST_BYTES = 300_000
 FILM_BYTES = 700_000
 SIMULATED = (320, 240)  # pixels of the simulator's camera
-MARGIN_PX = 2.0  # of a box that is drawn by hand, in those
+MARGIN_PX = 2.0  # of a box drawn by hand, in these pixels
 FIRST_PLACE, LAST_PLACE = (520.0, 440.0), (650.0, 340.0)  # of the mouse in the film, before and after
 ROUND_M = 1.1
 Scheme = Literal["dark", "light"]
 SCHEMES: tuple[Scheme, ...] = ("dark", "light")
-#: The colours of the page that mean something, as six hexadecimal digits each.
+#: The page's meaningful colours, as six hexadecimal digits each.
 INKS = """() => {
   const names = ["accent", "ok", "warn", "bad", "stop", "target", "series-1", "series-2"];
   const own = names.map((name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
@@ -83,7 +83,7 @@ def main() -> None:
         makers[name]()
 
 
-# What is seen ---------------------------------------------------------------------------------------------------------
+# Scenes --------------------------------------------------------------------------------------------------------------
 
 
 def one() -> None:
@@ -114,7 +114,7 @@ def one() -> None:
 
 
 def swarm() -> None:
-    """Three on rounds of their own."""
+    """Three drones on separate rounds."""
     names = [f"d{number}" for number in (1, 2, 3)]
     command = ["sim", "--drones", "3", "--name", "d", "--seed", "1"]
     # Small pictures: three renderers and a browser share this machine.
@@ -196,7 +196,7 @@ def target() -> None:
     ]
     found: list[Annotation] = []
     with (
-        flight(command, [lambda _: None]) as (chromium, address),  # which waits until it is there
+        flight(command, [lambda _: None]) as (chromium, address),  # waits until it has taken off
         skyloop.connect("alpha", access="observe", name="pictures") as drone,
     ):
         drone.on_annotation(lambda one: found.append(one) if one.source == "detections" and one.shapes else None)
@@ -221,8 +221,8 @@ def target() -> None:
                 page.locator(".follow-figures", has_text="%").wait_for()
                 if not touch:
                     page.keyboard.press("Enter")
-                    page.wait_for_timeout(12_000)  # until it is near
-                    # Not while a loaded machine hovers, nor behind a tree.
+                    page.wait_for_timeout(12_000)  # until the drone is near
+                    # Not while a loaded machine makes it hover, nor behind a tree.
                     page.locator('.follow-panel[data-tone="busy"] .follow-figures', has_text="%").wait_for()
                 save(page, f"cockpit-target-{name}.png")
                 page.keyboard.press("l")
@@ -230,9 +230,9 @@ def target() -> None:
 
 
 def film() -> None:
-    """A box is drawn by hand around a person in a park, who is followed, circled, and left alone again.
+    """A box drawn by hand around a person in a park; the drone follows, circles and leaves them.
 
-    Where the box has to be is the simulator's truth; how far the drone was truly away is printed.
+    The simulator's truth gives the place of the box; the drone's true distance is printed.
     """
     command = ["sim", "--name", "alpha", "--world", "park", "--seed", "4"]
     command += [word for option in ("cameras=front", "width=320", "fps=15") for word in ("--option", option)]
@@ -245,7 +245,7 @@ def film() -> None:
     ):
 
         def now(in_s: float = 0.0) -> FrameTruth:
-            """What is on the screen, now or soon."""
+            """Return the truth of the picture on the screen, now or soon."""
             true = truth.at_capture(drone.feedback(), shown.captured_ns + nanoseconds(in_s))
             assert true is not None
             return true
@@ -288,13 +288,13 @@ def film() -> None:
 
 
 def is_well_seen(true: FrameTruth) -> bool:
-    """Whether the walker is wholly in the picture, near, and has a way to go until its left edge."""
+    """Return whether the walker is completely in the picture, near, and not close to its left edge."""
     box = true.boxes.get("walker")
     return box is not None and not box.cut and box.visible > 0.98 and 180 < box.box[0] < 275 and box.box[3] > 60
 
 
 def corner(page: Page, true: FrameTruth, *, upper: bool) -> tuple[float, float]:
-    """Where the upper left or the lower right corner of a box around the walker is on the screen [CSS pixels]."""
+    """Return the upper left or lower right corner of a box around the walker on the screen [CSS pixels]."""
     x, y, width, height = true.boxes["walker"].box
     if upper:
         return on_screen(page, (x - MARGIN_PX, y - MARGIN_PX), SIMULATED)
@@ -302,7 +302,7 @@ def corner(page: Page, true: FrameTruth, *, upper: bool) -> tuple[float, float]:
 
 
 def on_screen(page: Page, pixel: tuple[float, float], size: tuple[float, float]) -> tuple[float, float]:
-    """Where a pixel of the drone's picture is on the screen [CSS pixels]."""
+    """Return the place of a pixel of the drone's picture on the screen [CSS pixels]."""
     picture = page.locator(".video").bounding_box()
     assert picture is not None
     scale = min(picture["width"] / size[0], picture["height"] / size[1])
@@ -311,7 +311,7 @@ def on_screen(page: Page, pixel: tuple[float, float], size: tuple[float, float])
 
 
 def mark(page: Page, found: Annotation, *, touch: bool) -> None:
-    """Press the middle of the largest person that was detected; on a touch screen with a finger."""
+    """Press the centre of the largest detected person; on a touch screen with a finger."""
     people = [
         outline
         for outline, text in itertools.pairwise(found.shapes)
@@ -330,7 +330,7 @@ def mark(page: Page, found: Annotation, *, touch: bool) -> None:
 
 
 def rounds(name: str, number: int) -> Fly:
-    """A triangle about where it took off, at a height of its own; its corners are logged for whoever looks."""
+    """Fly a triangle around the place of take-off, at a separate height; its corners are logged for viewers."""
 
     def fly(stop: threading.Event) -> None:
         with skyloop.connect(name, name=f"rounds.py {number + 1}") as drone:
@@ -357,19 +357,19 @@ def rounds(name: str, number: int) -> Fly:
 
 @contextmanager
 def detecting() -> Iterator[None]:
-    """A processor that finds people."""
+    """Run a processor that detects people."""
     command = [sys.executable, "-m", "skyloop", "detect", "--on", "alpha"]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         yield
         process.terminate()
 
 
-# How it is photographed -----------------------------------------------------------------------------------------------
+# Photographing --------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str]]:
-    """A world, its controllers, the cockpit and Chromium."""
+    """Run a world, its controllers, the cockpit and Chromium."""
     chromium = browser.find()
     if chromium is None:
         sys.exit("there is no Chromium here (Debian: apt install chromium)")
@@ -383,7 +383,7 @@ def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str
         stack.callback(world.terminate)
         assert world.stdout is not None
         for _ in fliers:
-            world.stdout.readline()  # says that it is ready
+            world.stdout.readline()  # reports that it is ready
         cockpit = stack.enter_context(CockpitProcess(recordings=Path(folder) / "recordings"))
         threads = [threading.Thread(target=fly, args=(stop,)) for fly in fliers]
         for thread in threads:
@@ -410,7 +410,7 @@ def open_page(chromium: Browser, address: str, size: ViewportSize, scheme: Schem
 
 
 def settle(page: Page, names: list[str], seconds: float) -> None:
-    """Wait until all are in the air, and then so that plots and paths have something to show."""
+    """Wait until all are in the air, and then until plots and paths have something to show."""
     for name in names:
         page.locator(f'.pane[data-drone="{name}"] .pill', has_text="flying").wait_for(timeout=60_000)
     end = time.monotonic() + seconds
@@ -419,11 +419,11 @@ def settle(page: Page, names: list[str], seconds: float) -> None:
 
 
 def save(page: Page, name: str) -> None:
-    """As a PNG of 256 colours: what is too large for a page of documentation is an error."""
+    """Write a PNG of 256 colours; one too large for a page of documentation is an error."""
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     target = PICTURES / name
     PICTURES.mkdir(parents=True, exist_ok=True)
-    # Lamps and lines have few pixels, and their colours mean something: they are kept as they are.
+    # Lamps and lines have few pixels but meaningful colours: keep them unchanged.
     kept = [part for ink in page.evaluate(INKS) for part in bytes.fromhex(ink)]
     common = picture.quantize(256 - len(kept) // 3, dither=Image.Dither.NONE).getpalette() or []
     palette = Image.new("P", (1, 1))

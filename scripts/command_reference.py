@@ -1,6 +1,6 @@
-"""The reference of the command line, made from the commands themselves: the site's pages of them, in reStructuredText.
+"""Make the command-line reference from the commands: the site's pages, in reStructuredText.
 
-python scripts/command_reference.py    # prints it; `make docs` puts them into the site
+python scripts/command_reference.py    # prints it; `make docs` puts it into the site
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _MARKUP: Final = re.compile(r"([\\*`|_<>])")
 
 
 def pages() -> Iterator[tuple[str, str]]:
-    """Yield the name and the text of each command's page, by what one wants to do."""
+    """Yield the name and the text of each command's page, grouped by task."""
     group = get_command(build())
     root = _context(group, "skyloop", None)
     for name in COMMANDS:
@@ -29,10 +29,10 @@ def pages() -> Iterator[tuple[str, str]]:
 
 
 def overview(folder: str) -> str:
-    """Return the commands by what one wants to do, with links to their pages.
+    """Return the commands grouped by task, with links to their pages.
 
     Args:
-        folder: Of those pages, as seen from the page that lists them.
+        folder: The folder of those pages, relative to the listing page.
     """
     lines: list[str] = []
     for task in Task:
@@ -47,7 +47,7 @@ def overview(folder: str) -> str:
 
 
 def reference() -> str:
-    """Return the pages of all commands, one after the other."""
+    """Return the pages of all commands in sequence."""
     return "\n".join(text for _, text in pages())
 
 
@@ -81,7 +81,7 @@ def _title(words: str, underline: str) -> tuple[str, ...]:
 
 
 def _prose(text: str) -> str:
-    """Help as reStructuredText: options as code, and nothing else that could be markup."""
+    """Return help as reStructuredText: options as code, and no other markup."""
     parts = _OPTION.split(" ".join(text.split()))
     return "".join(f"``{part}``" if number % 2 else _MARKUP.sub(r"\\\1", part) for number, part in enumerate(parts))
 

@@ -1,7 +1,7 @@
-"""How well paths are flown: ``python scripts/control_errors.py [--seeds 10] [--gust 1.0]``.
+"""Measure how well paths are flown: ``python scripts/control_errors.py [--seeds 10] [--gust 1.0]``.
 
-Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with its sensors' noise, commands 40 ms
-and feedback 20 ms on the way, 5 % of both lost, positions with 1 cm of noise. The error is that of the true position.
+Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with its sensors' noise, commands delayed
+by 40 ms and feedback by 20 ms, 5 % of both lost, positions with 1 cm of noise. The error is that of the true position.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ FLIGHTS: Final[dict[str, Callable[[Drone], Flyer]]] = {
 class Result(NamedTuple):
     """One flight."""
 
-    to_path: TrackingError  #: from the true position to where it should have been at that time
+    to_path: TrackingError  #: from the true position to the planned one at that time
     across: TrackingError  #: from the true position to the nearest point of the square's outline; empty for other paths
     done: bool
 
 
 def fly(make: Callable[[Drone], Flyer], seed: int, gust_m_s: float = 0.0, radio: Radio | None = None) -> Result:
-    """One flight in simulated time; of a square from the first corner on."""
+    """Fly once in simulated time; a square from its first corner on."""
     to_path, across = TrackingError(), TrackingError()
     with rehearse(f"sim://?world=empty&cameras=none&seed={seed}", radio=radio or Radio(seed=seed)) as drone:
         drone.config["sim.wind"] = (0.0, 0.0, 0.0)
@@ -69,7 +69,7 @@ def fly(make: Callable[[Drone], Flyer], seed: int, gust_m_s: float = 0.0, radio:
 
 
 def _to_outline(x: float, y: float, half: float) -> float:
-    """Distance to the outline of a square around the origin."""
+    """Return the distance to the outline of a square around the origin."""
     east, north = abs(x) - half, abs(y) - half
     return math.hypot(max(0.0, east), max(0.0, north)) if max(east, north) > 0.0 else -max(east, north)
 

@@ -1,8 +1,8 @@
-"""Hold the tests' coverage against its floors: the whole package, and each module of the core.
+"""Check the tests' coverage against its floors: the whole package, and each module of the core.
 
     coverage json -o coverage.json && python scripts/coverage_floor.py coverage.json
 
-CI runs it after the tests (``.ci/run``), ``make coverage`` too. It ends with 1 and names what is below.
+CI (``.ci/run``) and ``make coverage`` run it after the tests. It exits with 1 and names anything below its floor.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from typing import Any
 TOTAL_PERCENT = 93.0  #: of all lines and branches of the package
 MODULE_PERCENT = 90.0  #: of each module of the core
 CORE = ("client", "drivers", "messages", "network", "proxy", "transport", "vehicles")
-NO_CORE = {"emulation", "emulator", "firmware", "wire"}  #: folders and modules of vehicles that are no drivers
+NO_CORE = {"emulation", "emulator", "firmware", "wire"}  #: folders and modules of vehicles that are not drivers
 
-# Modules of the core that may be below, each with the reason. What is no longer below leaves this table.
+# Modules of the core that may be below, with the reason. Remove a module once it is no longer below.
 EXCEPTIONS: dict[str, str] = {
-    "vehicles/ros2/node.py": "needs ROS 2, whose tests run in an environment of their own",
+    "vehicles/ros2/node.py": "needs ROS 2, whose tests run in a separate environment",
     "drivers/recording_sink.py": "part of the public suite: the rest reports mistakes that no driver here makes",
 }
 
 
 def failures(report: Mapping[str, Any], exceptions: Mapping[str, str] = EXCEPTIONS) -> list[str]:
-    """Return a sentence for each floor that isn't kept.
+    """Return a sentence for each floor that is not held.
 
     Args:
-        report: What ``coverage json`` writes.
+        report: The output of ``coverage json``.
         exceptions: Modules of the core that may be below the floor, by their path under ``skyloop/``.
     """
     found: list[str] = []
@@ -49,7 +49,7 @@ def failures(report: Mapping[str, Any], exceptions: Mapping[str, str] = EXCEPTIO
 
 
 def obsolete(report: Mapping[str, Any], exceptions: Mapping[str, str] = EXCEPTIONS) -> list[str]:
-    """Return the exceptions that are none any more. No failure: what varies with chance stands now above, now below."""
+    """Return the exceptions no longer needed. Not a failure: coverage that varies by chance may pass today."""
     percent = {
         path.partition("skyloop/")[2]: each["summary"]["percent_covered"] for path, each in report["files"].items()
     }
@@ -57,13 +57,13 @@ def obsolete(report: Mapping[str, Any], exceptions: Mapping[str, str] = EXCEPTIO
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Return 0 if all floors are kept."""
+    """Return 0 if all floors are held."""
     if len(arguments) != 1:
         print(__doc__)
         return 2
     report = json.loads(Path(arguments[0]).read_text())
     for name in obsolete(report):
-        print(f"note: {name} is not below {MODULE_PERCENT:g} % here: if it stays so, take it out of EXCEPTIONS")
+        print(f"note: {name} is not below {MODULE_PERCENT:g} % here: if it stays so, remove it from EXCEPTIONS")
     found = failures(report)
     for sentence in found:
         print(sentence)

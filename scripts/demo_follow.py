@@ -1,4 +1,4 @@
-"""``python scripts/demo_follow.py``: a simulated drone follows a person who walks about; figures against the truth."""
+"""``python scripts/demo_follow.py``: a simulated drone follows a walking person; figures against the truth."""
 
 from __future__ import annotations
 
@@ -32,43 +32,43 @@ if TYPE_CHECKING:
 ENOUGH_IN_VIEW: Final = 0.9
 DETECTOR, LOOKS = "detector", "looks"
 _REFRESH_HZ = 4
-_LINE_EVERY_S = 5.0  # where there is no terminal
+_LINE_EVERY_S = 5.0  # without a terminal
 _TURN_RAD_S = 0.6
-_AHEAD_RAD = 0.2  # a person nearer than this to straight ahead can be pointed at,
-_AHEAD_FRAMES = 15  # after so many frames in a row: the picture of a vehicle that has just begun to turn is blurred
+_AHEAD_RAD = 0.2  # a person closer than this to straight ahead can be pointed at,
+_AHEAD_FRAMES = 15  # after this many frames in a row: the picture of a vehicle beginning to turn is blurred
 
 
 def follow_anything(
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, metavar="S", help="How long to follow; until Ctrl-C if not given")
+        float | None, typer.Option(min=0.0, metavar="S", help="Duration of following [default: until Ctrl-C]")
     ] = None,
     headless: Annotated[
         bool, typer.Option("--headless", help="No page; exit code 1 if the person was in view less than 90 %")
     ] = False,
-    world: Annotated[str, typer.Option(help="One with people: park, street, yard, or a file")] = "park",
-    looks: Annotated[bool, typer.Option("--looks", help="By looks alone, also where a detector is installed")] = False,
-    distance: Annotated[float, typer.Option(metavar="M", help="To keep, in metres; above 2")] = 4.0,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Decides the noise and the wind")] = 0,
+    world: Annotated[str, typer.Option(help="World with people: park, street, yard, or a file")] = "park",
+    looks: Annotated[bool, typer.Option("--looks", help="By appearance only, even if a detector is installed")] = False,
+    distance: Annotated[float, typer.Option(metavar="M", help="Distance to keep; above 2")] = 4.0,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the noise and the wind")] = 0,
     port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
-    name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
+    name: Annotated[str, typer.Option(help="Name of the pilot, as shown to others")] = "demo",
     json: Annotated[
-        bool, typer.Option("--json", help="For programs: the figures as one JSON object; the rest on standard error")
+        bool, typer.Option("--json", help="Print the figures as one JSON object; the rest goes to standard error")
     ] = False,
 ) -> None:
-    """Take off in a simulated park, and follow a person who walks about, at 4 m. Ctrl-C lands.
+    """Take off in a simulated park, and follow a walking person, at 4 m. Ctrl-C lands.
 
-    A detector finds people in the frames where ONNX Runtime and SciPy are installed (extra detect). Else the simulator
-    points at somebody once, and what is in that box is tracked by its looks.
+    A detector finds people in the frames if ONNX Runtime and SciPy are installed (extra detect). Otherwise the
+    simulator points at a person once, and the content of that box is tracked by its appearance.
 
-    The figures at the end compare with where the simulator had the person.
+    The figures at the end compare with the person's true position in the simulator.
     """
     from skyloop.control import ChaseSettings
     from skyloop.sim import load_world
 
-    settings = ChaseSettings(distance_m=distance)  # refuses what is not valid
+    settings = ChaseSettings(distance_m=distance)  # raises for invalid values
     if not any(getattr(target, "shape", None) == "person" for target in load_world(world, seed).targets):
-        raise UsageError(f"nobody walks about in the world {world!r}: give --world park, street or yard")
+        raise UsageError(f"no one walks in the world {world!r}: give --world park, street or yard")
     console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds, world, seed).fly(settings.distance_m, looks, not headless, port, browser)
     if json:
@@ -81,7 +81,7 @@ def follow_anything(
 
 
 def packaged_detector() -> OnnxDetector | None:
-    """Return the detector of the simulator's figures; None where what it needs is not installed."""
+    """Return the detector of the simulator's figures; None if its requirements are missing."""
     from skyloop.vision import simulated_detector
 
     if find_spec("scipy") is None:
@@ -106,14 +106,14 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, distance_m: float, looks: bool, page_shown: bool, port: int | None, browser: bool) -> FollowReport:
-        """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
+        """Fly it; ``port`` None: the default port of pages. Raises the errors of connecting and of take-off."""
         from follow_truth import FollowReport, TargetTruth
 
         from skyloop.sim import load_world
 
         detector = None if looks else packaged_detector()
         if detector is None and not looks:
-            self.console.print(f"no detector: {install_command('detect')} brings what it needs")
+            self.console.print(f"no detector: {install_command('detect')} installs one")
         truth = TargetTruth(load_world(self.world, self.seed))
         report = FollowReport(LOOKS if detector is None else DETECTOR, distance_m)
         uri = "sim://?" + urlencode({"world": self.world, "seed": self.seed, "cameras": "front", "fps": 15})
@@ -135,7 +135,7 @@ class _Demo:
     def _follow(self, drone: Drone, detector: OnnxDetector | None, truth: TargetTruth, report: FollowReport) -> None:
         box = None
         if detector is None:
-            self.console.print("looking for somebody to point at, to follow by looks alone")
+            self.console.print("looking for a person to point at, to follow by appearance only")
             box = self._pointed_at(drone, truth)
             if box is None:
                 return
@@ -168,7 +168,7 @@ class _Demo:
             self.console.print("[yellow]the person was lost for too long[/]")
 
     def _pointed_at(self, drone: Drone, truth: TargetTruth) -> Box | None:
-        """Turn until somebody is straight ahead; the box, or None if it was stopped before."""
+        """Turn until a person is straight ahead; return the box, or None if stopped before."""
         begun_s, ahead = time.monotonic(), 0
         for frame in drone.frames():
             if self._stopped or (self.seconds is not None and time.monotonic() - begun_s > self.seconds):
@@ -185,7 +185,7 @@ class _Demo:
         return None
 
     def _stop(self) -> None:
-        """First Ctrl-C: end the flight in good order. The second one is the user's impatience, and Python's."""
+        """End the flight in good order on the first Ctrl-C. A second one interrupts Python as usual."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
@@ -197,7 +197,7 @@ def _follower(
     from skyloop.control import FollowTarget
 
     class Judged(FollowTarget):
-        """Counts how well it goes."""
+        """Counts its successes."""
 
         def on_frame(self, frame: Frame) -> None:
             super().on_frame(frame)
@@ -207,7 +207,7 @@ def _follower(
     return Judged(
         drone,
         box,
-        class_name="person",  # with a box, too: how large people are gives the distance
+        class_name="person",  # also with a box: the size of people gives the distance
         detector=detector,
         distance_m=report.distance_m,
     )

@@ -1,7 +1,7 @@
-"""Writes the tables of the pages that are lists of the code, between ``<!-- made: NAME -->`` and ``<!-- end -->``.
+"""Write the tables generated from the code into pages, between ``<!-- made: NAME -->`` and ``<!-- end -->``.
 
 python -m scripts.doc_tables            # `make docs` does it first
-python -m scripts.doc_tables --check    # ends with 1 if a page is not up to date, as the tests do
+python -m scripts.doc_tables --check    # exits with 1 if a page is out of date, like the tests
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DOCS: Final = Path(__file__).parents[1] / "docs"
 
 
 def parameters() -> str:
-    """The proxy's parameters, with what they are without a setting."""
+    """Return the proxy's parameters with their defaults."""
     rows = []
     for own in OWN:
         number = isinstance(own.value, float)
@@ -31,17 +31,17 @@ def parameters() -> str:
 
 
 def fates() -> str:
-    """What ends an intent."""
+    """Return the causes that end an intent."""
     return table(("fate", "what ends an intent"), [(f"`{fate.value}`", words) for fate, words in ENDINGS.items()])
 
 
 def endings() -> str:
-    """The same in a sentence."""
+    """Return the same as a sentence."""
     return "; ".join(ENDINGS.values()) + "."
 
 
 def attempts() -> str:
-    """What intruders tried, and where it worked."""
+    """Return the attempts of intruders, and where they succeeded."""
     from tests.promises.security.deeds import COLUMNS, DEEDS, works
 
     rows = [(deed.what, *("**works**" if works(deed, who) else "–" for who in COLUMNS)) for deed in DEEDS]
@@ -49,7 +49,7 @@ def attempts() -> str:
 
 
 def table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
-    """A table of Markdown."""
+    """Return a Markdown table."""
     lines = ["|".join(f" {cell} " if cell else " " for cell in row) for row in (head, *rows)]
     return "\n".join([f"|{lines[0]}|", "|" + "---|" * len(head), *(f"|{line}|" for line in lines[1:])])
 
@@ -61,7 +61,7 @@ PAGES: Final[Mapping[str, Mapping[str, Callable[[], str]]]] = {
 
 
 def made(page: str) -> tuple[str, str]:
-    """A page as it is, and as it should be."""
+    """Return a page as it is, and as it should be."""
     text = (DOCS / page).read_text(encoding="utf-8")
     return text, fill(text, {name: make() for name, make in PAGES[page].items()}, "made")
 
@@ -76,7 +76,7 @@ def main() -> int:
         if text == wanted:
             continue
         stale = True
-        print(f"docs/{page} {'is not up to date' if check else 'written'}")
+        print(f"docs/{page} {'is out of date' if check else 'written'}")
         if not check:
             (DOCS / page).write_text(wanted, encoding="utf-8")
     return int(stale and check)

@@ -1,8 +1,8 @@
-"""Makes the pictures of the examples by running them: ``python scripts/example_pictures.py``, all or those named.
+"""Make the pictures of the examples by running them: ``python scripts/example_pictures.py``, all or those named.
 
-Each example flies simulated drones that are recorded, and the recording becomes a film: ``flight_film``. They go to
-``docs/pictures/examples``, and ``docs/examples.md`` shows them. Needs the extras sim, vision, record, gym and ``pip
-install pillow matplotlib nbclient ipykernel``.
+Each example flies simulated drones, which are recorded, and the recording becomes a film: ``flight_film``. The films go
+to ``docs/pictures/examples`` and are shown on ``docs/examples.md``. Needs the extras sim, vision, record, gym and
+``pip install pillow matplotlib nbclient ipykernel``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures" / "examples"
 MOST_BYTES = 280_000
 ROOM = View("room", eye=(-3.6, -2.7, 2.4), at=(0.2, 0.0, 0.75), focal_px=330.0)
 HALL = View("empty", eye=(-3.4, -2.6, 2.5), at=(0.0, 0.0, 0.75), focal_px=330.0)
-# From outside, where the walls and the ceiling in between are not seen.
+# From outside, without the walls and the ceiling between.
 SOUTH_WALL = View("room", eye=(3.6, 4.6, 4.2), at=(0.1, -1.3, 1.0), focal_px=430.0)
 FOUR_WALLS = View("room", eye=(-5.2, -6.4, 6.4), at=(1.1, -0.4, 0.9), focal_px=345.0)
 COURSE = View("gates", eye=(-8.8, -10.6, 8.4), at=(1.55, -1.4, 1.15), focal_px=330.0)
@@ -53,13 +53,13 @@ def main() -> None:
     wanted = sys.argv[1:] or list(MAKERS)
     for name in wanted:
         if name not in MAKERS:
-            sys.exit(f"there is no picture of an example {name!r}: choose from {', '.join(MAKERS)}")
+            sys.exit(f"no example {name!r} has a picture: choose from {', '.join(MAKERS)}")
         with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
             os.environ["SKYLOOP_RUNTIME_DIR"] = f"{folder}/run"
             MAKERS[name](Path(folder))
 
 
-# Those that fly what is already there ---------------------------------------------------------------------------------
+# With running drones --------------------------------------------------------------------------------------------------
 
 
 def first_flight(folder: Path) -> None:
@@ -112,7 +112,7 @@ def three_routes(folder: Path) -> None:
     keep("three_routes", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
 
 
-# Behaviours, each in the world that it is for -------------------------------------------------------------------------
+# Behaviours, each in its world ----------------------------------------------------------------------------------------
 
 
 def approach(folder: Path) -> None:
@@ -128,7 +128,7 @@ def fly_gates(folder: Path) -> None:
 
 
 def land_on_platform(folder: Path) -> None:
-    """With a few seconds more, of the platform that goes on with the drone on it."""
+    """Film a few seconds more, of the platform moving on with the drone on it."""
     with flight(folder, "alpha", "--world", "platform", *BELOW):
         run("land_on_platform", "alpha")
         time.sleep(4.0)
@@ -136,7 +136,7 @@ def land_on_platform(folder: Path) -> None:
 
 
 def orbit_and_map(folder: Path) -> None:
-    """The flight, and each place where it took a marker to be."""
+    """Film the flight, and each place where it located a marker."""
     with flight(folder, "alpha", *FRONT):
         run("orbit_and_map", "alpha")
     flown = Recording.open(folder / "flight.mcap")
@@ -154,7 +154,7 @@ def orbit_and_map(folder: Path) -> None:
 
 
 def dots(canvas: Picture, places: dict[str, list[list[float]]]) -> None:
-    """The places of each marker, and its name at their median, as the map has it."""
+    """Draw the located places of each marker, and its name at their median, as in the map."""
     for number, (name, own) in enumerate(places.items()):
         colour = DOTS[number % len(DOTS)]
         for point in np.round(FOUR_WALLS.pixels(np.array(own)) * 16).astype(np.int32).tolist():
@@ -177,17 +177,17 @@ def follow_anything(folder: Path) -> None:
     keep("follow_anything", film(folder / "flight.mcap", PARK, captions=True))
 
 
-# Those that bring their own -------------------------------------------------------------------------------------------
+# With their own drones -----------------------------------------------------------------------------------------------
 
 
 def replay_and_compare(folder: Path) -> None:
-    """The flight, and below it what both controllers asked for when they looked at it again."""
+    """Film the flight, and below it the commands of both controllers in the replay."""
     run("replay_and_compare", str(folder))
     flown = Recording.open(folder / "flight.mcap")
     old, new = (Recording.open(folder / f"{name}.mcap") for name in ("old", "new"))
     both = compare(old, new)
     first_ns, last_ns = span_ns(flown)
-    later_s = (begin_ns(old, old.drone().name) - first_ns) / 1e9  # between the beginnings of both time axes
+    later_s = (begin_ns(old, old.drone().name) - first_ns) / 1e9  # between the starts of both time axes
     pictures = film(folder / "flight.mcap", ROOM)
     times = np.linspace(0.0, (last_ns - first_ns) / 1e9, len(pictures))
     for picture, now in zip(pictures, times, strict=True):
@@ -198,7 +198,7 @@ def replay_and_compare(folder: Path) -> None:
 
 
 def chart(canvas: Picture, series: Sequence[tuple[Array, Array]], now_s: float, last_s: float) -> None:
-    """Turning rates along time, up to now, on a card at the lower edge."""
+    """Draw turning rates over time, up to now, on a card at the lower edge."""
     height, width = canvas.shape[:2]
     left, top, right, bottom = 8, height - 72, width - 8, height - 8
     card = canvas[top:bottom, left:right]
@@ -208,14 +208,14 @@ def chart(canvas: Picture, series: Sequence[tuple[Array, Array]], now_s: float, 
     ):
         known = (times >= 0) & (times <= now_s) & np.isfinite(rates)
         across = left + (right - left) * times[known] / last_s
-        up = bottom - 16 - rates[known] * 28  # a turn of 1 rad/s is 28 pixels high
+        up = bottom - 16 - rates[known] * 28  # a turn rate of 1 rad/s is 28 pixels high
         line = np.column_stack([across, up])
         cv2.polylines(canvas, [np.round(line * 16).astype(np.int32)], False, colour, 2, cv2.LINE_AA, 4)
         cv2.putText(canvas, name, (left + 6, top + y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
 
 
 def learn_to_reach(folder: Path) -> None:  # noqa: ARG001
-    """How the mean return grew."""
+    """Draw the growth of the mean return."""
     said = run("learn_to_reach", "--rounds", "25")
     means, bests = (
         [float(found) for found in re.findall(rf"{what} +(-?[\d.]+)", said)][:25] for what in ("mean return", "best")
@@ -225,7 +225,7 @@ def learn_to_reach(folder: Path) -> None:  # noqa: ARG001
     rounds = range(1, len(means) + 1)
     axes.plot(rounds, bests, color="#9ca3af", label="best of 64")
     axes.plot(rounds, means, color="#2563eb", label="mean of 64")
-    axes.set(xlabel="round", ylabel="return", title="What 64 simulated drones have learnt")
+    axes.set(xlabel="round", ylabel="return", title="Learning progress of 64 simulated drones")
     axes.grid(color="#e5e7eb")
     axes.legend()
     PICTURES.mkdir(parents=True, exist_ok=True)
@@ -234,7 +234,7 @@ def learn_to_reach(folder: Path) -> None:  # noqa: ARG001
 
 
 def first_flight_notebook(folder: Path) -> None:
-    """The notebook's own plot."""
+    """Save the notebook's own plot."""
     notebook = nbformat.read(EXAMPLES / "first_flight.ipynb", as_version=4)  # type: ignore[no-untyped-call]
     NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
@@ -266,12 +266,12 @@ MAKERS: dict[str, Callable[[Path], None]] = {
 }
 
 
-# How they are run -----------------------------------------------------------------------------------------------------
+# Running them ---------------------------------------------------------------------------------------------------------
 
 
 @contextmanager
 def flight(folder: Path, *words: str) -> Iterator[None]:
-    """Simulated drones of these names (the words before the first option), recorded to ``flight.mcap``."""
+    """Record simulated drones of these names (the words before the first option) to ``flight.mcap``."""
     count = next((number for number, word in enumerate(words) if word.startswith("--")), len(words))
     names, options = words[:count], words[count:]
     cameras = next((word.partition("=")[2] for word in options if word.startswith("cameras=")), "front")
@@ -287,7 +287,7 @@ def flight(folder: Path, *words: str) -> Iterator[None]:
 
 @contextmanager
 def started(*words: str, until: str = "") -> Iterator[None]:
-    """A Python process for as long as the block; begins it when that has said a word."""
+    """Run a Python process during the block, which begins once the process has printed ``until``."""
     with subprocess.Popen([sys.executable, "-u", *words], stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -299,7 +299,7 @@ def started(*words: str, until: str = "") -> Iterator[None]:
 
 
 def run(example: str, *words: str) -> str:
-    """An example, to its end; what it said."""
+    """Run an example to its end; return its output."""
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / f"{example}.py"), *words], check=True, stdout=subprocess.PIPE, text=True
     )

@@ -1,5 +1,5 @@
-"""A recorded flight of simulated drones as a short film: what an onlooker in their world would have seen, the ways
-flown so far, and in a corner what a drone's own camera saw, with what was drawn on it."""
+"""A short film of a recorded flight of simulated drones: an onlooker's view of their world with the paths flown so far,
+and in a corner a drone's own camera with the drawings on it."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from skyloop.sim.world import TargetState, Vec3
 WIDTH, HEIGHT = 480, 270
 INSET = (160, 120)
 FRAMES, FPS = 40, 8
-DRAWN_NS = 400_000_000  # so old may a picture be that is shown for what was drawn on it
-BACKDROP = (72, 64, 58)  # BGR, around a room that is looked into from outside
-WAYS = ((246, 130, 59), (22, 115, 249), (94, 197, 34))  # BGR, one a drone
+DRAWN_NS = 400_000_000  # maximum age of a picture shown for its drawings
+BACKDROP = (72, 64, 58)  # BGR, around a room seen from outside
+WAYS = ((246, 130, 59), (22, 115, 249), (94, 197, 34))  # BGR, one per drone
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Where the onlooker stands in which world. World axes [m]."""
+    """An onlooker's position and world. World axes [m]."""
 
     world: str = "room"
     eye: Vec3 = (-3.8, -2.8, 2.6)
@@ -55,13 +55,13 @@ class View:
         return CameraModel("onlooker", WIDTH, HEIGHT, 30.0, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 
     def pixels(self, points: Array) -> Array:
-        """Points (n, 3) as they are seen, (n, 2); NaN for those behind the onlooker."""
+        """Project points (n, 3) to pixels (n, 2); NaN for those behind the onlooker."""
         right, down, ahead = self.pose.rotation.T @ (points - np.array(self.eye)).T
         ahead = np.where(ahead > 0.05, ahead, np.nan)
         return np.column_stack([WIDTH / 2 + self.focal_px * right / ahead, HEIGHT / 2 + self.focal_px * down / ahead])
 
     def outside(self) -> NDArray[np.bool_]:
-        """The pixels past the room, for an onlooker who stands outside of it and looks in; none for one within."""
+        """Return the pixels beyond the room for an onlooker outside; none for one inside."""
         size = np.array(load_world(self.world).room.size_m)
         low, high = size * (-0.5, -0.5, 0.0), size * (0.5, 0.5, 1.0)
         if (low < self.eye).all() and (self.eye < high).all():
@@ -74,15 +74,15 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What a drone's camera saw."""
+    """A picture from a drone's camera."""
 
     picture: Picture
-    drawing: Annotation | None  # what was drawn on it
+    drawing: Annotation | None  # the drawings on it
 
 
 @dataclass(slots=True)
 class Track:
-    """One drone's true states along the recording."""
+    """One drone's true states during the recording."""
 
     states: list[Feedback]
     times_s: list[float]
@@ -99,7 +99,7 @@ class Track:
         return max(0, bisect.bisect(self.times_s, time_s) - 1)
 
     def way(self, end_s: float) -> Array:
-        """Where it was until then, ten times a second, (n, 3)."""
+        """Return its path until then, ten times a second, (n, 3)."""
         times = np.arange(0.0, end_s, 0.1)
         return np.array([place(self.states[self.index(time)]) for time in times]).reshape(-1, 3)
 
@@ -107,9 +107,9 @@ class Track:
 def film(
     path: Path, view: View, *, owners: bool = False, captions: bool = False, after_s: float = 0.0
 ) -> list[Picture]:
-    """The pictures of a film, from the first take-off until ``after_s`` after the last landing. ``owners``: write at
-    each drone who flies it; ``captions``: what was written on the camera's picture stands at the lower edge instead,
-    where there is room for it."""
+    """Return the pictures of a film, from the first take-off until ``after_s`` after the last landing. ``owners``:
+    write the pilot's name at each drone; ``captions``: move text from the camera's picture to the lower edge, where
+    there is room for it."""
     recording = Recording.open(path)
     names = [drone.name for drone in recording.drones]
     begin_ns, end_ns = span_ns(recording, after_s)
@@ -137,7 +137,7 @@ def film(
 
 
 def span_ns(recording: Recording, after_s: float = 0.0) -> tuple[int, int]:
-    """From the first take-off until ``after_s`` after the last landing, on the proxies' clock [ns]."""
+    """Return the span from the first take-off until ``after_s`` after the last landing, on the proxies' clock [ns]."""
     airborne = [
         item.value.captured_ns
         for drone in recording.drones
@@ -148,7 +148,7 @@ def span_ns(recording: Recording, after_s: float = 0.0) -> tuple[int, int]:
 
 
 def save(path: Path, pictures: list[Picture], most_bytes: int) -> None:
-    """As an animated WebP, of the best quality that has at most so many bytes."""
+    """Write an animated WebP, in the best quality within ``most_bytes``."""
     images = [Image.fromarray(np.ascontiguousarray(picture[:, :, ::-1])) for picture in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
     for quality in (70, 55, 40, 25, 10):
@@ -158,14 +158,14 @@ def save(path: Path, pictures: list[Picture], most_bytes: int) -> None:
         if path.stat().st_size <= most_bytes:
             print(f"{path.name}: {len(images)} pictures, quality {quality}, {path.stat().st_size:,} bytes")
             return
-    raise SystemExit(f"{path.name} has {path.stat().st_size:,} bytes, and at most {most_bytes:,} are wanted")
+    raise SystemExit(f"{path.name} has {path.stat().st_size:,} bytes, more than {most_bytes:,}")
 
 
 # Inside ---------------------------------------------------------------------------------------------------------------
 
 
 def place(state: Feedback) -> Array:
-    """Where it truly is, (3,)."""
+    """Return its true place, (3,)."""
     return np.array([_native(state, f"truth.{axis}") for axis in "xyz"])
 
 
@@ -175,7 +175,7 @@ def _native(state: Feedback, name: str) -> float:
 
 
 def _rotation(state: Feedback) -> Array:
-    """World from body, (3, 3)."""
+    """Return the rotation from body to world, (3, 3)."""
     (cr, sr), (cp, sp), (cy, sy) = (
         (math.cos(angle), math.sin(angle))
         for angle in (_native(state, f"truth.{name}") for name in ("roll", "pitch", "yaw"))
@@ -199,7 +199,7 @@ def _targets(view: View, state: Feedback) -> tuple[TargetState, ...]:
 
 
 def _sights(recording: Recording, drone: str, track: Track, begin_ns: int, times: Array) -> list[Sight | None]:
-    """What the first camera saw at each time; None each without a camera."""
+    """Return the first camera's picture at each time; None each without a camera."""
     cameras = recording.cameras(drone)
     if not cameras:
         return [None] * len(times)
@@ -212,14 +212,14 @@ def _sights(recording: Recording, drone: str, track: Track, begin_ns: int, times
             break
         captured_ns = picture.header.captured_ns
         drawing = track.annotations.get(captured_ns)
-        # Controllers skip pictures when they are busy: the last one that they drew on stands a little longer.
+        # Busy controllers skip pictures: keep the last one with drawings a little longer.
         if drawing or not (newest and newest.drawing) or captured_ns - newest.drawing.captured_ns > DRAWN_NS:
             newest = Sight(picture.pixels(), drawing)
     return shown + [newest] * (len(times) - len(shown))
 
 
 def _inset(canvas: Picture, sight: Sight, captions: bool) -> None:
-    """The camera's picture in the upper right corner. ``captions``: the words of its drawing at the lower edge."""
+    """Draw the camera's picture in the upper right corner. ``captions``: its drawing's text goes to the lower edge."""
     drawing = sight.drawing
     if drawing is not None and captions:
         words = [shape.text for shape in drawing.shapes if isinstance(shape, Text)]

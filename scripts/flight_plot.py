@@ -1,4 +1,4 @@
-"""A flight in figures, as an SVG: true distance to the marker over time, and both paths from above. Pure."""
+"""A flight's figures as an SVG: true distance to the marker over time, and both paths from above. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WIDTH, HEIGHT = 960, 380
 INK, FAINT, GRID = "#24292f", "#6e7781", "#e3e6ea"
 DRONE, BOARD, WANTED = "#1f6feb", "#d9730d", "#2da44e"
 ROOM_M = (8.0, 6.0)  # of the world ``room``, from west to east and from south to north
-EVERY_S = 0.1  # points are drawn so often
+EVERY_S = 0.1  # between the points drawn
 Point = tuple[float, float]
 
 
@@ -25,7 +25,7 @@ class FlightLog:
     places: list[tuple[int, tuple[float, ...], tuple[float, ...]]] = field(default_factory=list)
 
     def add(self, feedback: Feedback) -> None:
-        """Take the next sample; more often than is drawn are passed over."""
+        """Add a sample; samples closer together than points are skipped."""
         native = feedback.native
         if native is None or (self.places and feedback.captured_ns - self.places[-1][0] < EVERY_S * 1e9):
             return
@@ -36,14 +36,14 @@ class FlightLog:
         self.places.append((feedback.captured_ns, own, board))
 
     def ranges(self) -> list[Point]:
-        """Time since the first sample [s] and distance between vehicle and board [m]."""
+        """Return the time since the first sample [s] and the distance between vehicle and board [m]."""
         begin = self.places[0][0]
         return [((at_ns - begin) / 1e9, math.dist(own, board)) for at_ns, own, board in self.places]
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """A rectangle of the drawing, and what its sides stand for."""
+    """A rectangle of the drawing, and the ranges of its sides."""
 
     left: float
     top: float
@@ -59,7 +59,7 @@ class Axes:
 
 
 def plot(log: FlightLog) -> str:
-    """The whole drawing."""
+    """Return the whole drawing."""
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" height="{HEIGHT}" '
         'font-family="system-ui, -apple-system, Segoe UI, Helvetica, Arial, sans-serif" font-size="13">',

@@ -1,10 +1,10 @@
-"""Follows people behind emulated firmware, in real time: ``python scripts/follow_emulated.py [ardrone2] [tello]``.
+"""Follow people with emulated firmware, in real time: ``python scripts/follow_emulated.py [ardrone2] [tello]``.
 
-A person strolls round a lawn at 1.2 m/s, or at 0.7 m/s before a Tello, which flies 1 m/s at most by the sticks;
-``--case hidden`` and the others are those of ``follow_flights.py``, and so is the judgement. The vehicle is that of
-``skyloop sim --firmware``, in this process, which so knows the truth; its proxy is a process of its own. So video is
-encoded, sent, decoded and late as by the real vehicle. The time is that of the clock: what else the machine does
-disturbs the flight. What is touched is not counted.
+A person strolls around a lawn at 1.2 m/s, or at 0.7 m/s for a Tello, which flies at most 1 m/s by the sticks;
+``--case hidden`` and the others are those of ``follow_flights.py``, with the same judgement. The vehicle is that of
+``skyloop sim --firmware``, in this process, which therefore knows the truth; its proxy is a separate process. Video is
+encoded, sent, decoded and delayed as from the real vehicle. Time is real: other load on the machine disturbs the
+flight. Collisions are not counted.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ CAMERAS: Final = {"ardrone2": FRONT_2, "tello": FRONT}
 
 
 def stroll(rng: random.Random, speed_m_s: float = 0.7) -> str:
-    """A person who walks round a lawn before the vehicle, while another one passes behind."""
+    """Return a world in which a person walks around a lawn before the vehicle, while another one passes behind."""
     room = '[room]\nsize = [34, 30, 10]\nfloor = "grass"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
     points = rotated([(3.5, -4), (9.5, -4), (9.5, 4), (3.5, 4)], rng)
     other = person("passer", rng.randrange(1000), [(13, -6), (13, 6), (13.5, 6), (13.5, -6)], 1.0)
@@ -55,14 +55,14 @@ _KEPT: Final = 200
 
 
 class TruthLog:
-    """What was true lately: noted with each sample of feedback, asked for by the time of a frame."""
+    """The recent truth: recorded with each sample of feedback, looked up by the time of a frame."""
 
     def __init__(self, host: SimHost) -> None:
         self._simulation = host.simulation
         self._kept: deque[Feedback] = deque(maxlen=_KEPT)
 
     def note(self, _feedback: Feedback | None = None) -> None:
-        """Note the present truth, as the simulator's own driver reports it."""
+        """Record the present truth, as reported by the simulator's own driver."""
         truth = self._simulation.truth(0)
         native: dict[str, bool | int | float | str | tuple[float, ...]] = {"sim.time_s": truth.time_s}
         for axis, place, velocity in zip("xyz", truth.position_m, truth.velocity_m_s, strict=True):
@@ -71,14 +71,14 @@ class TruthLog:
         self._kept.append(Feedback(captured_ns=monotonic_ns(), native=native))
 
     def near(self, frame: Frame) -> Feedback | None:
-        """The truth nearest to a frame's capture."""
+        """Return the truth nearest to a frame's capture."""
         kept = list(self._kept)
         return min(kept, key=lambda one: abs(one.captured_ns - frame.captured_ns), default=None)
 
 
 @contextmanager
 def flown(kind: str, host: SimHost, options: str = "") -> Iterator[Drone]:
-    """A drone that hovers, behind a proxy of its own."""
+    """Yield a hovering drone, behind its own proxy."""
     if kind == "tello":
         with TelloFirmware(host) as tello:
             address = f"tello://{tello.settings.bind}?{options}"
@@ -111,16 +111,16 @@ def fly(
     seconds: float = 40.0,
     options: str = "",
 ) -> Outcome:
-    """Wait until the target is in view, follow it, and judge that.
+    """Wait until the target is in view, follow it, and judge the result.
 
     Args:
         kind: ``ardrone2`` or ``tello``.
-        case: What is followed.
-        seed: Of the world.
-        class_name: Follow the largest of this class; None: what is in the target's true box.
+        case: The target and its world.
+        seed: Seed of the world.
+        class_name: Follow the largest of this class; None: the content of the target's true box.
         gust_m_s: Standard deviation of gusts.
-        seconds: How long.
-        options: Of the vehicle's address.
+        seconds: Duration.
+        options: Options of the vehicle's address.
     """
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "world.toml"
@@ -144,7 +144,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--gust", type=float, default=0.0, help="standard deviation of gusts [m/s]")
     parser.add_argument("--seconds", type=float, default=40.0)
-    parser.add_argument("--options", default="", help="of the vehicle's address, such as velocity_axes=body")
+    parser.add_argument("--options", default="", help="options of the vehicle's address, such as velocity_axes=body")
     given = parser.parse_args()
     for kind in given.kinds or CAMERAS:
         if kind not in CAMERAS:
@@ -162,7 +162,7 @@ def main() -> None:
                     seconds=given.seconds,
                     options=given.options,
                 )
-                swapped = "another one in the box" if outcome.swapped else "always itself"
+                swapped = "another one in the box" if outcome.swapped else "never another"
                 print(
                     f"{kind}, {given.case} by {by}, seed {seed}: RMS of the distance {outcome.rms_m:.2f} m, "
                     f"{outcome.seconds:.0f} s, {outcome.note}, {swapped}",

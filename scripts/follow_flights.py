@@ -1,4 +1,4 @@
-"""Flights that follow people and cars: the worlds, and what counts. Run by ``scripts/behaviours.py follow-target``."""
+"""Flights that follow people and cars: worlds and judgement. Run by ``scripts/behaviours.py follow-target``."""
 
 from __future__ import annotations
 
@@ -25,36 +25,36 @@ from skyloop.vision.object_tracks import ObjectDetector
 from skyloop.vision.tracking import Box
 
 FLIGHT_S: Final = 40.0
-SETTLED_S: Final = 5.0  # from when on the distance counts
+SETTLED_S: Final = 5.0  # the distance counts from then on
 AGAIN_S: Final = 3.0  # and this long after it came out of hiding
-JUDGED: Final = 2  # each second frame
-SWAPPED: Final = 8  # judged frames in a row, one second, that show something else in the target's box
-TILT_RAD: Final = 0.5  # against gusts the drag leaves too little of the simulated drone's usual 0.21 rad
+JUDGED: Final = 2  # every second frame
+SWAPPED: Final = 8  # consecutive judged frames (one second) with something else in the target's box
+TILT_RAD: Final = 0.5  # in gusts, drag leaves too little of the simulated drone's usual 0.21 rad
 _WAIT_S: Final = 60.0
-_POINTED_S: Final = 0.5  # so long is the target in view when it is pointed at
+_POINTED_S: Final = 0.5  # how long the target is in view before it is pointed at
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What is followed, and where."""
+    """A target and its world."""
 
-    world: Callable[[random.Random], str]  #: its file, for a seed
+    world: Callable[[random.Random], str]  #: the world file for a seed
     target: str = "walker"
     distance_m: float = 4.0
     bearing_rad: float | None = None
     traits: Traits | None = None  #: None: those of its class
-    speed_m_s: float = 3.0  #: the greatest
+    speed_m_s: float = 3.0  #: maximum speed
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What came out of one flight."""
+    """The result of one flight."""
 
     found: bool
-    in_view: float  #: share of the frames in which nothing hides the target
+    in_view: float  #: share of the frames without occlusion that show the target
     swapped: bool
-    rms_m: float  #: of the distance's error while nothing hides the target
-    hidden_s: float  #: the longest time that it was hidden
+    rms_m: float  #: of the distance's error without occlusion
+    hidden_s: float  #: the longest occlusion
     hits: int
     seconds: float
     note: str
@@ -92,20 +92,20 @@ def fly(
 
 
 def reported(frame: Frame) -> Feedback | None:
-    """The state at the frame's capture, with the truth as the simulator's driver reports it."""
+    """Return the state at the frame's capture, with the truth reported by the simulator's driver."""
     return frame.feedback
 
 
 class JudgedFlight:
-    """A flight that is judged by the truth.
+    """A flight judged by the truth.
 
     Args:
         drone: In the air.
         judge: Knows the truth of the target.
-        case: What is followed.
-        detector: Of the behaviour.
-        state_of: Returns a state with the truth at, or near, a frame's capture.
-        later: Judge when the flight is over, as a flight in real time has no time for it.
+        case: The target and its world.
+        detector: The behaviour's detector.
+        state_of: Returns a state with the truth at or near a frame's capture.
+        later: Judge after the flight, because a flight in real time leaves no time for it.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class JudgedFlight:
         self._frames = 0
 
     def outcome(self, class_name: str | None, seconds: float = FLIGHT_S) -> Outcome:
-        """Fly, and say how it went. The target is what is of a class, or in its true box."""
+        """Fly and judge. The target is the largest of a class, or the content of its true box."""
         drone = self._drone
         drone.on_event(self._count_hits)
         start = self._first_box()
@@ -144,7 +144,7 @@ class JudgedFlight:
                 self._judged(captured_ns, state, box)
         clear = [truth for _, truth in self._truths if not truth.hidden]
         begin = self._truths[0][0] if self._truths else 0
-        errors, out_ns = [], begin  # since when it can be seen
+        errors, out_ns = [], begin  # the time since which it is visible
         for at, truth in self._truths:
             out_ns = at if truth.hidden else out_ns
             if at - begin > SETTLED_S * 1e9 and (out_ns == begin or at - out_ns > AGAIN_S * 1e9):
@@ -163,7 +163,7 @@ class JudgedFlight:
         self._hits += getattr(event, "kind", "") == "collision"
 
     def _first_box(self) -> tuple[float, float, float, float] | None:
-        """Point at the target once it was in view for a second."""
+        """Point at the target after it was in view for a second."""
         begin, since = None, None
         for frame in self._drone.frames():
             begin = begin or frame.captured_ns
@@ -182,7 +182,7 @@ class JudgedFlight:
         return None
 
     def judge(self, frame: Frame, pilot: FollowTarget) -> None:
-        """Judge what was made of a frame; each second one."""
+        """Judge the result of every second frame."""
         self._frames += 1
         state = self._state_of(frame)
         if state is None or self._frames % JUDGED:
@@ -235,7 +235,7 @@ class _Judged(FollowTarget):
 
 
 def _scenery(name: str) -> str:
-    """A shipped world without its targets and its start."""
+    """Return a shipped world without its targets and its start."""
     text = resources.files("skyloop.sim").joinpath(f"worlds/{name}.toml").read_text()
     tables = re.split(r"(?m)^(?=\[)", text)
     return "".join(one for one in tables if not one.startswith(("[[target]]", "[[spawn]]")))
@@ -255,7 +255,7 @@ def person(name: str, look: int, points: list[tuple[float, float]], speed: float
 
 
 def _rounded(points: list[tuple[float, float]], radius: float = 0.8) -> list[tuple[float, float]]:
-    """The same round trip with round corners: nobody turns on the spot at full speed."""
+    """Return the same round trip with rounded corners: no one turns on the spot at full speed."""
     rounded = []
     for before, corner, after in zip([points[-1], *points], points, [*points[1:], points[0]], strict=False):
         ends = []
@@ -272,19 +272,19 @@ def _rounded(points: list[tuple[float, float]], radius: float = 0.8) -> list[tup
 
 
 def _turned(points: list[tuple[float, float]], rng: random.Random) -> list[tuple[float, float]]:
-    """The same round trip from another point on."""
+    """Return the same round trip starting at another point."""
     first = rng.randrange(len(points))
     return points[first:] + points[:first]
 
 
 def rotated(points: list[tuple[float, float]], rng: random.Random) -> list[tuple[float, float]]:
-    """The same round trip from another point on, perhaps the other way round."""
+    """Return the same round trip starting at another point, perhaps reversed."""
     turned = _turned(points, rng)
     return turned[::-1] if rng.random() < 0.5 else turned
 
 
 def walker(rng: random.Random, speed_m_s: float = 1.5) -> str:
-    """A person who walks up and down the street, at 1.5 m/s, while others walk along the pavements."""
+    """Return a world in which a person walks up and down the street, at 1.5 m/s, while others use the pavements."""
     points = rotated([(-13, 2), (13, 2), (13, -2), (-13, -2)], rng)
     others = [
         person(f"passer {n}", rng.randrange(1000), [(x, y), (-x, y), (-x, y + 0.4), (x, y + 0.4)], speed)
@@ -295,7 +295,7 @@ def walker(rng: random.Random, speed_m_s: float = 1.5) -> str:
 
 
 def car(rng: random.Random) -> str:
-    """A car that drives round a square at 3 m/s, through bends of 3 m, past parked ones."""
+    """Return a world in which a car drives around a square at 3 m/s, through bends of 3 m, past parked ones."""
     room = '[room]\nsize = [46, 34, 10]\nfloor = "asphalt"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
     corners = [(-10.0, -5.0), (10.0, -5.0), (10.0, 5.0), (-10.0, 5.0)]
     if rng.random() < 0.5:
@@ -318,7 +318,7 @@ def car(rng: random.Random) -> str:
 
 
 def hidden(rng: random.Random) -> str:
-    """A person who walks round a lawn, past two walls that each hide him for about 3 s; filmed from inside."""
+    """Return a world in which a person walks around a lawn, past two walls that each hide him for about 3 s."""
     room = '[room]\nsize = [34, 26, 10]\nfloor = "grass"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
     ends = [math.radians(15 * n) for n in range(-6, 7)]
     oval = [(5 + 5.5 * math.cos(a), 5.5 * math.sin(a)) for a in ends]  # counter-clockwise: the inside is on his left
@@ -330,13 +330,13 @@ def hidden(rng: random.Random) -> str:
     )
     house = '[[box]]\nname = "house"\nstands_at = [0, 10.5]\nsize = [20, 2, 4]\ntexture = "concrete"\n'
     passer = person("passer", rng.randrange(1000), [(-9, 8), (9, 8), (9, 8.5), (-9, 8.5)], 1.2)
-    side = rng.choice((1, -1))  # it looks to where nothing hides him
+    side = rng.choice((1, -1))  # it faces the side where nothing hides him
     start = spawn(side * rng.uniform(2, 4), rng.uniform(-1, 1), 0 if side > 0 else 180)
     return room + start + walls + house + person("walker", rng.randrange(1000), points, 1.5) + passer
 
 
 def twin(rng: random.Random) -> str:
-    """A person whose exact twin comes towards him, past him and back, again and again, on either side."""
+    """Return a world in which a person's exact twin repeatedly walks past him and back, on either side."""
     look = rng.randrange(1000)
     room = '[room]\nsize = [30, 24, 10]\nfloor = "concrete"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
     points = rotated([(-8.0, -3.0), (8.0, -3.0), (8.0, 3.0), (-8.0, 3.0)], rng)

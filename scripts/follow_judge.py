@@ -1,4 +1,4 @@
-"""What is true of the one target that is followed, on top of what is true of all: for ``follow_flights.py``."""
+"""The truth about the one target being followed, in addition to all others: for ``follow_flights.py``."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from skyloop.sim.world import World
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What is true at the capture of one frame."""
+    """The truth at the capture of one frame."""
 
-    image: FrameTruth  #: of everything
-    box: TargetBox | None  #: the target's; None: it is not in the image
-    hidden: bool  #: something stands before the target, wherever the camera looks
-    in_view: bool  #: the image shows the target's middle, and it is not hidden
+    image: FrameTruth  #: of the whole image
+    box: TargetBox | None  #: the target's; None: not in the image
+    hidden: bool  #: something occludes the target, wherever the camera points
+    in_view: bool  #: the image shows the target's centre without occlusion
     distance_m: float  #: horizontal, from the vehicle's centre
 
 
@@ -27,9 +27,9 @@ class Judge:
     """Knows the truth of one target of a world.
 
     Args:
-        world: The world that is flown in.
+        world: The world of the flight.
         target: The target's name.
-        camera: Of the vehicle.
+        camera: The vehicle's camera.
     """
 
     def __init__(self, world: World, target: str, camera: CameraModel = FRONT_CAMERA) -> None:

@@ -1,4 +1,4 @@
-"""How well a simulated person or car is followed, against the truth: for ``demo_follow.py``, ``follow_judge.py``."""
+"""Judge the following of a simulated person or car by the truth: for ``demo_follow.py``, ``follow_judge.py``."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import World
 from skyloop.vision.tracking import Box, overlap
 
-HIDDEN: Final = 0.25  #: a target of which less is to be seen counts as hidden
-SETTLING_S: Final = 5.0  #: from the first sighting; after it the distance counts
+HIDDEN: Final = 0.25  #: a target with a smaller visible share counts as hidden
+SETTLING_S: Final = 5.0  #: from the first sighting; the distance counts afterwards
 _SHOWN: Final = 0.3  # overlap of a box with the true one
-_MIDDLES_M: Final = {"person": 0.9, "car": 0.6}  # heights of what a camera would be aimed at
-_EACH: Final = 3  # frame that is judged: drawing what is true of it takes a few milliseconds
-_FOUND_PX: Final = (8.0, 24.0)  # least width and height of a person who can be pointed at
+_MIDDLES_M: Final = {"person": 0.9, "car": 0.6}  # heights that a camera would be aimed at
+_EACH: Final = 3  # every third frame is judged: rendering its truth takes a few milliseconds
+_FOUND_PX: Final = (8.0, 24.0)  # minimum width and height of a person to point at
 
 
 class TargetTruth:
-    """What is true of the people and cars of a simulated world in a frame of a camera. For one thread.
+    """The true people and cars of a simulated world in a camera's frames. For one thread.
 
     Args:
-        world: In which the drone flies.
-        camera: Of the drone.
+        world: The world of the flight.
+        camera: The drone's camera.
     """
 
     def __init__(self, world: World, camera: CameraModel = FRONT_CAMERA) -> None:
@@ -48,11 +48,11 @@ class TargetTruth:
         self._camera = camera
 
     def at(self, frame: Frame) -> FrameTruth | None:
-        """Return what is true at a frame's capture; None where the vehicle did not report the truth."""
+        """Return the truth at a frame's capture; None if the vehicle did not report it."""
         return None if frame.feedback is None else self.at_capture(frame.feedback, frame.captured_ns)
 
     def at_capture(self, state: Feedback, captured_ns: int) -> FrameTruth | None:
-        """Return what is true at a capture, by the state that was reported nearest to it; None: without the truth."""
+        """Return the truth at a capture, from the state reported nearest to it; None without the truth."""
         known = _true_numbers(state)
         if known is None:
             return None
@@ -73,7 +73,7 @@ class TargetTruth:
         return FrameTruth(boxes, distances, bearings, frozenset(centred))
 
     def visible_if_aimed(self, state: Feedback, captured_ns: int, name: str) -> float:
-        """Return the share of a target that nothing would hide, 0 to 1, if the camera were turned to it."""
+        """Return the visible share of a target, 0 to 1, if the camera were turned to it."""
         known = _true_numbers(state)
         if known is None:
             return 0.0
@@ -85,7 +85,7 @@ class TargetTruth:
         return next((box.visible for box in self._labeller.boxes(scene, pose, self._camera) if box.name == name), 0.0)
 
     def _scene(self, known: dict[str, float], late_ns: int) -> tuple[NDArray[np.float64], SceneState]:
-        """Where the vehicle was, (3,) [m], and everything that moves."""
+        """Return the vehicle's place, (3,) [m], and everything that moves."""
         late_s = late_ns / NS_PER_S
         place = np.array([known[f"truth.{axis}"] + late_s * known[f"truth.v{axis}"] for axis in "xyz"])
         targets = tuple(track.at(max(0.0, known["sim.time_s"] + late_s)) for track in self._tracks)
@@ -99,24 +99,24 @@ def _true_numbers(state: Feedback) -> dict[str, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class FrameTruth:
-    """What is true at the capture of one frame."""
+    """The truth at the capture of one frame."""
 
-    boxes: dict[str, TargetBox]  #: of all that is in the image, by name
+    boxes: dict[str, TargetBox]  #: of everything in the image, by name
     distances_m: dict[str, float]  #: horizontal, of each target
     bearings_rad: dict[str, float]  #: of each target, counter-clockwise from straight ahead
-    in_image: frozenset[str]  #: targets whose middle the image shows, or would if nothing hid it
+    in_image: frozenset[str]  #: targets with their centre in the image, occluded or not
 
     def hidden(self, name: str) -> bool:
-        """Return whether something in the image hides a target."""
+        """Return whether something in the image occludes a target."""
         return name in self.in_image and (name not in self.boxes or self.boxes[name].visible < HIDDEN)
 
     def shown_in(self, box: Box) -> str | None:
-        """Return the name of what a box shows best; None if it is nothing that is known."""
+        """Return the name of the best match of a box; None if nothing known matches."""
         best = max(self.boxes.values(), key=lambda one: overlap(one.box, box), default=None)
         return None if best is None or overlap(best.box, box) < _SHOWN else best.name
 
     def nearest_person(self) -> TargetBox | None:
-        """Return the largest person who is wholly in the image, not hidden, and large enough to be pointed at."""
+        """Return the largest person completely in the image, not occluded, and large enough to point at."""
         people = [
             one
             for one in self.boxes.values()
@@ -130,23 +130,23 @@ class FrameTruth:
 
 @dataclass(slots=True)
 class FollowReport:
-    """The figures, and how they look.
+    """The figures of following, and their table.
 
     Attributes:
         way: How the target was found in the frames: ``detector`` or ``looks``.
-        target: Name, in its world, of who was followed; None: nobody was found.
-        distance_m: That was to be kept, horizontally.
+        target: Name, in its world, of the person followed; None: none was found.
+        distance_m: The horizontal distance to keep.
     """
 
     way: str
     distance_m: float
     target: str | None = None
-    frames: int = 0  #: that were judged since the first sighting, without those in which something hides the target
-    in_view: int = 0  #: of these, in how many it was in the image
-    found: int = 0  #: of these, in how many the follower's box was on it
-    others: int = 0  #: frames in which the box was on somebody or something else
+    frames: int = 0  #: judged since the first sighting, without those with the target occluded
+    in_view: int = 0  #: of these, those with the target in the image
+    found: int = 0  #: of these, those with the follower's box on it
+    others: int = 0  #: frames with the box on anything else
     times_lost: int = 0
-    errors_m: list[float] = field(default_factory=list)  #: true minus wanted distance, once settled
+    errors_m: list[float] = field(default_factory=list)  #: true minus desired distance, once settled
     collisions: int = 0
     first_picture_s: float | None = None  #: from the start of the demo
     channels: dict[str, ChannelStats] = field(default_factory=dict)
@@ -155,12 +155,12 @@ class FollowReport:
     _phase: StrEnum | None = None
 
     def judge(self, frame: Frame, truth: TargetTruth, box: Box | None) -> None:
-        """Count a frame, each third one.
+        """Count every third frame.
 
         Args:
             frame: The newest.
-            truth: Of its world.
-            box: Where the follower takes the target to be in it; None: nowhere.
+            truth: The truth of its world.
+            box: The target's box by the follower; None: not found.
         """
         self._seen += 1
         if self._seen % _EACH or (self.target is None and box is None):
@@ -176,7 +176,7 @@ class FollowReport:
         self.count(true, shown, frame.captured_ns)
 
     def count(self, true: FrameTruth, shown: str | None, captured_ns: int) -> None:
-        """Count a frame of which the truth is known, and what the follower's box shows."""
+        """Count a frame with known truth, and the true content of the follower's box."""
         assert self.target is not None
         self.others += shown is not None and shown != self.target
         if true.hidden(self.target):
@@ -190,24 +190,24 @@ class FollowReport:
             self.errors_m.append(true.distances_m[self.target] - self.distance_m)
 
     def enter(self, phase: StrEnum, losses: frozenset[StrEnum]) -> None:
-        """Note the present phase: it counts as lost once for each time that it is not seen."""
+        """Record the present phase: each stretch without sight counts as one loss."""
         if phase in losses and self._phase is not None and self._phase not in losses:
             self.times_lost += 1
         self._phase = phase
 
     @property
     def share_in_view(self) -> float | None:
-        """Of the frames in which nothing hides the target; None: nobody was found."""
+        """Share of the frames without occlusion; None: no one was found."""
         return self.in_view / self.frames if self.frames else None
 
     def good(self, enough: float) -> bool:
-        """Return whether somebody was found, and in view for at least this share of the frames since."""
+        """Return whether a person was found, and in view for at least this share of the frames since."""
         return self.share_in_view is not None and self.share_in_view >= enough
 
     def verdict(self, enough: float) -> str:
-        """Return why it was not good."""
+        """Return the reason for a bad result."""
         if self.share_in_view is None:
-            return "nobody was found"
+            return "no one was found"
         return f"the target was in view in {self.share_in_view:.1%} of the frames, less than {enough:.0%}"
 
     def figures(self) -> dict[str, object]:
@@ -234,7 +234,7 @@ class FollowReport:
         """Return the figures for the terminal."""
         table = Table(title="The flight", title_justify="left", show_header=False, box=None)
         told = self.figures()
-        rows = [("followed", "nobody was found" if self.target is None else f"{self.target}, by {self.way}")]
+        rows = [("followed", "no one was found" if self.target is None else f"{self.target}, by {self.way}")]
         if self.frames:
             rows += [
                 ("in view, truly", f"{told['share_in_view']:.1%} of {self.frames} frames in which nothing hides it"),
@@ -243,7 +243,7 @@ class FollowReport:
             ]
         distance = "not known"
         if self.errors_m:
-            distance = f"median {told['distance_median_m']:.2f} m, wanted {self.distance_m:g} m"
+            distance = f"median {told['distance_median_m']:.2f} m, desired {self.distance_m:g} m"
             distance += f"; off by {told['distance_error_median_m']:.2f} m, 95 % within "
             distance += f"{told['distance_error_p95_m']:.2f} m (after the first {SETTLING_S:g} s)"
         rows += [("distance, truly", distance), ("collisions", str(self.collisions))]

@@ -1,4 +1,4 @@
-"""Measure the package room by room: how large each is, how finely cut, and how it hangs together.
+"""Measure the package room by room: its size, how finely it is cut, and how it hangs together.
 
     python scripts/house.py             # the table; --json: as JSON
     python scripts/house.py --budgets   # its part of scripts/budgets.toml, with today's numbers
@@ -37,8 +37,8 @@ from typing import Final, TypeAlias
 ROOT: Final = Path(__file__).parents[1]
 BUDGETS: Final = ROOT / "scripts" / "budgets.toml"
 CORE: Final = ("messages", "transport", "proxy", "client", "aio", "drivers")
-SMALL: Final = 12  #: lines of a class that is counted as small
-#: What is budgeted of the whole package; of each room and of the core the first two.
+SMALL: Final = 12  #: maximum lines of a small class
+#: The budgets of the whole package; of each room and of the core the first two.
 BUDGETED: Final = ("files", "lines", "small", "chain", "_core")
 
 Rows: TypeAlias = Mapping[str, Mapping[str, float]]
@@ -46,7 +46,7 @@ Rows: TypeAlias = Mapping[str, Mapping[str, float]]
 
 @dataclass(slots=True)
 class Module:
-    """What is measured of one file."""
+    """The measurements of one file."""
 
     room: str
     lines: int
@@ -55,8 +55,8 @@ class Module:
     classes: list[int] = field(default_factory=list)
     import_lines: int = 0
     core_uses: int = 0
-    imports: set[str] = field(default_factory=set)  #: wherever they stand
-    chained: set[str] = field(default_factory=set)  #: those that run when it is imported
+    imports: set[str] = field(default_factory=set)  #: anywhere in the file
+    chained: set[str] = field(default_factory=set)  #: those that run on import
 
 
 def room_of(path: Path) -> str:
@@ -128,7 +128,7 @@ def house(modules: Mapping[str, Module]) -> Rows:
     importers = Counter(name for module in modules.values() for name in module.imports)
 
     @cache
-    def chain(name: str) -> int:  # imports in a circle have no end: `lint-imports` allows none
+    def chain(name: str) -> int:  # circular imports would never end: `lint-imports` allows none
         return 1 + max(map(chain, modules[name].chained), default=0)
 
     rooms: dict[str, list[str]] = defaultdict(list)
@@ -157,11 +157,11 @@ def house(modules: Mapping[str, Module]) -> Rows:
 
 
 def over(measured: Rows, budgets: Rows) -> list[str]:
-    """Return a sentence for each budget that is exceeded, or missing, or of a room that is gone."""
+    """Return a sentence for each budget that is exceeded or missing, or whose room is gone."""
     found = [f"{room} has no budget" for room in measured if room not in budgets]
     found += [f"{room} is gone: remove its budget" for room in budgets if room not in measured]
     return found + [
-        f"{room}: {key} is {measured[room][key]:.0f}, and the budget is {most:.0f}"
+        f"{room}: {key} is {measured[room][key]:.0f}, the budget is {most:.0f}"
         for room, budget in budgets.items()
         for key, most in budget.items()
         if room in measured and measured[room][key] > most
@@ -169,7 +169,7 @@ def over(measured: Rows, budgets: Rows) -> list[str]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Return 0 unless a budget is to be held and is not."""
+    """Return 0 unless a budget is exceeded."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.add_argument("--budgets", action="store_true", help="print them as lines of scripts/budgets.toml")

@@ -1,13 +1,13 @@
-"""Identifies the flight model of the simulated AR.Drone from recorded pitch steps, judges it, and draws it.
+"""Identify the flight model of the simulated AR.Drone from recorded pitch steps, judge it, and draw it.
 
     python scripts/identify_ardrone.py
     python scripts/identify_ardrone.py --data ../shared/fixtures/ardrone-flights --picture steps.png
 
-The recordings are no part of the project: docs/ardrone-model.md says where they come from. The parameters, and how the
-drone's own estimate of its speed follows the speed, are fitted to the recordings but one, and judged on that one, for
-each of them in turn. What the code has, ``AR_DRONE`` in ``skyloop.sim.vehicles`` and ``AR_DRONE_ESTIMATE`` in
-``skyloop.sim.identification``, is fitted to five and judged on three; it is compared with all, beside the vehicle by
-default, and drawn. Figures are RMS over 3 s, and the reported speed 3 s after the step, simulated and recorded. Needs
+The recordings are not part of the project: docs/ardrone-model.md names their source. The parameters, and how the
+drone's own estimate of its speed follows the speed, are fitted to all recordings but one and judged on that one, for
+each in turn. The values in the code, ``AR_DRONE`` in ``skyloop.sim.vehicles`` and ``AR_DRONE_ESTIMATE`` in
+``skyloop.sim.identification``, are fitted to five and judged on three; they are compared with all, beside the default
+vehicle, and drawn. Figures are RMS over 3 s, and the reported speed 3 s after the step, simulated and recorded. Needs
 scipy and matplotlib (requirements-dev.txt), and some five minutes.
 """
 
@@ -42,7 +42,7 @@ from skyloop.sim.vehicles import AR_DRONE
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("SKYLOOP_FIXTURES") or ROOT.parent / "shared" / "fixtures") / "ardrone-flights"
 FITTED = ("0.4sImpulseNoHover", "0.5sImpulseNH5", "1sImpulseHalfMagNH2", "1sImpulseNH3", "8sStepHalfMagNH1")
-#: What the code has not seen: every second run in order of names, but the long step, of which there is only one.
+#: The recordings not used for the code: every second run by name, but not the long step, which is the only one.
 JUDGED = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1")
 RUNS = tuple(sorted(FITTED + JUDGED))
 DRAWN = ("0.5sImpulseHalfMagNH1", "0.5sImpulseNH6", "1sImpulseNH1", "8sStepHalfMagNH1")
@@ -56,7 +56,7 @@ INK, FAINT, REAL, MODEL = "#24292f", "#8c959f", "#1f6feb", "#d9730d"
 
 @dataclass(frozen=True, slots=True)
 class Free:
-    """A parameter that is searched for: where the search begins, and between which bounds."""
+    """A parameter to search: start and bounds."""
 
     name: str
     start: float
@@ -70,7 +70,7 @@ FREE = (
     Free("linear_drag_per_s", 0.3, 0.0, 2.0),
     Free("airspeed_tilt_rad_s2_per_m2", 0.01, 0.0, 0.1),
     Free("level_brake_per_s", 0.3, 0.0, 2.0),
-    # Of the estimate.
+    # The estimate's.
     Free("lag_s", 0.1, 0.01, 0.5),
     Free("scale", 1.1, 0.5, 2.0),
 )
@@ -84,8 +84,8 @@ BY_DEFAULT_PLAIN: Model = (VehicleParameters(), SpeedEstimate(1e-9, 1.0))
 def main() -> None:
     usage = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     usage.add_argument("--data", type=Path, default=DATA, help="folder of the recordings, one folder each")
-    usage.add_argument("--picture", type=Path, default=PICTURE, help="where the picture goes")
-    usage.add_argument("--only-compare", action="store_true", help="don't fit: compare and draw what the code has")
+    usage.add_argument("--picture", type=Path, default=PICTURE, help="file for the picture")
+    usage.add_argument("--only-compare", action="store_true", help="don't fit: compare and draw the code's values")
     usage.add_argument("--hold", action="append", default=[], metavar="NAME=VALUE", help="don't fit this parameter")
     given = usage.parse_args()
     held = {name: float(value) for name, _, value in (one.partition("=") for one in given.hold)}
@@ -132,9 +132,9 @@ def from_first_step(recording: Recording) -> Recording:
 
 
 def fit(runs: Sequence[Recording], free: Sequence[Free] = FREE, base: Model = IN_THE_CODE) -> Model:
-    """The vehicle and estimate that come nearest to these runs by least squares: each run, and within it pitch and
-    speed in shares of the agreement that is wanted, weighs the same. Differential quotients come from drones that fly
-    side by side."""
+    """Return the vehicle and estimate nearest to these runs by least squares: each run, and within it pitch and speed
+    as shares of the desired agreement, has equal weight. Difference quotients come from drones that fly side by
+    side."""
     start = np.array([one.start for one in free])
 
     def models(candidates: Sequence[Floats]) -> list[Model]:
@@ -169,7 +169,7 @@ def values(model: Model) -> str:
 
 
 def residuals(runs: Sequence[Recording], models: Sequence[Model]) -> list[Floats]:
-    """One array for each model."""
+    """Return one array for each model."""
     parts: list[list[Floats]] = [[] for _ in models]
     for run in runs:
         response = replay(run.command, [vehicle for vehicle, _ in models])
@@ -185,14 +185,14 @@ def line(run: Recording, model: Model) -> str:
 
 
 def figures(run: Recording, model: Model, begin_s: float = 0.0) -> str:
-    """RMS over the window that begins at a time of the run, and the speeds at its end."""
+    """Return the RMS over the window that begins at a time of the run, and the speeds at its end."""
     pitch, forward, faster = judge(run, model, begin_s)
     recorded = float(np.interp(begin_s + WINDOW_S, run.forward.times_s, run.forward.values))
     return f"{pitch:5.2f}°  {forward:5.3f} m/s  {recorded + faster:5.2f} for {recorded:5.2f} m/s"
 
 
 def judge(run: Recording, model: Model, begin_s: float = 0.0) -> tuple[float, float, float]:
-    """RMS of pitch [°] and speed [m/s] over the window, and by how much the simulated drone is faster at its end."""
+    """Return the RMS of pitch [°] and speed [m/s] over the window, and the simulated excess speed at its end."""
     vehicle, estimate = model
     response = replay(run.command, [vehicle], begin_s + WINDOW_S)
     misfit = compare(response, run, begin_s, begin_s + WINDOW_S, estimate)[0]
@@ -205,7 +205,7 @@ def judge(run: Recording, model: Model, begin_s: float = 0.0) -> tuple[float, fl
 
 
 def draw(runs: Sequence[Recording], stamped: Sequence[Recording], path: Path) -> None:
-    """A column for each run: command, pitch and forward speed, recorded and simulated."""
+    """Draw a column for each run: command, pitch and forward speed, recorded and simulated."""
     mpl.use("Agg")  # needs no display
     plt.rcParams.update({"font.family": "DejaVu Sans", "font.size": 9.5, "text.color": INK, "axes.labelcolor": INK})
     figure, axes = plt.subplots(

@@ -1,16 +1,16 @@
-"""Labels a thing in a recorded film with boxes, in each tenth frame.
+"""Label a thing in a recorded film with boxes, in every tenth frame.
 
-With a window, where OpenCV has one: draw the box with the mouse, Space or Enter takes it, C leaves the frame out.
+If OpenCV supports windows: draw the box with the mouse, Space or Enter accepts it, C skips the frame.
 
     python -m scripts.label_film FILM LABELS.json --name "upper label"
 
-Without one, from the command line, after looking at enlarged pictures of the frames:
+Otherwise, from the command line, after viewing enlarged pictures of the frames:
 
     python -m scripts.label_film FILM LABELS.json --pictures FOLDER --zoom 3 --crop 0,0,120,260
     python -m scripts.label_film FILM LABELS.json --name "upper label" --box 0:5,1,32,56 --box 10:5,1,32,56
-    python -m scripts.label_film FILM LABELS.json --name "upper label" --all 5,1,32,56      # where it does not move
+    python -m scripts.label_film FILM LABELS.json --name "upper label" --all 5,1,32,56      # if it does not move
 
-The pictures show the boxes that the file has so far. A box is x, y, width and height in pixels.
+The pictures show the boxes already in the file. A box is x, y, width and height in pixels.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from skyloop.vision.tracking import Box, checked_box
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("film", type=Path, help="a PaVE stream of an AR.Drone 2")
-    parser.add_argument("labels", type=Path, help="the JSON file, made if it is not there")
-    parser.add_argument("--name", help="of the thing")
-    parser.add_argument("--each", type=int, default=10, help="how many frames to go on [default: 10]")
+    parser.add_argument("labels", type=Path, help="the JSON file, created if missing")
+    parser.add_argument("--name", help="name of the thing")
+    parser.add_argument("--each", type=int, default=10, help="step in frames [default: 10]")
     parser.add_argument("--box", action="append", default=[], metavar="FRAME:X,Y,WIDTH,HEIGHT")
     parser.add_argument("--all", metavar="X,Y,WIDTH,HEIGHT", help="the same box in each of the frames")
     parser.add_argument("--how", help="how the boxes were made, kept in the file")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write the frames with their boxes, as PNG")
-    parser.add_argument("--crop", metavar="X,Y,WIDTH,HEIGHT", help="of the pictures")
-    parser.add_argument("--zoom", type=int, default=2, help="of the pictures and the window [default: 2]")
+    parser.add_argument("--crop", metavar="X,Y,WIDTH,HEIGHT", help="part of the pictures to show")
+    parser.add_argument("--zoom", type=int, default=2, help="enlargement of the pictures and the window [default: 2]")
     options = parser.parse_args()
     try:
         film = read_film(options.film)
@@ -65,7 +65,7 @@ def label(film: NDArray[np.uint8], options: argparse.Namespace) -> None:
         for text in options.box:
             frame, _, box = text.partition(":")
             if not frame.isdecimal() or int(frame) >= len(film):
-                raise UsageError(f"--box is {text!r} and must begin with a frame's number up to {len(film) - 1}")
+                raise UsageError(f"--box must begin with a frame's number up to {len(film) - 1}, got {text!r}")
             boxes[int(frame)] = numbers(box)
         if not options.all and not options.box:
             boxes.update(drawn(film, wanted, options.name, options.zoom))
@@ -88,7 +88,7 @@ def label(film: NDArray[np.uint8], options: argparse.Namespace) -> None:
 
 
 def drawn(film: NDArray[np.uint8], wanted: range, name: str, zoom: int) -> dict[int, Box]:
-    """The boxes that the user draws in a window."""
+    """Return the boxes drawn by the user in a window."""
     found: dict[int, Box] = {}
     for n in wanted:
         try:

@@ -1,10 +1,10 @@
-"""Builds wheel and source package, checks them, and flies the demo with what is installed from the wheel.
+"""Build wheel and source package, check them, and fly the demo from the installed wheel.
 
-    python scripts/package_check.py            # what `make package` and .ci/run do
+    python scripts/package_check.py            # as in `make package` and .ci/run
     python scripts/package_check.py --keep-in build/package --seconds 20
 
-Needs nothing but Python: the tools, and then the wheel, go into virtual environments of their own, and the demo is run
-in a folder where no checkout is in reach.
+Needs only Python: the tools, and then the wheel, are installed into separate virtual environments, and the demo runs in
+a folder without a checkout within reach.
 """
 
 import argparse
@@ -23,9 +23,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6")
-#: What `make demo` installs, too.
+#: Also installed by `make demo`.
 EXTRAS = ("sim", "vision", "cockpit")
-#: In the wheel beside the modules, and missed only when it is used.
+#: In the wheel beside the modules, and otherwise missed only when used.
 NEEDED = (
     "skyloop/py.typed",
     "skyloop/__init__.pyi",
@@ -34,7 +34,7 @@ NEEDED = (
     "skyloop/cockpit/static/licences.txt",
     "skyloop/vision/weights/figures.onnx",
 )
-#: With these a test run is possible from the source package alone.
+#: Needed to run the tests from the source package alone.
 SOURCES = ("Makefile", "requirements-dev.txt", "tests/conftest.py", "docs/architecture.md", "cockpit-page/src/main.ts")
 
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def check_wheel(wheel: Path) -> None:
-    """Check what the page of a package index shows, and the files that are no modules."""
+    """Check the description shown by package indexes, and the files that are not modules."""
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         metadata = BytesParser().parsebytes(archive.read(next(name for name in names if name.endswith("/METADATA"))))
@@ -87,7 +87,7 @@ def check_wheel(wheel: Path) -> None:
 
 
 def check_source(source: Path) -> None:
-    """Check that the source package has what its tests need, and nothing that was built or installed."""
+    """Check that the source package has everything its tests need, and nothing built or installed."""
     with tarfile.open(source) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     missing = [name for name in SOURCES if name not in names]
@@ -97,7 +97,7 @@ def check_source(source: Path) -> None:
 
 
 def environment(folder: Path, *requirements: str | Path) -> Path:
-    """Make a virtual environment with these requirements, and return its Python."""
+    """Create a virtual environment with these requirements, and return its Python."""
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     run(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *requirements)
@@ -105,8 +105,8 @@ def environment(folder: Path, *requirements: str | Path) -> Path:
 
 
 def run(program: Path, *arguments: str | Path, cwd: Path | None = None) -> None:
-    """Run a program to its end; what it prints is shown, and its failure ends this one."""
-    # Neither the checkout nor another environment is in reach of what is tried.
+    """Run a program to its end, showing its output; raise if it fails."""
+    # Neither the checkout nor another environment may be within reach of the tested code.
     kept = {
         name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
     }
@@ -116,7 +116,7 @@ def run(program: Path, *arguments: str | Path, cwd: Path | None = None) -> None:
 
 
 def step(text: str, begin: float = time.monotonic()) -> None:
-    """Show what is done now, and after how many seconds."""
+    """Print the present step, and the seconds since the start."""
     print(f"[{time.monotonic() - begin:5.1f} s] {text}", flush=True)
 
 

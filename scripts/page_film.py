@@ -20,8 +20,8 @@ _WIDTH: Final = 560
 _LAST_MS: Final = 1500
 _QUALITIES: Final = (60, 45, 35, 30, 25, 20, 15)
 _MOVE_S: Final = 0.5
-_DRAWN_MS: Final = 15  # after it was received
-#: Browsers without a screen draw no mouse: an arrow that goes where the mouse goes, and a ring while it is pressed.
+_DRAWN_MS: Final = 15  # after its arrival
+#: Headless browsers draw no mouse: an arrow that follows the mouse, and a ring while it is pressed.
 _MOUSE: Final = """() => {
   const make = (name, attributes) => {
     const one = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -45,7 +45,7 @@ _MOUSE: Final = """() => {
 
 
 class Shown:
-    """Which frame of a drone's only camera a page shows, by what the page receives from its next loading on."""
+    """The frame of a drone's only camera on a page, from the page's messages after its next load."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
@@ -54,13 +54,13 @@ class Shown:
 
     @property
     def captured_ns(self) -> int:
-        """Of the newest frame."""
+        """Capture time of the newest frame."""
         while self._newest_ns is None:
             self._page.wait_for_timeout(10)
         return self._newest_ns
 
     def wait_for_next(self) -> None:
-        """Wait until another frame was received, and is on the screen."""
+        """Wait until another frame has arrived and is on the screen."""
         before = self.captured_ns
         while self.captured_ns == before:
             self._page.wait_for_timeout(2)
@@ -74,11 +74,11 @@ class Shown:
 
 @dataclass
 class PageFilm:
-    """Takes pictures of a page while things are done on it.
+    """Takes pictures of a page during actions on it.
 
     Attributes:
         watch: Called with each picture.
-        times_s: When each was taken.
+        times_s: The time of each.
     """
 
     page: Page
@@ -91,13 +91,13 @@ class PageFilm:
         self._session = self.page.context.new_cdp_session(self.page)
 
     def begin(self, x: float, y: float) -> None:
-        """Show the mouse, at this place [CSS pixels]."""
+        """Show the mouse at this place [CSS pixels]."""
         self.page.evaluate(_MOUSE)
         self._at = x, y
         self.page.mouse.move(x, y)
 
     def shoot(self, seconds: float = 0.0) -> None:
-        """Take pictures for so long; at least one."""
+        """Take pictures for this time; at least one."""
         end_s = time.monotonic() + seconds
         while True:
             begun_s = time.monotonic()
@@ -115,7 +115,7 @@ class PageFilm:
             self.shoot()
 
     def move(self, x: float, y: float, seconds: float = _MOVE_S) -> None:
-        """Move the mouse, as a hand does: slowly at both ends."""
+        """Move the mouse like a hand: slowly at both ends."""
         (from_x, from_y), begun_s = self._at, time.monotonic()
         share = 0.0
         while share < 1.0:
@@ -126,23 +126,23 @@ class PageFilm:
         self._at = x, y
 
     def click(self, button: Locator) -> None:
-        """Move to the middle of a button, and press it."""
+        """Move to the centre of a button, and press it."""
         self.move(*_middle(button))
-        self._at = _middle(button)  # what is on it may have changed its width in the meantime
+        self._at = _middle(button)  # its text may have changed its width meanwhile
         self.page.mouse.move(*self._at)
         self.page.mouse.down()
         self.page.mouse.up()
         self.shoot()
 
     def _picture(self) -> bytes:
-        """As Playwright does, but without waiting for fonts, and compressed for speed."""
+        """Take a picture like Playwright, but without waiting for fonts, and compressed for speed."""
         taken = self._session.send(
             "Page.captureScreenshot", {"format": "jpeg", "quality": 95, "optimizeForSpeed": True}
         )
         return base64.b64decode(taken["data"])
 
     def save(self, path: Path, most_bytes: int) -> None:
-        """Write an animated WebP that plays at the speed of the clock, of the best quality that fits.
+        """Write an animated WebP that plays in real time, in the best quality that fits.
 
         Raises:
             SystemExit: It does not fit.
@@ -165,7 +165,7 @@ class PageFilm:
                     f"quality {quality}, {size:,} bytes"
                 )
                 return
-        raise SystemExit(f"{path.name} has {size:,} bytes, and at most {most_bytes:,} are wanted")
+        raise SystemExit(f"{path.name} has {size:,} bytes, more than {most_bytes:,}")
 
 
 def _middle(button: Locator) -> tuple[float, float]:

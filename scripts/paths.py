@@ -1,22 +1,22 @@
-"""Trace the four paths through Skyloop that matter most, on a live proxy, and count the files and calls of each.
+"""Trace the four most important paths through Skyloop on a live proxy, and count the files and calls of each.
 
     python scripts/paths.py            # the table
     python scripts/paths.py --list     # each call as well; --json: all as JSON
     python scripts/paths.py --check    # holds them against scripts/budgets.toml: `make check`
 
-A simulated drone, its proxy, the local transport and the application run in this process, and ``sys.settrace`` notes
-each call of a function of the package. Only the pilot that dies is a process of its own, which is killed.
+A simulated drone, its proxy, the local transport and the application run in this process, and ``sys.settrace`` records
+each call of a function of the package. Only the pilot that dies is a separate process, which is killed.
 
 - *velocity*: from ``drone.velocity()`` of a pilot in flight to the simulator's control loops.
 - *frame*: from the simulated camera's finished image, at the driver, to the application's ``on_frame`` callback.
 - *parameter*: from ``drone.config["limits.speed"] = …``, which proxy and vehicle share, to its confirmation.
 - *death*: from the transport's notice that the pilot's connection ended to the end of the thread that received from it;
-  meanwhile the vehicle was told to hover.
+  meanwhile the vehicle was sent a hover.
 
-What is counted:
+Counting:
 
-- A *call* is that of a function or method whose code is in the package, properties included, or the resumption of a
-  generator. Comprehensions belong to their function. What Python and libraries do, the methods that they make (as of
+- A *call* is a call of a function or method of the package, including properties, or the resumption of a
+  generator. Comprehensions belong to their function. Calls of Python and libraries, generated methods (as of
   dataclasses), and other threads than the path's are not counted.
 - *files*: those that the calls are in.
 - *returns*: calls into a file that the path had left: the call before was in another file. Returning from a call does
@@ -51,9 +51,9 @@ import skyloop
 PACKAGE: Final = str(Path(skyloop.__file__).parent) + os.sep
 BUDGETS: Final = Path(__file__).with_name("budgets.toml")
 RUNS: Final = 6
-TRIES: Final = 3  #: how often all is traced where something is over its budget, or was not seen to its end
+TRIES: Final = 3  #: how often to trace everything again if a budget is exceeded or a path incomplete
 WAIT_S: Final = 20.0
-QUIET_S: Final = 0.05  #: a path is over when its threads have called nothing for so long
+QUIET_S: Final = 0.05  #: a path is over once its threads have been quiet for this long
 ADDRESS: Final = "sim://?rate=1&cameras=front&width=64&height=48&fps=3"
 PILOT: Final = f"""import time, skyloop
 drone = skyloop.connect("gauge", rate_hz=1, network=False, timeout_s={WAIT_S})
@@ -61,16 +61,16 @@ drone.feedback().state.airborne or drone.takeoff()
 print(drone.hover(), flush=True)
 time.sleep({WAIT_S})
 """
-#: Parameters of the proxy that let a slow run go on: no hover or landing because the computer is busy.
+#: Parameters of the proxy that let a slow run continue: no hover or landing because the computer is busy.
 PATIENT: Final = ("authority.timeout_s", "failsafe.hover_after_s", "failsafe.land_after_s", "command.max_age_s")
-#: The path's threads by the ends of their names, in the path's order.
+#: The path's threads by the suffixes of their names, in the path's order.
 THREADS: Final = {
     "velocity": ("MainThread", "-peer"),
     "frame": ("-cameras", "-client", " of front"),
     "parameter": ("MainThread", "-peer", "-requests", "-client"),
     "death": ("-peer",),
 }
-#: Where paths begin and end: the first letters of the file, the last ones of the function.
+#: The beginnings and ends of paths: prefix of the file, suffix of the function.
 ANYWHERE: Final = ("", "")
 SIMULATOR: Final = ("sim/", "")
 CAMERA: Final = ("vehicles/", ".show")
@@ -92,7 +92,7 @@ class Call(NamedTuple):
 
 
 class Tracer:
-    """Notes calls on this thread and on those that start later, while a path is traced."""
+    """Records calls on this thread and on later ones while a path is traced."""
 
     def __init__(self) -> None:
         self.calls: list[Call] = []
@@ -111,7 +111,7 @@ class Tracer:
 
     @contextmanager
     def tracing(self, path: str, begins: tuple[str, str] = ANYWHERE) -> Iterator[None]:
-        """Note the calls on a path's threads in the block, from the first at this place on."""
+        """Record the calls on a path's threads during the block, from the first at this place on."""
         self.calls, self._threads, self._begins = [], THREADS[path], begins
         try:
             yield
@@ -130,19 +130,19 @@ class Tracer:
 
 
 def figures(calls: Sequence[Call]) -> dict[str, int]:
-    """Return files, calls and returns of a path."""
+    """Return a path's files, calls and returns."""
     files = [file for file, _ in groupby(call.file for call in calls)]
     return {"files": len(set(files)), "calls": len(calls), "returns": len(files) - len(set(files))}
 
 
 def until(calls: Sequence[Call], last: tuple[str, str]) -> list[Call]:
-    """Return the calls up to the last at this place; none where none is."""
+    """Return the calls up to the last at this place; none if there is none."""
     return list(calls[: max((n for n, call in enumerate(calls, 1) if call.at(last)), default=0)])
 
 
 def velocities(tracer: Tracer, drone: skyloop.Drone) -> Iterator[list[Call]]:
-    for n in range(RUNS + 1):  # the first begins to move what hovered
-        time.sleep(0.1)  # one that comes sooner is left to the connection's thread
+    for n in range(RUNS + 1):  # the first starts the hovering drone moving
+        time.sleep(0.1)  # the connection's thread would send a sooner one
         with tracer.tracing("velocity"):
             drone.velocity(forward=0.1 if n % 2 else -0.1)
             path = tracer.settled(SIMULATOR)
@@ -162,7 +162,7 @@ def frames(tracer: Tracer, drone: skyloop.Drone) -> Iterator[list[Call]]:
         tracer.calls.append(Call(threading.current_thread().name, *CALLBACK))
 
     drone.on_frame(on_frame)
-    for n in range(RUNS + 1):  # the first makes what the later ones use
+    for n in range(RUNS + 1):  # the first creates objects that later ones reuse
         with tracer.tracing("frame", CAMERA):
             path = until(tracer.settled(CALLBACK), CALLBACK)
         if n and [sum(call.at(place) for call in path) for place in (CAMERA, CALLBACK)] == [1, 1]:
@@ -181,7 +181,7 @@ def deaths(tracer: Tracer) -> Iterator[list[Call]]:
 
 
 def trace() -> dict[str, list[list[Call]]]:
-    """Fly, and return the runs of each path that came to its end."""
+    """Fly, and return the complete runs of each path."""
     sys.modules["numba"] = None  # type: ignore[assignment]  # its import and compiling are slow, above all traced
     import skyloop.sim.camera_pipeline
     from skyloop.drivers.registry import make_driver
@@ -206,9 +206,9 @@ def trace() -> dict[str, list[list[Call]]]:
 
 
 def over(measured: Mapping[str, Mapping[str, int]], budgets: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return a sentence for each budget that is exceeded, and for each path that was not seen to its end."""
-    return [f"{name} was not seen to its end in any run" for name in THREADS if name not in measured] + [
-        f"{name}: {key} are {row[key]}, and the budget is {most}"
+    """Return a sentence for each exceeded budget, and for each incomplete path."""
+    return [f"{name} was not complete in any run" for name in THREADS if name not in measured] + [
+        f"{name}: {key} are {row[key]}, the budget is {most}"
         for name, row in measured.items()
         for key, most in budgets.get(name, {}).items()
         if row[key] > most
@@ -216,7 +216,7 @@ def over(measured: Mapping[str, Mapping[str, int]], budgets: Mapping[str, Mappin
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Return 0 unless a path was not seen, or a budget is to be held and is not."""
+    """Return 0 unless a path was incomplete, or a budget is exceeded."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--list", action="store_true", help="print each call as well")
     parser.add_argument("--json", action="store_true", help="print all as JSON")

@@ -1,4 +1,4 @@
-"""Makes the pictures of the README from real runs: ``make pictures``, or ``python scripts/pictures.py flight`` for one.
+"""Make the pictures of the README from real runs: ``make pictures``, or ``python scripts/pictures.py flight`` for one.
 
 =====================  ==============================================================================================
 ``flight-strip.jpg``   the camera of one simulated flight, with what the tracker drew: searching, found, following
@@ -29,7 +29,7 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 FLIGHT = "sim://?seed=2&cameras=front&width=640"  # this seed's marker starts behind the drone
-MARKER_ID = 7  # of the board that is carried about the room
+MARKER_ID = 7  # of the board carried around the room
 FLIGHT_S = 45.0
 KEEP_EVERY = 6  # of the frames: five a second are enough to choose from
 MOST_BYTES = 300_000
@@ -41,7 +41,7 @@ def main() -> None:
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
-            sys.exit(f"there is no picture {name!r}: choose from {', '.join(makers)}")
+            sys.exit(f"no picture {name!r}: choose from {', '.join(makers)}")
         makers[name]()
 
 
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 class Filmed(FollowMarker):
-    """The demo's controller, keeping some of its frames and the mode it was in."""
+    """The demo's controller, keeping some of its frames and their modes."""
 
     def __init__(self, drone: skyloop.Drone) -> None:
         super().__init__(drone, MARKER_ID)
@@ -66,7 +66,7 @@ class Filmed(FollowMarker):
 
 
 def flight() -> None:
-    """Fly once; keep pictures, drawings and the true places."""
+    """Fly once; keep pictures, drawings and true places."""
     log = FlightLog(wanted_m=1.5)
     drawings: dict[int, Annotation] = {}
     with skyloop.connect(FLIGHT, name="pictures") as drone:
@@ -88,7 +88,7 @@ def flight() -> None:
 
 
 def _choose(film: list[tuple[int, Mode, Picture]], found_ns: int) -> list[tuple[int, Picture]]:
-    """One while searching, the first sighting, and one after 15 s of following."""
+    """Return one while searching, the first sighting, and one after 15 s of following."""
     searching = [(at, picture) for at, mode, picture in film if mode is Mode.SEARCHING and at < found_ns]
     found = next((at, picture) for at, _, picture in film if at == found_ns)
     following = next(
@@ -98,7 +98,7 @@ def _choose(film: list[tuple[int, Mode, Picture]], found_ns: int) -> list[tuple[
 
 
 def draw(picture: Picture, annotation: Annotation | None) -> Picture:
-    """The picture with what the tracker said of it, as the page draws it."""
+    """Return the picture with the tracker's drawings, as on the page."""
     canvas = picture.copy()
     for shape in annotation.shapes if annotation is not None else ():
         red, green, blue = shape.colour
@@ -115,7 +115,7 @@ def draw(picture: Picture, annotation: Annotation | None) -> Picture:
 
 
 def _label(canvas: Picture, text: str, at: tuple[float, float], colour: tuple[int, int, int]) -> None:
-    """Text on a dark card, to be read in a picture made smaller."""
+    """Draw text on a dark card, readable in a reduced picture."""
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.8, 2)
     x, y = round(at[0]) + 8, round(at[1]) + height
     card = canvas[max(0, y - height - 8) : y + below + 4, max(0, x - 8) : x + width + 8]
@@ -124,12 +124,12 @@ def _label(canvas: Picture, text: str, at: tuple[float, float], colour: tuple[in
 
 
 def _pixel(point: tuple[float, float]) -> tuple[int, int]:
-    """In sixteenths of a pixel, which OpenCV's ``shift`` of 4 bits wants."""
+    """Return a point in sixteenths of a pixel, for OpenCV's ``shift`` of 4 bits."""
     return round(point[0] * 16), round(point[1] * 16)
 
 
 def side_by_side(pictures: list[Picture], gap: int = 8, width: int = 480) -> Picture:
-    """Of one width each, with white between."""
+    """Join pictures, scaled to equal width, with white between."""
     height = round(pictures[0].shape[0] * width / pictures[0].shape[1])
     white = np.full((height, gap, 3), 255, np.uint8)
     row: list[Any] = []
@@ -143,7 +143,7 @@ def side_by_side(pictures: list[Picture], gap: int = 8, width: int = 480) -> Pic
 
 
 def world() -> None:
-    """Three drones on their way through the gates, seen by a camera of nobody's."""
+    """Three drones on their way through the gates, seen by an external camera."""
     gates = load_world("gates", 0)
     simulation = Simulation(gates, 3, seed=0)
     for drone in range(3):
@@ -160,7 +160,7 @@ def world() -> None:
 
 
 def looking(place: tuple[float, float, float], at: tuple[float, float, float]) -> CameraPose:
-    """A level camera at a place that looks at another, world axes [m]."""
+    """Return a level camera at a place that points at another, world axes [m]."""
     forward = np.subtract(at, place) / np.linalg.norm(np.subtract(at, place))
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -168,11 +168,11 @@ def looking(place: tuple[float, float, float], at: tuple[float, float, float]) -
 
 
 def save(name: str, picture: Picture) -> None:
-    """Write a picture; what is too large for a README is an error."""
+    """Write a picture; one too large for a README is an error."""
     options = [cv2.IMWRITE_JPEG_QUALITY, 90, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     good, data = cv2.imencode(".jpg", picture, options)
     if not good or len(data) > MOST_BYTES:
-        sys.exit(f"{name} has {len(data):,} bytes, and at most {MOST_BYTES:,} are wanted")
+        sys.exit(f"{name} has {len(data):,} bytes, more than {MOST_BYTES:,}")
     PICTURES.mkdir(parents=True, exist_ok=True)
     (PICTURES / name).write_bytes(data.tobytes())
     print(f"{name}: {picture.shape[1]}×{picture.shape[0]}, {len(data):,} bytes")

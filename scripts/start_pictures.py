@@ -1,4 +1,4 @@
-"""Makes the pictures of the first pages: what the README's program sees on each vehicle, and a camera without a drone.
+"""Make the pictures of the first pages: the README's program on each vehicle, and a camera without a drone.
 
 ``python scripts/start_pictures.py``, or ``… tello`` for one. The Tello and the Pixhawk are emulated firmware.
 """
@@ -23,7 +23,7 @@ from skyloop.vision import MarkerDetector
 
 ROOT = Path(__file__).parents[1]
 FLIGHT_S = 25.0
-MARKER_ID = 7  # of the board that the program follows
+MARKER_ID = 7  # of the board followed by the program
 WIDTH = 640
 GREEN = (90, 220, 60)
 VEHICLES = {
@@ -45,10 +45,10 @@ def main() -> None:
 
 
 def flown(name: str) -> None:
-    """Fly the README's controller, and keep what it saw last, with the marker that it faces."""
+    """Fly the README's controller, and keep the last picture that shows its marker."""
     firmware, address = VEHICLES[name]
     with emulated(firmware), skyloop.connect(address) as drone:
-        drone.next_frame(timeout_s=120.0)  # an emulated camera takes its time for the first on a busy machine
+        drone.next_frame(timeout_s=120.0)  # an emulated camera's first picture takes long on a busy machine
         drone.takeoff()
         controller = watched(program())(drone)
         print(f"{name}: {controller.run(seconds=FLIGHT_S)}")
@@ -57,7 +57,7 @@ def flown(name: str) -> None:
 
 
 def program() -> Any:
-    """The class of the README's first program."""
+    """Return the class of the README's first program."""
     found = re.search(r"```python\n(import skyloop\n.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
     assert found
     names: dict[str, Any] = {"__name__": "program"}
@@ -66,7 +66,7 @@ def program() -> Any:
 
 
 def watched(follow: Any) -> Any:
-    """The same program, keeping the newest frame in which it saw its marker."""
+    """Return the same program, keeping the newest frame that shows its marker."""
 
     class Watched(follow):  # type: ignore[misc]
         shown: skyloop.Frame
@@ -81,7 +81,7 @@ def watched(follow: Any) -> Any:
 
 @contextmanager
 def emulated(arguments: list[str]) -> Iterator[None]:
-    """A drone's firmware, as long as it lasts; none without arguments."""
+    """Run a drone's firmware during the block; none without arguments."""
     if not arguments:
         yield
         return
@@ -95,7 +95,7 @@ def emulated(arguments: list[str]) -> Iterator[None]:
 
 
 def marked(frame: Any) -> Picture:
-    """A frame with the outlines of the markers in it, and how far away each is."""
+    """Return a frame with the outlines and distances of its markers."""
     height = round(frame.shape[0] * WIDTH / frame.shape[1])
     picture: Picture = cv2.resize(frame, (WIDTH, height), interpolation=cv2.INTER_AREA)
     for marker in MarkerDetector("4x4_50", size_m=0.3).detect(frame):
@@ -108,7 +108,7 @@ def marked(frame: Any) -> Picture:
 
 
 def webcam() -> None:
-    """A camera without a drone: a video of the simulated room stands in for it."""
+    """Photograph a camera without a drone: a video of the simulated room replaces it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "clip.mp4"
         film(path)
@@ -119,7 +119,7 @@ def webcam() -> None:
 
 
 def film(path: Path, frames: int = 90) -> None:
-    """What the camera of a simulated drone sees while it turns on the spot."""
+    """Film the view of a simulated drone's camera while it turns on the spot."""
     with skyloop.connect("sim://?cameras=front&width=640&seed=1") as drone, av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=15)
         stream.height, stream.width = drone.next_frame(timeout_s=60.0).shape[:2]

@@ -1,12 +1,12 @@
-"""Trains the detector of the simulator's figures, ``src/skyloop/vision/weights/figures.onnx``: 20 minutes on one core.
+"""Train the detector of the simulator's figures, ``src/skyloop/vision/weights/figures.onnx``: 20 minutes on one core.
 
     pip install torch onnx
     python -m scripts.train_detector figures.onnx
     python -m scripts.train_detector figures.onnx --pictures 300 --steps 100    # a minute: does it work here?
-    python -m benchmarks.detector figures.onnx                                  # what it finds, without PyTorch
+    python -m benchmarks.detector figures.onnx                                  # its results, without PyTorch
 
 It renders pictures of people, cars and crates, trains a small convolutional network with them, writes it as an ONNX
-file that ``OnnxDetector`` reads, and prints what it finds in pictures that it was not trained with.
+file for ``OnnxDetector``, and prints its results on pictures not used for training.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from skyloop.sim.render import use_one_core
 from skyloop.vision import OnnxDetector
 
 WIDTH, HEIGHT = 320, 256  #: of the input [px]: whole strides, and a picture of 320×240 is not scaled
-GREY: Final = 114  # around it, as OnnxDetector has it
+GREY: Final = 114  # around it, as in OnnxDetector
 OUTPUTS: Final = 4 + len(CLASS_NAMES)
 _BATCH: Final = 16
-_RATE: Final = 8e-3  # of learning, at its highest
-_SETTLING: Final = 300  # pictures by which the scores are settled
-_SEEN: Final = 0.3  # share of a thing that must be free for the network to have to find it
-_LEAST_PX: Final = 8  # of its longer side, and half of that of its shorter one
+_RATE: Final = 8e-3  # maximum learning rate
+_SETTLING: Final = 300  # pictures for calibrating the scores
+_SEEN: Final = 0.3  # minimum visible share of a thing that the network must find
+_LEAST_PX: Final = 8  # minimum of its longer side; half as much of its shorter one
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """A step of the network: a convolution with ReLU, the sum of two, or one made as large as another."""
+    """A step of the network: a convolution with ReLU, the sum of two layers, or an upsampling to another's size."""
 
     name: str
     kind: str  #: "conv", "last" (without ReLU), "sum", "sum and relu" or "grow"
@@ -97,10 +97,10 @@ class Album:
     """Pictures for training, in memory.
 
     Attributes:
-        images: BGR, (n, 240, 320, 3), those of fewer rows at the top.
+        images: BGR, (n, 240, 320, 3), those with fewer rows at the top.
         rows: Of each picture, (n,).
-        boxes: Number of the picture, of the class, x, y, width, height [px] and share visible, (m, 7).
-        first: Where the boxes of each picture begin, and of the last one end, (n + 1,).
+        boxes: Number of the picture, class, x, y, width, height [px] and visible share, (m, 7).
+        first: Start of each picture's boxes, and end of the last one's, (n + 1,).
     """
 
     images: Image
@@ -110,7 +110,7 @@ class Album:
 
     @staticmethod
     def of(pictures: Iterable[Picture], count: int) -> Album:
-        """Collect pictures, and show how many there are."""
+        """Collect pictures, showing their number."""
         images, rows = np.zeros((count, 240, WIDTH, 3), np.uint8), np.zeros(count, np.int64)
         boxes, begun = [], time.monotonic()
         for number, picture in enumerate(pictures):
@@ -124,7 +124,7 @@ class Album:
         return Album(images, rows, table, np.searchsorted(table[:, 0], np.arange(count + 1)))
 
     def sample(self, number: int, rng: Rng) -> tuple[Image, NDArray[np.float32], NDArray[np.int64]]:
-        """Return a picture as the network sees it, changed by chance, and the middles, sizes and classes in it."""
+        """Return a picture as the network sees it, randomly changed, with the centres, sizes and classes in it."""
         image = self.images[number, : self.rows[number]]
         rows = self.boxes[self.first[number] : self.first[number + 1]]
         classes, visible = rows[:, 1].astype(np.int64), rows[:, 6]
@@ -147,7 +147,7 @@ class Album:
 def zoomed(
     image: Image, low: NDArray[np.float32], high: NDArray[np.float32], rng: Rng
 ) -> tuple[Image, NDArray[np.float32], NDArray[np.float32]]:
-    """Return an image enlarged or made smaller about a place, and its boxes, cut off at its edges."""
+    """Return an image scaled about a place, and its boxes, clipped at the edges."""
     height, width = image.shape[:2]
     scale = float(np.exp(rng.uniform(math.log(0.6), math.log(1.8))))
     shift = rng.uniform(0, 1, 2) * (width - scale * width, height - scale * height)
@@ -159,7 +159,7 @@ def zoomed(
 
 
 def show(text: str, *, last: bool = False) -> None:
-    """Show progress in place on a terminal, and now and then elsewhere."""
+    """Show progress in place on a terminal, and occasionally elsewhere."""
     if sys.stdout.isatty():
         print(f"\r{text}    ", end="\n" if last else "", flush=True)
     elif last or time.monotonic() - show.__dict__.get("shown", 0.0) > 10:
@@ -176,7 +176,9 @@ def torch_() -> Any:
     try:
         import torch
     except ImportError as error:
-        raise UsageError(f"training needs PyTorch, which is no part of Skyloop: pip install torch ({error})") from error
+        raise UsageError(
+            f"training needs PyTorch, which is not part of Skyloop: pip install torch ({error})"
+        ) from error
     return torch
 
 
@@ -190,7 +192,7 @@ def onnx_() -> Any:
         import onnx
     except ImportError as error:
         raise UsageError(
-            f"writing the file needs onnx, which is no part of Skyloop: pip install onnx ({error})"
+            f"writing the file needs onnx, which is not part of Skyloop: pip install onnx ({error})"
         ) from error
     return onnx
 
@@ -209,7 +211,7 @@ def build(torch: Any, layers: tuple[Layer, ...]) -> Any:
         if final:
             torch.nn.init.normal_(conv.weight, std=0.01)
             torch.nn.init.zeros_(conv.bias)
-            conv.bias.data[4:] = -4.6  # nearly every place is empty
+            conv.bias.data[4:] = -4.6  # nearly all places are empty
             conv.bias.data[2:4] = 1.0
         norm = torch.nn.Identity() if final else torch.nn.BatchNorm2d(layer.channels, momentum=0.03)
         modules[layer.name.replace(".", "_")] = torch.nn.Sequential(conv, norm)
@@ -233,10 +235,10 @@ def run(torch: Any, layers: tuple[Layer, ...], modules: Any, image: Any) -> Any:
 
 
 def loss(torch: Any, raw: Any, answer: Any, target: Any, grid: tuple[Any, Any]) -> Any:
-    """Return how wrong the outputs are: generalised overlap of the boxes, and varifocal loss of the classes.
+    """Return the loss: generalised overlap of the boxes, and varifocal loss of the classes.
 
     Rezatofighi et al., "Generalized Intersection over Union", CVPR 2019; Zhang et al., "VarifocalNet", CVPR 2021: a
-    place's score is to be the overlap of its box, so that of two boxes for a thing the better one is kept.
+    place's score should be the overlap of its box, so that of two boxes for a thing the better one is kept.
     """
     middles, strides = grid
     positive = answer >= 0
@@ -271,7 +273,7 @@ def train(album: Album, steps: int, seed: int) -> dict[str, NDArray[np.float32]]
     rng, layers = np.random.default_rng(seed), network()
     modules = build(torch, layers)
     optimizer = torch.optim.AdamW(modules.parameters(), lr=_RATE, weight_decay=0.02)
-    # With half the bits it is trained twice as fast, on processors that multiply them.
+    # With half the bits, training is twice as fast on processors that multiply them natively.
     short = "avx512_bf16" in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     grid = places(WIDTH, HEIGHT)
     grids = tuple(torch.from_numpy(part) for part in grid)
@@ -373,16 +375,16 @@ def write(path: Path, weights: Mapping[str, NDArray[np.float32]]) -> None:
     graph = helper.make_graph(nodes, "figures", [image], [output], constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     names = repr(dict(enumerate(CLASS_NAMES)))
-    described = "People, cars and crates as Skyloop's simulator draws them; of no use on real images"
+    described = "People, cars and crates as Skyloop's simulator draws them; useless on real images"
     told = {"task": "detect", "names": names, "imgsz": repr([HEIGHT, WIDTH]), "stride": "32", "description": described}
     helper.set_model_props(model, told)
     path.write_bytes(model.SerializeToString())
 
 
 def settle(path: Path, weights: dict[str, NDArray[np.float32]], seed: int) -> None:
-    """Write the network so that at the usual score its misses and false alarms balance, class by class.
+    """Write the network so that its misses and false alarms balance at the usual score, class by class.
 
-    For that the scores are shifted; which of two detections of a class is surer stays the same.
+    Only shifts the scores; the order of two detections of a class stays the same.
     """
     write(path, weights)
     rng = np.random.default_rng(seed)
@@ -404,16 +406,18 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("file", type=Path, help="the ONNX file to write")
-    parser.add_argument("--pictures", type=int, default=6000, help="to train with [default: 6000]")
-    parser.add_argument("--steps", type=int, default=4500, help=f"of training, {_BATCH} pictures each [default: 4500]")
-    parser.add_argument("--seed", type=int, default=1, help="of pictures and training [default: 1]")
-    parser.add_argument("--keep", type=Path, metavar="FILE.npz", help="keep the pictures there, or take them")
+    parser.add_argument("--pictures", type=int, default=6000, help="number to train with [default: 6000]")
+    parser.add_argument(
+        "--steps", type=int, default=4500, help=f"number of training steps, {_BATCH} pictures each [default: 4500]"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of pictures and training [default: 1]")
+    parser.add_argument("--keep", type=Path, metavar="FILE.npz", help="keep the pictures there, or reuse them")
     options = parser.parse_args()
     try:
         if not _BATCH <= options.pictures <= 100_000 or not 1 <= options.steps <= 10_000_000 or options.seed < 0:
             raise UsageError(f"give {_BATCH} to 100000 pictures, 1 to 10000000 steps, and a seed of at least 0")
         if not options.file.absolute().parent.is_dir():
-            raise UsageError(f"there is no folder {options.file.parent} for {options.file.name}")
+            raise UsageError(f"no folder {options.file.parent} for {options.file.name}")
         torch_(), onnx_()
         use_one_core()
         album = _album(options)

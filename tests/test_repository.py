@@ -161,7 +161,7 @@ def test_a_room_over_its_budget(gauge: ModuleType) -> None:
     assert gauge.over(rows, budgets) == [
         "new has no budget",
         "gone is gone: remove its budget",
-        "sim: lines is 10, and the budget is 9",
+        "sim: lines is 10, the budget is 9",
     ]
 
 
@@ -170,8 +170,8 @@ def test_the_figures_of_a_path(tracer: ModuleType) -> None:
     assert tracer.figures(path) == {"files": 3, "calls": 7, "returns": 2}
     measured = {name: tracer.figures(path) for name in tracer.THREADS if name != "frame"}
     assert tracer.over(measured, {"death": {"files": 3, "returns": 1}}) == [
-        "frame was not seen to its end in any run",
-        "death: returns are 2, and the budget is 1",
+        "frame was not complete in any run",
+        "death: returns are 2, the budget is 1",
     ]
 
 

@@ -1,4 +1,4 @@
-"""What goes wrong on a path, decided by a seed; time is an argument."""
+"""The impairments of a path, decided by a seed; time is an argument."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skyloop.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class Impairments:
-    """What a path does to packets, each way. ``loss`` and ``reorder`` are probabilities for each packet.
+    """The effects of a path on packets, each way. ``loss`` and ``reorder`` are probabilities for each packet.
 
     Raises:
         UsageError: A value is out of range: probabilities 0 to 1, times 0 to 60 s.
@@ -21,10 +21,10 @@ class Impairments:
 
     loss: float = 0.0
     delay_s: float = 0.0
-    jitter_s: float = 0.0  #: at most so much is added to the delay, evenly; what is sent later still comes later
-    reorder: float = 0.0  #: share that is held back …
-    reorder_s: float = 0.01  #: … for so much longer, so that those behind overtake
-    trace: Trace | None = None  #: what it carries: packets wait for that, and then for all of the above
+    jitter_s: float = 0.0  #: maximum addition to the delay, uniform; order is kept
+    reorder: float = 0.0  #: share held back …
+    reorder_s: float = 0.01  #: … for this much longer, so that later ones overtake
+    trace: Trace | None = None  #: its capacity: packets first wait for that, and then for all of the above
 
     def __post_init__(self) -> None:
         for name in ("loss", "reorder"):
@@ -36,20 +36,20 @@ class Impairments:
 
     @property
     def longest_s(self) -> float:
-        """The longest time that a packet which arrives was on the way [s], without a trace."""
+        """The longest transit time of a packet that arrives [s], without a trace."""
         return self.delay_s + self.jitter_s + (self.reorder_s if self.reorder else 0.0)
 
 
 class Way:
-    """One direction of a path: packets in, packets out when their time has come.
+    """One direction of a path: packets enter, and leave when their time has come.
 
     Args:
         seed: Decides the fate of each packet.
-        impairments: What goes wrong.
+        impairments: The effects on packets.
     """
 
     def __init__(self, seed: object, impairments: Impairments) -> None:
-        self.impairments = impairments  #: may be changed at any time; holds for packets that come in later
+        self.impairments = impairments  #: may change at any time; applies to later packets
         self.lost = 0
         self._modem: Modem | None = None
         self._random = random.Random(str(seed))
@@ -58,9 +58,9 @@ class Way:
         self._last_ns = 0
 
     def put(self, packet: bytes, now_ns: int) -> None:
-        """Take a packet in."""
+        """Add a packet."""
         wrong, chance = self.impairments, self._random.random
-        # Always three draws: what becomes of a packet depends on its number and not on the rates before it.
+        # Always three draws: a packet's fate depends on its number, not on earlier rates.
         lost, held, jitter = chance() < wrong.loss, chance() < wrong.reorder, chance() * wrong.jitter_s
         if lost:
             self.lost += 1
@@ -81,7 +81,7 @@ class Way:
         heapq.heappush(self._waiting, (due_ns, self._number, packet))
 
     def get(self, now_ns: int) -> tuple[int, bytes] | None:
-        """Return the next packet whose time has come, and when that was [ns]; None if none has."""
+        """Return the next packet whose time has come, and that time [ns]; None if none has."""
         if self._waiting and self._waiting[0][0] <= now_ns:
             due_ns, _, packet = heapq.heappop(self._waiting)
             return due_ns, packet

@@ -20,13 +20,13 @@ from skyloop.errors import UnsupportedError, UsageError
 _Entered = TypeVar("_Entered")
 _PROGRAMS: Final = {"ip": "iproute2", "nsenter": "util-linux", "unshare": "util-linux"}
 _TUN: Final = Path("/dev/net/tun")
-_WITHIN_S: Final = 20.0  # for what takes milliseconds on a machine that is not stuck
-# It says its number, and ends with the pipe, so with whoever made it: then the kernel takes the namespaces apart.
+_WITHIN_S: Final = 20.0  # takes milliseconds on a healthy machine
+# It prints its number, and ends with the pipe, and so with its creator: then the kernel removes the namespaces.
 _HOLD: Final = 'echo "$1" > /proc/sys/kernel/hostname && echo $$ && exec cat'
 
 
 def problem() -> str:
-    """Return why no hosts can be made here; empty if they can."""
+    """Return why no hosts can be created here; empty if they can."""
     if sys.platform != "linux":
         return f"network namespaces need Linux, and this is {sys.platform}"
     if os.geteuid() != 0:
@@ -47,21 +47,21 @@ def problem() -> str:
 
 
 class Host:
-    """A host with interfaces, a name and a directory of local sockets of its own.
+    """A host with its own interfaces, name and directory of local sockets.
 
     Files and processes are shared with all.
     """
 
     def __init__(self, name: str, environment: Mapping[str, str], clock_ahead_s: float) -> None:
-        """Make the host.
+        """Create the host.
 
         Args:
             name: Its host name.
-            environment: Variables of all that runs here, besides those of this process.
+            environment: Extra environment variables of its programs.
             clock_ahead_s: How far its monotonic clock is ahead of this machine's, in whole seconds.
 
         Raises:
-            UnsupportedError: It can't be made.
+            UnsupportedError: It can't be created.
         """
         self.name = name
         self.interfaces: list[str] = []
@@ -81,8 +81,8 @@ class Host:
         if not said.isdecimal():
             self.close()
             raise UnsupportedError(f"no host {name!r} could be made: {problem() or 'its shell ended'}")
-        self.pid = int(said)  #: of a process that does nothing but hold the namespaces
-        #: Put before a command, it runs here, as the very process that was started.
+        self.pid = int(said)  #: of a process that only holds the namespaces
+        #: A prefix that runs a command here, as the very process that was started.
         self.prefix: Sequence[str] = ("nsenter", "--target", said, *kinds, "env", *map("=".join, environment.items()))
         self.ip("link set lo up")
 
@@ -111,16 +111,16 @@ class Host:
         self.run("ip", "-batch", "-", said="\n".join(lines))
 
     def add_interface(self) -> str:
-        """Return the name of one more interface, which is yet to be made."""
+        """Return the name of one more interface, which is yet to be created."""
         self.interfaces.append(f"eth{len(self.interfaces)}")
         return self.interfaces[-1]
 
     def forward(self) -> None:
-        """Pass packets on from one interface to another."""
+        """Forward packets between interfaces."""
         self.run("sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
 
     def masquerade(self, interface: str) -> None:
-        """Give what leaves by an interface this host's address as sender, as a NAT router does. Needs ``nft``."""
+        """Rewrite the sender of outgoing packets to this host's address, like a NAT router. Needs ``nft``."""
         self.run(
             "nft",
             "add table ip nat; add chain ip nat out { type nat hook postrouting priority 100; }; "
@@ -131,16 +131,16 @@ class Host:
         """Release the namespaces; they end with the last process in them. Idempotent."""
         for stream in (self._holder.stdin, self._holder.stdout):
             if stream is not None:
-                with contextlib.suppress(BrokenPipeError):  # the holder is gone already
+                with contextlib.suppress(BrokenPipeError):  # the holder has already ended
                     stream.close()
         self._holder.wait(_WITHIN_S)
 
 
 class Segment:
-    """A switch, and the subnet of the hosts that joined it.
+    """A switch, and the subnet of the hosts on it.
 
     Args:
-        switch: A host of its own.
+        switch: Its own host.
         subnet: Such as ``10.77.1.0/24``.
     """
 
@@ -149,7 +149,7 @@ class Segment:
         self._network = ipaddress.ip_network(subnet)
         self._addresses = self._network.hosts()
         self._ports: dict[Host, str] = {}
-        # A group's packets go to all, also before anybody has said that they want them.
+        # Multicast packets go to all, even before anyone has joined the group.
         switch.ip("link add name switch type bridge mcast_snooping 0", "link set switch up")
 
     def join(self, host: Host) -> str:
@@ -174,11 +174,11 @@ class Segment:
         return address
 
     def cut(self, host: Host) -> None:
-        """Let nothing pass from now on, without telling the host: as out of a radio's reach."""
+        """Block everything from now on, without telling the host: as out of a radio's range."""
         self._switch.ip(f"link set {self._ports[host]} nomaster")
 
     def restore(self, host: Host) -> None:
-        """Let everything pass again."""
+        """Unblock everything."""
         self._switch.ip(f"link set {self._ports[host]} master switch")
 
     def unplug(self, host: Host) -> None:
@@ -191,10 +191,10 @@ class Segment:
 
 
 class Lab:
-    """Hosts and segments, which end with the ``with`` block.
+    """Hosts and segments that end with the ``with`` block.
 
     Raises:
-        UnsupportedError: No hosts can be made here; see :func:`problem`.
+        UnsupportedError: No hosts can be created here; see :func:`problem`.
     """
 
     def __init__(self) -> None:
@@ -205,12 +205,12 @@ class Lab:
         self._count = 0
 
     def host(self, name: str, *, clock_ahead_s: float = 0.0, environment: Mapping[str, str] | None = None) -> Host:
-        """Make a host.
+        """Create a host.
 
         Args:
             name: Its host name.
             clock_ahead_s: How far its monotonic clock is ahead of all others, in whole seconds.
-            environment: Variables of all that runs there.
+            environment: Environment variables of its programs.
         """
         self._count += 1
         sockets = {"SKYLOOP_RUNTIME_DIR": str(self._folder / str(self._count))}
@@ -219,11 +219,11 @@ class Lab:
         return host
 
     def segment(self, subnet: str) -> Segment:
-        """Make a switch; ``subnet`` is such as ``10.77.1.0/24``."""
+        """Create a switch; ``subnet`` is such as ``10.77.1.0/24``."""
         return Segment(self.host("switch"), subnet)
 
     def enter(self, context: AbstractContextManager[_Entered]) -> _Entered:
-        """Enter a context that ends before the hosts that were made so far."""
+        """Enter a context that ends before the hosts created so far."""
         return self._stack.enter_context(context)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A bad link between two hosts, and what it reports."""
+"""A bad link between two hosts, and its reports."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from benchmarks.hosts.relay import Direction, relay
 from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 
 _ANSWERS_WITHIN_S: Final = 10.0
-_QUEUE: Final = 1000  #: packets that may wait for the relay, as on an ordinary interface
+_QUEUE: Final = 1000  #: packets queued for the relay, as on an ordinary interface
 _numbers = itertools.count()
 
 
 class Path:
-    """A point-to-point link whose packets pass a process that can do anything to them. Ends with the lab.
+    """A point-to-point link whose packets pass through an impairing process. Ends with the lab.
 
     The fate of the n-th packet each way is the same in each run with the same seed and rates.
 
@@ -26,7 +26,7 @@ class Path:
         first: One host.
         second: The other.
         seed: Decides the fate of each packet.
-        impairments: What goes wrong, both ways; by default nothing.
+        impairments: The effects on packets, both ways; by default none.
     """
 
     def __init__(self, lab: Lab, first: Host, second: Host, *, seed: int, impairments: Impairments | None = None):
@@ -40,7 +40,7 @@ class Path:
         self._worker.answer(STARTS_WITHIN_S)
         self.first, self.second = f"10.78.{number}.1", f"10.78.{number}.2"  #: the hosts' addresses on this path
         for host, here, there in ((first, self.first, self.second), (second, self.second, self.first)):
-            # Else the kernel's own packets, to find routers, took their turns too.
+            # Otherwise the kernel's own packets, which search routers, would take part in the draws.
             host.run("sh", "-c", f"echo 1 > /proc/sys/net/ipv6/conf/{name}/disable_ipv6")
             host.ip(
                 f"link set {name} txqueuelen {_QUEUE} up",
@@ -48,7 +48,7 @@ class Path:
             )
 
     def set(self, impairments: Impairments, back: Impairments | None = None) -> None:
-        """Set what happens to packets that are sent from now on.
+        """Set the effects on packets sent from now on.
 
         Args:
             impairments: To the second host.
@@ -58,12 +58,12 @@ class Path:
         self._tell_relay(self.impairments)
 
     def cut(self) -> None:
-        """Let nothing pass from now on, without telling the hosts."""
+        """Block everything from now on, without telling the hosts."""
         there, back = self.impairments
         self._tell_relay((replace(there, loss=1.0), replace(back, loss=1.0)))
 
     def restore(self) -> None:
-        """Let pass what passed before the cut."""
+        """Restore the state before the cut."""
         self._tell_relay(self.impairments)
 
     def _tell_relay(self, impairments: tuple[Impairments, Impairments]) -> None:
@@ -71,12 +71,12 @@ class Path:
         self._worker.answer(_ANSWERS_WITHIN_S)
 
     def tell(self) -> tuple[Direction, Direction]:
-        """Return what passed from the first host to the second, and back, since the last call."""
+        """Return the traffic from the first host to the second, and back, since the last call."""
         self._worker.pipe.send("tell")
         there, back = self._worker.answer(_ANSWERS_WITHIN_S)
         return there, back
 
     @property
     def pid(self) -> int:
-        """The process in between, whose processor time may be of interest."""
+        """The process in between, for measuring its processor time."""
         return self._worker.pid

@@ -1,4 +1,4 @@
-"""The process of a path: moves packets between the TUN devices of two hosts, late, in another order, or not at all."""
+"""The process of a path: moves packets between the TUN devices of two hosts, delayed, reordered, or dropped."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ _IFF_TUN: Final = 0x0001
 _IFF_NO_PI: Final = 0x1000
 _CLONE_NEWNET: Final = 0x40000000
 _LARGEST: Final = 65536
-_AT_ONCE: Final = 32  # packets of one direction before the other is looked at
-_NICE: Final = -10  # the delay that is asked for should not grow by that of a busy processor
+_AT_ONCE: Final = 32  # packets of one direction before the other gets a turn
+_NICE: Final = -10  # a busy processor should not add to the requested delay
 
 
 class Direction(NamedTuple):
-    """What passed one way since the last report."""
+    """The traffic of one direction since the last report."""
 
     packets: int  #: that arrived
     size: int  #: bytes of those
     lost: int  #: on purpose
-    late_ns: list[int]  #: by how much each came later than it should have, by this process's own doing
+    late_ns: list[int]  #: excess delay of each, added by this process
 
 
 def device(pid: int, name: str) -> int:
-    """Make a TUN device in the network namespace of a process; return its descriptor, which does not block."""
+    """Create a TUN device in the network namespace of a process; return its non-blocking descriptor."""
     libc = ctypes.CDLL(None, use_errno=True)
     with Path(f"/proc/{pid}/ns/net").open() as namespace:
         if libc.setns(namespace.fileno(), _CLONE_NEWNET) != 0:
@@ -50,22 +50,22 @@ def relay(
     ends: tuple[tuple[int, str], tuple[int, str]],
     impairments: tuple[Impairments, Impairments],
 ) -> None:
-    """Relay packets until ``None`` comes through the pipe.
+    """Relay packets until ``None`` arrives through the pipe.
 
-    Two :class:`Impairments` there, one each way, hold from then on, and are answered by ``"set"``; ``"tell"`` is
+    Two :class:`Impairments` there, one each way, apply from then on, and are answered by ``"set"``; ``"tell"`` is
     answered by two :class:`Direction`.
 
     Args:
         pipe: To the measuring process.
         seed: Decides the fate of each packet.
-        ends: A process of each host, and the name of the device that the host gets.
+        ends: A process of each host, and the name of the host's device.
         impairments: At first, each way.
     """
     descriptors = [device(*end) for end in ends]
     ways = [_Wire(descriptors[0], descriptors[1], f"{seed}/0", impairments[0])]
     ways.append(_Wire(descriptors[1], descriptors[0], f"{seed}/1", impairments[1]))
     os.nice(_NICE)
-    gc.disable()  # nothing here makes cycles
+    gc.disable()  # nothing here creates cycles
     pipe.send("ready")
     control = pipe.fileno()
     while True:
@@ -100,7 +100,7 @@ class _Wire:
         self._late_ns: list[int] = []
 
     def take(self) -> None:
-        """What came in."""
+        """Take incoming packets."""
         for _ in range(_AT_ONCE):
             try:
                 packet = os.read(self.source, _LARGEST)
@@ -109,18 +109,18 @@ class _Wire:
             self.way.put(packet, time.monotonic_ns())
 
     def give(self) -> None:
-        """What is due goes out."""
+        """Deliver packets that are due."""
         while (found := self.way.get(now_ns := time.monotonic_ns())) is not None:
             due_ns, packet = found
             try:
                 os.write(self._sink, packet)
-            except OSError:  # that device is down: the packet is lost as on any other path
+            except OSError:  # the device is down: the packet is lost as on any path
                 continue
             self._size += len(packet)
             self._late_ns.append(now_ns - due_ns)
 
     def tell(self) -> Direction:
-        """What passed, and from then on the next."""
+        """Return the traffic since the last report."""
         told = Direction(len(self._late_ns), self._size, self.way.lost, self._late_ns)
         self._size, self.way.lost, self._late_ns = 0, 0, []
         return told

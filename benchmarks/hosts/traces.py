@@ -1,4 +1,4 @@
-"""What a mobile network carried, moment by moment: recorded, or made up from a seed."""
+"""The capacity of a mobile network over time: recorded, or synthesised from a seed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Final
 from skyloop.errors import FileFormatError, UsageError
 
 OPPORTUNITY: Final = 1500  #: bytes that may leave at each time of a trace
-QUEUE: Final = 300_000  #: bytes that wait in a modem before it drops what comes
+QUEUE: Final = 300_000  #: bytes queued in a modem before it drops more
 SYNTHETIC: Final = "synthetic"
 RECORDED: Final = ("ATT-LTE-driving-2016", "TMobile-LTE-short", "Verizon-LTE-short")
 _MS: Final = 1_000_000
@@ -31,7 +31,7 @@ class Trace:
     """
 
     name: str
-    at_ms: tuple[int, ...]  #: in each of them, :data:`OPPORTUNITY` bytes; those that nobody uses are lost
+    at_ms: tuple[int, ...]  #: at each, :data:`OPPORTUNITY` bytes may leave; unused ones are lost
     queue: int = QUEUE  #: bytes
     begin_ns: int = 0  #: when it begins, on the monotonic clock
 
@@ -43,11 +43,11 @@ class Trace:
 
     @property
     def length_ms(self) -> int:
-        """How long it is until it is repeated."""
+        """The time until it repeats."""
         return self.at_ms[-1]
 
     def due_ns(self, index: int) -> int:
-        """Return when an opportunity comes; the index goes on after the end."""
+        """Return the time of an opportunity; indices continue after the end."""
         turn, index = divmod(index, len(self.at_ms))
         return self.begin_ns + (turn * self.length_ms + self.at_ms[index]) * _MS
 
@@ -59,31 +59,31 @@ class Trace:
         return turn * len(self.at_ms) + bisect_left(self.at_ms, ms)
 
     def kbit(self, from_ms: float, to_ms: float) -> float:
-        """Return how much it carries in a part of its length, without its end [kbit]."""
+        """Return the capacity in a part of its length, excluding the end [kbit]."""
         return (bisect_left(self.at_ms, to_ms) - bisect_left(self.at_ms, from_ms)) * OPPORTUNITY * 8e-3
 
     def waits_ms(self, ms: float) -> float:
-        """Return for how long nothing could leave, at a moment within its length."""
+        """Return how long nothing could leave, at a moment within its length."""
         index = bisect_right(self.at_ms, ms)
         return ms - (self.at_ms[index - 1] if index else 0)
 
 
 class Modem:
-    """The queue before a path of which each moment carries so much: first in, first out, full or not.
+    """The queue before a path with a varying capacity: first in, first out, bounded.
 
     Args:
-        trace: What it carries.
+        trace: The capacity.
     """
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
-        self._next = 0  # the opportunity that is used next …
-        self._room = OPPORTUNITY  # … and what is left of it
-        self._waiting: deque[tuple[int, int]] = deque()  # when each leaves, and its bytes
+        self._next = 0  # the next opportunity …
+        self._room = OPPORTUNITY  # … and its remaining bytes
+        self._waiting: deque[tuple[int, int]] = deque()  # departure times and bytes
         self._bytes = 0
 
     def leaves_ns(self, size: int, now_ns: int) -> int | None:
-        """Return when a packet that comes now leaves; None if the queue is full, and it is dropped."""
+        """Return when a packet that arrives now leaves; None if the queue is full and drops it."""
         while self._waiting and self._waiting[0][0] <= now_ns:
             self._bytes -= self._waiting.popleft()[1]
         if self._bytes + size > self.trace.queue:
@@ -103,10 +103,10 @@ class Modem:
 
 
 def recorded(name: str) -> Trace | None:
-    """Return a recorded uplink; None where it is not there: beside the checkout or in ``SKYLOOP_FIXTURES``.
+    """Return a recorded uplink; None if missing: beside the checkout or in ``SKYLOOP_FIXTURES``.
 
     Raises:
-        FileFormatError: It is no trace.
+        FileFormatError: It is not a trace.
     """
     file = _FIXTURES / "mobile-network" / f"{name}.up.120s"
     if not file.is_file():
@@ -115,11 +115,11 @@ def recorded(name: str) -> Trace | None:
         times = tuple(int(line) for line in file.read_text().split()[:_MAX_LINES])
         return Trace(name, times)
     except (ValueError, UsageError) as error:
-        raise FileFormatError(f"{file} is no trace, a time in ms in each line: {error}") from None
+        raise FileFormatError(f"{file} is not a trace with a time in ms on each line: {error}") from None
 
 
 def synthetic(seed: int = 1, length_s: int = 120, kbit_s: float = 2200.0) -> Trace:
-    """Make up a trace like that of a phone in a car: its rate wanders, and sometimes nothing passes.
+    """Synthesise a trace like that of a phone in a car: its rate wanders, and sometimes nothing passes.
 
     The logarithm of the rate follows an autoregressive process of one second (a standard deviation of 0.7), and once in
     12 s on average nothing passes for 0.6 to 4 s, short times more often. Of the three recorded ones that is the
@@ -127,7 +127,7 @@ def synthetic(seed: int = 1, length_s: int = 120, kbit_s: float = 2200.0) -> Tra
     minutes in which nothing passes.
 
     Args:
-        seed: Decides it all.
+        seed: Decides everything.
         length_s: Its length [s].
         kbit_s: About the average while something passes.
     """
@@ -149,7 +149,7 @@ def synthetic(seed: int = 1, length_s: int = 120, kbit_s: float = 2200.0) -> Tra
 
 
 def find(names: tuple[str, ...] = ()) -> list[Trace]:
-    """Return the traces of these names; without any, all that were recorded, or the synthetic one if none is there.
+    """Return the traces of these names; without any, all recorded ones, or the synthetic one if there are none.
 
     Raises:
         UsageError: There is no such trace.

@@ -1,4 +1,4 @@
-"""What the benchmarks' command lines share: options, progress, and how results are shown and kept."""
+"""Options, progress and output shared by the benchmarks' command lines."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from skyloop.files import write as write_file
 
 LEAST_S: Final = 0.5
 
-#: Told the share that is done, 0 to 1, and what comes next.
+#: Called with the share done, 0 to 1, and the next step.
 Report = Callable[..., None]
 Seconds = Annotated[
-    float | None, typer.Option(min=LEAST_S, help="How long to measure each contender, case or size [default: 30]")
+    float | None, typer.Option(min=LEAST_S, help="Duration for each contender, case or size [default: 30]")
 ]
 Minutes = Annotated[float | None, typer.Option(min=0.01, help="The same in minutes; the paper's were 5")]
-Sizes = Annotated[str | None, typer.Option(help="Of the frames, such as 320x240,640x480 [default: 320x240]")]
-Output = Annotated[Path | None, typer.Option(help="A folder for the figures as JSON and, of some, the diagrams")]
+Sizes = Annotated[str | None, typer.Option(help="Frame sizes, such as 320x240,640x480 [default: 320x240]")]
+Output = Annotated[Path | None, typer.Option(help="Folder for the figures as JSON and, for some, the diagrams")]
 
 
 def duration_s(seconds: float | None, minutes: float | None) -> float:
-    """Return how long to measure [s].
+    """Return the duration of a measurement [s].
 
     Raises:
         UsageError: Both options are given.
@@ -52,14 +52,14 @@ def parse_sizes(text: str | None) -> list[Size]:
     """Parse sizes of frames such as ``320x240,640x480``.
 
     Raises:
-        UsageError: The text is anything else.
+        UsageError: The text is not a list of sizes.
     """
     return [Size(width, height) for width, height in bench.parse_sizes(text)]
 
 
 @contextmanager
 def measuring(what: str, output: Path | None) -> Iterator[Report]:
-    """Make the folder for the results, and show the progress on a terminal."""
+    """Create the folder for the results, and show the progress on a terminal."""
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
     with Progress(transient=True, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
@@ -78,7 +78,7 @@ def finish(
     output: Path | None,
     draw: Callable[[Any, Path], list[Path]] | None = None,
 ) -> None:
-    """Print the tables, and write the results as JSON and their diagrams into the folder if there is one.
+    """Print the tables, and write the results as JSON, with diagrams, to the folder if there is one.
 
     Raises:
         MissingExtraError: matplotlib is not installed; the JSON is written all the same.
@@ -106,7 +106,7 @@ def measure_delays(
 
 
 def print_skipped(skipped: Mapping[str, str]) -> None:
-    """Write to standard error what could not be measured, and why."""
+    """Print what could not be measured, and why, to standard error."""
     for name, why in skipped.items():
         typer.echo(f"without {name}: {why}", err=True)
 

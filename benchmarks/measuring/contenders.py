@@ -1,4 +1,4 @@
-"""The contenders that are measured in the same run, by one contract (:mod:`benchmarks.measuring.contract`)."""
+"""The contenders measured in the same run, by one contract (:mod:`benchmarks.measuring.contract`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """Something that is measured: a module with its two ends, and the interpreter that it runs under."""
+    """A contender: a module with its two ends, and the interpreter that runs it."""
 
     name: str
     title: str

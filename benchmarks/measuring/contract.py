@@ -1,10 +1,10 @@
-"""The contract by which every contender is measured: two processes with one end each, and stamps on one clock.
+"""The contract for measuring every contender: two processes with one end each, and stamps on one clock.
 
 A contender is a module with two classes, ``Vehicle(address, received)``, ``Application(address, received)``. The
-sender's stamp is taken when the data are there and before the contender is called; ``received(channel, sent_ns)``
-is called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
+sender's stamp is taken when the data are ready and before the contender is called; ``received(channel, sent_ns)`` is
+called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
 
-Interpreters that have no more than NumPy and the contender import this, so nothing else is imported here.
+Interpreters with only NumPy and the contender import this module, so it imports nothing else.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from benchmarks.measuring.waypoints import Setpoint, fly
 from benchmarks.measuring.workers import Pipe
 
 Image = NDArray[np.uint8]
-#: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].
+#: Called for each sample that its receiver has: its channel, and its time of sending [ns, monotonic].
 Received = Callable[[str, int], None]
-#: By channel: when each sample was sent, and when it was received [ns].
+#: By channel: the times of sending and receiving each sample [ns].
 Arrivals = dict[str, list[tuple[int, int]]]
 
 
@@ -45,19 +45,19 @@ class ApplicationEnd(Protocol):
 
 
 class Recorder:
-    """Keeps what was received."""
+    """Keeps the arrivals."""
 
     def __init__(self) -> None:
         self.arrivals: Arrivals = {}
 
     def received(self, channel: str, sent_ns: int) -> None:
-        """Note that a sample of a channel was received now. Any thread."""
+        """Record that a sample of a channel arrived now. Any thread."""
         now_ns = time.monotonic_ns()
         self.arrivals.setdefault(channel, []).append((sent_ns, now_ns))
 
 
 def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
-    """Run the vehicle's process, one turn after the other."""
+    """Run the vehicle's process, turn by turn."""
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
@@ -74,7 +74,7 @@ def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
 
 
 def application_side(pipe: Pipe, module: str, address: str) -> None:
-    """Run the application's process, one turn after the other."""
+    """Run the application's process, turn by turn."""
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
@@ -95,8 +95,8 @@ def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
 
     Args:
         end: Sends them.
-        turn: What is sent when.
-        begin_ns: When counting begins, on the monotonic clock.
+        turn: The schedule.
+        begin_ns: Start of counting, on the monotonic clock.
     """
 
     def publish_feedback() -> None:

@@ -37,10 +37,10 @@ class Cell(msgspec.Struct, frozen=True):
 
 
 class Series(msgspec.Struct, frozen=True):
-    """Skyloop's delays one by one, with frames of the first size; what the figures are drawn from."""
+    """Skyloop's individual delays, with frames of the first size; the data of the figures."""
 
     channel: str
-    at_s: list[float]  #: since the beginning, the turns of others left out
+    at_s: list[float]  #: since the beginning, without the turns of others
     delay_us: list[float]
 
 
@@ -52,12 +52,12 @@ class Delays(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
     sizes: list[str]
     contenders: dict[str, str]  #: names and titles
     versions: dict[str, str]  #: of the other libraries
-    skipped: dict[str, str]  #: other libraries that could not be measured, and why
+    skipped: dict[str, str]  #: other libraries that could not be measured, with reasons
     cells: list[Cell]
     series: list[Series]
 
     def summary(self, contender: str, size: str, channel: str) -> Summary | None:
-        """Return the figures of one channel of one contender; None if that was not measured."""
+        """Return the figures of one channel of one contender; None if not measured."""
         for cell in self.cells:
             if (cell.contender, cell.size, cell.channel) == (contender, size, channel):
                 return cell.summary
@@ -74,11 +74,11 @@ def measure(
     """Measure Skyloop, the floor and other contenders in turns.
 
     Args:
-        seconds: How long each is measured with each size of frames [s].
-        sizes: Of the frames.
+        seconds: Duration for each with each size of frames [s].
+        sizes: Sizes of the frames.
         peers: Further contenders.
-        skipped: Contenders that can't be measured, and why, for the results.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        skipped: Contenders that can't be measured, with reasons, for the results.
+        progress: Called with the share done, 0 to 1, and the next step.
 
     Raises:
         LinkError: A contender's processes do not find each other, or nothing arrives.
@@ -106,7 +106,7 @@ def measure(
 
 
 def turns_of(seconds: float, sizes: Sequence[Size]) -> list[Turn]:
-    """Return turns of about five seconds, the sizes one after the other."""
+    """Return turns of about five seconds, cycling through the sizes."""
     rounds = max(1, round(seconds / TURN_S))
     return [Turn(number, seconds / rounds, size) for number in range(rounds) for size in sizes]
 
@@ -139,6 +139,6 @@ def load(path: Path) -> Delays:
     """Read ``delays.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Delays, "the results of benchmarks.peers", MAX_RESULTS)

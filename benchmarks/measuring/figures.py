@@ -1,4 +1,4 @@
-"""The paper's figures 3, 4 and 5 from our figures, as PNG and SVG. Needs matplotlib, which is imported when used."""
+"""The paper's figures 3, 4 and 5 from our results, as PNG and SVG. Needs matplotlib, imported when used."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _OTHERS: Final = {
 }
 _PAPER: Final = "#b8463d"
 _BINS: Final = 60
-_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; how many lie beyond is stated
+_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; the number beyond is stated
 _SETTINGS: Final[Any] = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -63,11 +63,11 @@ def paper_figures(results: Delays) -> dict[str, Figure]:
 
 
 def save(make: Callable[[], dict[str, Figure]], folder: Path, endings: Sequence[str] = ("png", "svg")) -> list[Path]:
-    """Make figures in the pages' style and write them by their names.
+    """Create figures in the pages' style and write them by their names.
 
     Args:
         make: Makes the figures, by their names.
-        folder: Where they are written.
+        folder: The folder for the files.
         endings: A file of each kind is written for each figure.
 
     Returns:
@@ -104,7 +104,7 @@ def check_installed() -> None:
 
 
 def distribution(series: Series, title: str) -> Figure:
-    """Draw how often which delay occurred, as the paper's figures 3 and 4."""
+    """Draw the distribution of delays, as in the paper's figures 3 and 4."""
     figure, axes = new_figure(7.2, 3.2)
     delays_us = np.asarray(series.delay_us)
     shown = delays_us[delays_us <= np.percentile(delays_us, _SHOWN)]
@@ -129,7 +129,7 @@ def distribution(series: Series, title: str) -> Figure:
 
 
 def evolution(results: Delays) -> Figure:
-    """Draw all three channels over the time of the run, as the paper's figure 5."""
+    """Draw all three channels over the time of the run, as in the paper's figure 5."""
     figure, axes = new_figure(7.2, 3.6)
     for series in results.series:
         axes.plot(

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.loop``: from the capture of a frame until the command that it caused is applied, by stage."""
+"""``python -m benchmarks.loop``: from a frame's capture until the resulting command is applied, by stage."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TURN_S: Final = 5.0
 _AHEAD_NS: Final = 50_000_000
 _LATE_S: Final = 20.0
 
-#: The stages by the moment in which each ends.
+#: The stages by the moment at which each ends.
 STAGES: Final = {
     "published": "the driver has the image → the proxy has stamped it",
     "delivered": "→ the application's receiving thread has the frame",
@@ -41,7 +41,7 @@ Progress = Callable[[float, str], None]
 
 
 class Trip(NamedTuple):
-    """When a frame, and then its command, reached each stage [ns]."""
+    """The times at which a frame, and then its command, reached each stage [ns]."""
 
     captured: int
     published: int
@@ -51,7 +51,7 @@ class Trip(NamedTuple):
     applied: int
 
     def stages_ns(self) -> dict[str, int]:
-        """Return how long each stage took, and all together [ns]."""
+        """Return the duration of each stage, and of all together [ns]."""
         stages = {name: self[number + 1] - self[number] for number, name in enumerate(STAGES)}
         return stages | {TOTAL: self.applied - self.captured}
 
@@ -76,9 +76,9 @@ def measure(seconds: float, sizes: Sequence[Size], progress: Progress = lambda _
     """Measure the loop with each size of frames, in turns.
 
     Args:
-        seconds: How long each size is measured [s].
-        sizes: Of the frames.
-        progress: Called with the share that is done, 0 to 1, and what comes next.
+        seconds: Duration for each size [s].
+        sizes: Sizes of the frames.
+        progress: Called with the share done, 0 to 1, and the next step.
 
     Raises:
         LinkError: Not one command was applied.
@@ -121,7 +121,7 @@ def _size_result(size: Size, trips: Sequence[Trip], sent: int) -> SizeResult:
 
 
 class Answering(Controller):
-    """Answers each frame with a command at once, so that only Skyloop's own share of the loop is left.
+    """Answers each frame with a command at once, which leaves only Skyloop's own share of the loop.
 
     Args:
         drone: The drone.
@@ -134,7 +134,7 @@ class Answering(Controller):
         self.called: dict[int, tuple[int, int, int]] = {}  # by capture: published, delivered, called [ns]
 
     def on_frame(self, frame: Frame) -> None:
-        """Note when it was called, and send a command that carries the frame's stamp."""
+        """Record the time of the call, and send a command that carries the frame's stamp."""
         now_ns = time.monotonic_ns()
         self.called[frame.captured_ns] = (frame.published_ns, frame.received_ns, now_ns)
         self.drone.velocity(forward=0.1, up=stamped(frame.captured_ns))
@@ -149,7 +149,7 @@ def control(pipe: Pipe, proxy: str) -> None:
     """
     pipe.send("ready")
     while (turn := pipe.recv()) is not None:
-        echoes: dict[int, tuple[int, int]] = {}  # by capture: sent, applied [ns]; repeats come later and change nothing
+        echoes: dict[int, tuple[int, int]] = {}  # by capture: sent, applied [ns]; later repeats change nothing
 
         def applied(echo: Applied, echoes: dict[int, tuple[int, int]] = echoes) -> None:
             if type(echo.asked) is Velocity:
@@ -173,6 +173,6 @@ def load(path: Path) -> Loop:
     """Read ``loop.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Loop, "the results of benchmarks.loop", MAX_RESULTS)

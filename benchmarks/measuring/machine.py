@@ -1,4 +1,4 @@
-"""What a process takes of this machine."""
+"""A process's use of this machine."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from pathlib import Path
 
 
 def cpu_time_s(pid: int) -> float:
-    """Return the processor time that a process has used so far, all threads, user and system [s]; 0 if it is gone."""
+    """Return the processor time used so far by a process, all threads, user and system [s]; 0 if it has ended."""
     stat = _read(f"/proc/{pid}/stat")
     if not stat:
         return 0.0
-    fields = stat.rpartition(")")[2].split()  # the name before it may hold blanks
+    fields = stat.rpartition(")")[2].split()  # the name before it may contain blanks
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def memory_bytes(pid: int) -> int:
-    """Return the memory that a process shares with no other [bytes]; 0 if it is gone."""
+    """Return the unshared memory of a process [bytes]; 0 if it has ended."""
     found = re.findall(r"^Private_(?:Clean|Dirty):\s+(\d+) kB$", _read(f"/proc/{pid}/smaps_rollup"), re.MULTILINE)
     return 1024 * sum(map(int, found))
 

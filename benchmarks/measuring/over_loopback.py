@@ -18,7 +18,7 @@ _HOST = "127.0.0.1"
 
 
 class Vehicle(NearVehicle):
-    """The vehicle's end, which listens at a free port of loopback."""
+    """The vehicle's end, which listens on a free port of loopback."""
 
     def __init__(self, address: str, received: Received) -> None:
         name, place = proxy_name(address), f"{_HOST}:{free_port(_HOST)}"

@@ -21,8 +21,8 @@ class Pair:
     Args:
         workers: Starts the processes, and ends them.
         module: Holds the contender's ends; see :mod:`benchmarks.measuring.contract`.
-        address: A folder of its own for its sockets.
-        python: The interpreter that it runs under.
+        address: A separate folder for its sockets.
+        python: The interpreter that runs it.
         application_module: Holds the application's end, if that is another module.
         prefixes: Put before the interpreter, for the vehicle's side and the application's.
     """
@@ -52,14 +52,14 @@ class Pair:
             worker.answer(STARTS_WITHIN_S)
 
     def begin(self) -> int:
-        """Let the samples flow; return when counting begins [ns]."""
+        """Start the samples; return the start of counting [ns]."""
         begin_ns = time.monotonic_ns() + round(WARM_UP_S * 1e9) + _AHEAD_NS
         for worker in (self.vehicle, self.application):
             worker.pipe.send(begin_ns)
         return begin_ns
 
     def arrivals(self, turn: Turn, begin_ns: int) -> Arrivals:
-        """Wait for the turn's end, and return what was sent in it and arrived."""
+        """Wait for the turn's end, and return its samples that arrived."""
         found: Arrivals = {channel: [] for channel in CHANNELS}
         for worker in (self.application, self.vehicle):
             found |= worker.answer(turn.seconds + WARM_UP_S + SETTLE_S + _LATE_S)
@@ -72,5 +72,5 @@ class Pair:
 
 
 def since(arrivals: Arrivals, begin_ns: int) -> Arrivals:
-    """Return the arrivals without those that were sent before."""
+    """Return the arrivals without earlier ones."""
     return {channel: [pair for pair in pairs if pair[0] >= begin_ns] for channel, pairs in arrivals.items()}

@@ -1,4 +1,4 @@
-"""What is sent when: the channels, their periods, and absolute deadlines. Needs the standard library alone."""
+"""The schedule: channels, periods, and absolute deadlines. Needs only the standard library."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PACKET_PERIOD_S: Final = 0.03125
 FRAME_PERIOD_S: Final = 0.0667
 WARM_UP_S: Final = 0.4  #: at the start of a turn, not counted: threads, slots and discovery of a new connection
 SETTLE_S: Final = 0.3  #: for the last samples of a turn to arrive
-_GOLDEN: Final = 0.618034  # multiples of it, less whole numbers, are spread evenly however many there are
+_GOLDEN: Final = 0.618034  # fractional parts of its multiples are spread evenly for any number of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ SIZES: Final = (SMALL, MIDDLE, LARGE)
 class Turn:
     """All three channels at once for ``seconds``, after the warm-up.
 
-    ``number`` shifts the channels against each other, so that over some turns they meet in every way.
+    ``number`` shifts the channels against each other, so that they coincide in every way over several turns.
     """
 
     number: int
@@ -59,11 +59,11 @@ class Turn:
         return self.frame_period_s if channel == VIDEO else PACKET_PERIOD_S
 
     def count(self, channel: str) -> int:
-        """Return how many samples of a channel are sent after the warm-up."""
+        """Return the number of samples of a channel sent after the warm-up."""
         return max(1, int(self.seconds / self.period_s(channel)))
 
     def deadlines_ns(self, channel: str, begin_ns: int) -> Iterator[int]:
-        """Yield when to send the samples of a channel, from the warm-up on [ns].
+        """Yield the sending times of a channel's samples, from the warm-up on [ns].
 
         Args:
             channel: The channel.
@@ -80,12 +80,12 @@ def paced(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[None]:
-    """Yield at each deadline; a late one does not shift those after it.
+    """Yield at each deadline; a late one does not shift the later ones.
 
     Args:
         deadlines_ns: On the clock.
         clock: Returns the time [ns].
-        sleep: Waits for some seconds.
+        sleep: Sleeps for a number of seconds.
     """
     for deadline_ns in deadlines_ns:
         wait_ns = deadline_ns - clock()

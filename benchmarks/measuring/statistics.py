@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-SMALL_SHARE = 0.01  #: of the period: the paper counts how many delays are below it
+SMALL_SHARE = 0.01  #: of the period: the paper counts the delays below it
 
 
 class Summary(msgspec.Struct, frozen=True):
-    """A distribution of delays of samples that were sent at a period."""
+    """A distribution of delays of samples sent periodically."""
 
     samples: int
     lost: int  #: sent and never received
@@ -35,11 +35,11 @@ def summarize(delays_ns: Sequence[float], *, sent: int, period_s: float) -> Summ
 
     Args:
         delays_ns: The delays of the samples that arrived [ns].
-        sent: How many samples were sent.
-        period_s: The channel's [s].
+        sent: Number of samples sent.
+        period_s: The channel's period [s].
 
     Raises:
-        ValueError: Not one arrived.
+        ValueError: None arrived.
     """
     values = _microseconds(delays_ns)
     median, p99, p999 = (float(value) for value in np.percentile(values, [50.0, 99.0, 99.9]))

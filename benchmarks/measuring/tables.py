@@ -23,13 +23,13 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[str]]
 
     def markdown(self) -> str:
-        """Return it as Markdown, without the title, which the page has in its own words."""
+        """Return the table as Markdown, without the title, which the page words differently."""
         lines = [self.columns, ["---"] * len(self.columns), *self.rows]
         return "\n".join("|---" * len(row) + "|" if row[0] == "---" else f"| {' | '.join(row)} |" for row in lines)
 
 
 def paper_table(results: Delays) -> Table:
-    """Return the paper's Table 1 with our figures and, where they are known, the paper's beside them."""
+    """Return the paper's Table 1 with our figures and, where known, the paper's beside them."""
     size = results.sizes[0]
     names, columns = [], []
     for channel in CHANNELS:

@@ -20,7 +20,7 @@ ZEROMQ_MEDIAN: Final = {(SMALL, COMMAND): 1.0}
 
 
 class Verdict(NamedTuple):
-    """One target, and the figure that was measured."""
+    """One target, and the measured figure."""
 
     what: str
     figure: float
@@ -34,7 +34,7 @@ class Verdict(NamedTuple):
 
 
 def judge_delays(results: Delays) -> list[Verdict]:
-    """Return the verdicts on the targets of which this run has both figures."""
+    """Return the verdicts on the targets for which this run has both figures."""
 
     def pair(size: Size, channel: str, other: str) -> tuple[Summary, Summary] | None:
         ours = results.summary(OURS.name, str(size), channel)

@@ -1,4 +1,4 @@
-"""The commands that are measured: those of an ideal point that is flown through waypoints."""
+"""The measured commands: those of an ideal point flown through waypoints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Setpoint(NamedTuple):
 
 
 def fly(period_s: float = PACKET_PERIOD_S) -> Iterator[Setpoint]:
-    """Yield a set-point each period, for ever, as a controller does that flies from waypoint to waypoint."""
+    """Yield a set-point each period, forever, like a controller that flies from waypoint to waypoint."""
     x = y = yaw = 0.0
     for target_x, target_y in cycle(WAYPOINTS_M):
         while (away := math.hypot(target_x - x, target_y - y)) > REACHED_M:

@@ -1,4 +1,4 @@
-"""Processes with a pipe each, if need be under another interpreter, which need not have Skyloop's dependencies."""
+"""Processes with a pipe each, optionally under another interpreter, which need not have Skyloop's dependencies."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from skyloop.errors import LinkError, NoAnswerError
 STARTS_WITHIN_S: Final = 30.0
 ENDS_WITHIN_S: Final = 5.0
 _WHAT_LENGTH: Final = 80
-#: Where ``benchmarks`` and ``skyloop`` are found.
+#: The folders of ``benchmarks`` and ``skyloop``.
 _PACKAGES: Final = f"{Path(__file__).parents[2]}{os.pathsep}{Path(skyloop.__file__).parents[1]}"
-# At the end of the path: another interpreter has its own packages, made for its own version, before ours.
+# At the end of the path: another interpreter's own packages, made for its version, come before ours.
 _BOOT: Final = (
     "import os, sys; sys.path += sys.argv[1].split(os.pathsep); "
     "from benchmarks.measuring.workers import child; child(sys.argv[2])"
@@ -57,13 +57,13 @@ class Worker:
         self.pipe.send((work.__module__, work.__qualname__, arguments))
 
     def answer(self, timeout_s: float) -> Any:
-        """Return what the process sends next.
+        """Return the next message of the process.
 
         Args:
-            timeout_s: How long to wait for it [s].
+            timeout_s: Longest wait for it [s].
 
         Raises:
-            NoAnswerError: Nothing came in time.
+            NoAnswerError: No message arrived in time.
             LinkError: The process has ended.
         """
         if not self.pipe.poll(timeout_s):
@@ -76,7 +76,7 @@ class Worker:
 
     def end(self) -> None:
         """Send ``None``, which ends the work."""
-        with contextlib.suppress(OSError):  # it ended already
+        with contextlib.suppress(OSError):  # it has already ended
             self.pipe.send(None)
 
     def wait(self) -> None:
@@ -102,9 +102,9 @@ class Workers:
 
         Args:
             work: A function of a module.
-            *arguments: Of the function.
+            *arguments: Arguments of the function.
             python: The interpreter.
-            prefix: Put before the interpreter, such as what makes it run on another host.
+            prefix: Put before the interpreter, for example to run it on another host.
         """
         worker = Worker([*prefix, python], work, arguments)
         self._running.append(worker)

@@ -1,1 +1,1 @@
-"""Pages of the documentation, filled from what was measured: ``python -m benchmarks.pages.NAME [FOLDER]``."""
+"""Fill pages of the documentation with measured figures: ``python -m benchmarks.pages.NAME [FOLDER]``."""

@@ -1,8 +1,8 @@
-"""Puts measured delays into ``docs/delays.md``: its tables and pictures are made from JSON and from nothing else.
+"""Put measured delays into ``docs/delays.md``: its tables and pictures come from JSON alone.
 
-``python -m benchmarks.pages.delays`` makes them anew from ``docs/measured``; with a folder it takes new results from
-what ``skyloop bench … --output FOLDER`` and ``python -m benchmarks.… --output FOLDER`` wrote: those of ``delays.json``,
-``load.json`` and ``loop.json`` that are there. Pictures are drawn anew unless the new results have no ``delays.json``.
+``python -m benchmarks.pages.delays`` makes them from ``docs/measured``; with a folder it first takes new results from
+the output of ``skyloop bench … --output FOLDER`` and ``python -m benchmarks.… --output FOLDER``: any of
+``delays.json``, ``load.json`` and ``loop.json``. Pictures are redrawn unless the new results have no ``delays.json``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from benchmarks.targets import judge_load
 DOCS = Path(__file__).parents[2] / "docs"
 MEASURED = DOCS / "measured"
 PAGE = DOCS / "delays.md"
-IDLE_LOAD = 0.5  # average number of processes that wanted a core
+IDLE_LOAD = 0.5  # load average
 FILES = ("delays.json", "load.json", "loop.json")
 
 
@@ -37,7 +37,7 @@ def main() -> None:
 
 
 def take(folder: Path) -> list[str]:
-    """Keep the results of a run beside the page; their names."""
+    """Store the results of a run beside the page; return their names."""
     found = [folder / name for name in FILES if (folder / name).exists()]
     if not found:
         sys.exit(f"{folder} holds none of {', '.join(FILES)}")
@@ -48,7 +48,7 @@ def take(folder: Path) -> list[str]:
 
 
 def blocks(folder: Path) -> dict[str, str]:
-    """What belongs into the marked places of the page."""
+    """Return the content of the page's marked places."""
     experiment = delays.load(folder / "delays.json")
     crowd = load.load(folder / "load.json")
     trips = loop.load(folder / "loop.json")
@@ -64,7 +64,7 @@ def blocks(folder: Path) -> dict[str, str]:
 
 
 def machine(results: delays.Delays) -> str:
-    """The machine in a sentence, how long was measured, and a warning if it was not alone."""
+    """Return a sentence on the machine and the duration, with a warning if the machine was shared."""
     where = results.machine
     packages = ", ".join(f"{name} {version}" for name, version in where.packages.items())
     text = f"{where} ({packages}); {results.seconds:g} s for each contender with each size."

@@ -1,4 +1,4 @@
-"""Puts tables into the marked places of a page. Pure."""
+"""Put tables into the marked places of a page. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skyloop.errors import UsageError
 
 
 def fill(page: str, blocks: Mapping[str, str], kind: str = "measured") -> str:
-    """The page with these texts between ``<!-- measured: NAME -->`` and ``<!-- end -->``; other places stay.
+    """Return the page with these texts between ``<!-- measured: NAME -->`` and ``<!-- end -->``; other places stay.
 
     ``kind`` stands before the name. Raises :class:`UsageError` for a text that the page has no place for.
     """

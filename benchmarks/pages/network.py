@@ -1,8 +1,8 @@
-"""Puts what was measured over the network into ``docs/network-loss.md`` and ``docs/scale.md``, from JSON alone.
+"""Put measurements over the network into ``docs/network-loss.md`` and ``docs/scale.md``, from JSON alone.
 
-``python -m benchmarks.pages.network`` makes their tables anew from ``docs/measured``; with a folder it takes new
-results from what ``python -m benchmarks.… --output FOLDER`` wrote: those of ``network.json``, ``scale.json`` and
-``swarm.json`` that are there.
+``python -m benchmarks.pages.network`` makes their tables from ``docs/measured``; with a folder it first takes new
+results from the output of ``python -m benchmarks.… --output FOLDER``: any of ``network.json``, ``scale.json`` and
+``swarm.json``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skyloop.bench import Machine
 DOCS = Path(__file__).parents[2] / "docs"
 MEASURED = DOCS / "measured"
 LOSS_PAGE, SCALE_PAGE = DOCS / "network-loss.md", DOCS / "scale.md"
-IDLE_LOAD = 0.5  # average number of processes that wanted a core
+IDLE_LOAD = 0.5  # load average
 SWARMS = ("swarm-1.json", "swarm-3.json")
 
 
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def take(folder: Path) -> None:
-    """Keep the results of a run beside the pages; a swarm's under the number of its users."""
+    """Store the results of a run beside the pages; a swarm's under the number of its users."""
     found = [folder / name for name in ("network.json", "scale.json", "swarm.json") if (folder / name).exists()]
     if not found:
         sys.exit(f"{folder} holds none of network.json, scale.json and swarm.json")
@@ -70,7 +70,7 @@ def scale_blocks(folder: Path) -> dict[str, str]:
 
 
 def machine(where: Machine, seconds: float) -> str:
-    """The machine in a sentence, how long was measured, and a warning if it was not alone."""
+    """Return a sentence on the machine and the duration, with a warning if the machine was shared."""
     text = f"{where}; {seconds:g} s for each case."
     if where.load is None or where.load > IDLE_LOAD:
         text += "\n\n**The machine had other work at the same time**: the medians are meaningful, the tails less so."

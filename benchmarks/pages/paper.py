@@ -1,7 +1,7 @@
-"""Puts a flight of ``python -m benchmarks.paper`` into ``docs/paper.md``: ``python -m benchmarks.pages.paper FOLDER``.
+"""Put a flight of ``python -m benchmarks.paper`` into ``docs/paper.md``: ``python -m benchmarks.pages.paper FOLDER``.
 
 The page's tables are made from ``docs/measured/paper.json``: the flight's ``results.json`` without its single samples.
-Its pictures are those of the flight. Without a folder the tables are made anew.
+Its pictures are those of the flight. Without a folder only the tables are made again.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main() -> None:
 
 
 def take(folder: Path) -> None:
-    """Keep the figures and the pictures of a flight."""
+    """Store the figures and the pictures of a flight."""
     found = load(folder / "results.json")
     delays = msgspec.structs.replace(found.delays, series=[])
     found = msgspec.structs.replace(found, delays=delays, way=Way([], [], [], [], []))
@@ -40,7 +40,7 @@ def take(folder: Path) -> None:
 
 
 def blocks(results: Experiment) -> dict[str, str]:
-    """What belongs into the marked places of the page."""
+    """Return the content of the page's marked places."""
     return {
         "machine": machine(results),
         "delays": report.delay_table(results).markdown(),
@@ -50,7 +50,7 @@ def blocks(results: Experiment) -> dict[str, str]:
 
 
 def machine(results: Experiment) -> str:
-    """Where, how long and beside how much else it was flown, in a sentence."""
+    """Return a sentence on the machine, the duration and the load of the flight."""
     waypoints = 0 if results.tracking is None else results.tracking.waypoints
     text = f"{results.delays.machine}; {results.seconds:.0f} s, {waypoints} waypoints, seed 0."
     if results.load is not None and results.load > results.delays.machine.cores:

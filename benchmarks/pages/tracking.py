@@ -1,7 +1,7 @@
-"""Puts measured trackers into ``docs/tracking.md``: its tables and its picture are made from JSON and nothing else.
+"""Put measured trackers into ``docs/tracking.md``: its tables and its picture come from JSON alone.
 
-``python -m benchmarks.pages.tracking`` makes them anew from ``docs/measured``; with a folder it takes new results from
-what ``python -m benchmarks.tracking --output FOLDER`` wrote.
+``python -m benchmarks.pages.tracking`` makes them from ``docs/measured``; with a folder it first takes new results from
+the output of ``python -m benchmarks.tracking --output FOLDER``.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main() -> None:
 
 
 def blocks(results: TrackingResults) -> dict[str, str]:
-    """Return what belongs into the marked places of the page."""
+    """Return the content of the page's marked places."""
     return {
         "machine": f"{results.machine}.",
         "trackers": table(results).markdown(),

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 RECORDING: Final = "flight.mcap"
 LEAST_MINUTES: Final = 0.05
 CAMERA: Final = "front"
-#: The paper's rates: telemetry each 31.25 ms, and 15 frames of 320×240 a second.
+#: The paper's rates: telemetry every 31.25 ms, and 15 frames of 320×240 a second.
 VEHICLE: Final = {
     "vehicle": "ardrone",
     "cameras": CAMERA,
@@ -43,18 +43,18 @@ VEHICLE: Final = {
     "position": 1,
     "truth": 1,
 }
-_PRINT_EVERY_S = 30.0  # where there is no terminal
+_PRINT_EVERY_S = 30.0  # without a terminal
 
 
 def paper(
     minutes: Annotated[
-        float, typer.Option(min=LEAST_MINUTES, metavar="MIN", help="How long to fly; the paper's were 5")
+        float, typer.Option(min=LEAST_MINUTES, metavar="MIN", help="Duration of the flight; the paper's were 5")
     ] = 5.0,
     output: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="A folder for all that it makes", show_default="paper-DATE-TIME")
+        Path | None, typer.Option(metavar="DIR", help="Folder for all output", show_default="paper-DATE-TIME")
     ] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="No page to watch and to fly from")] = False,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Decides noise and wind")] = 0,
+    headless: Annotated[bool, typer.Option("--headless", help="No page to watch and fly")] = False,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of noise and wind")] = 0,
     port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
 ) -> None:
@@ -63,7 +63,7 @@ def paper(
     It flies through waypoints by motion capture. The recording gives the paper's Table 1 and figures 3 to 5, with the
     tracking error. The page flies too: take control there, and release it.
 
-    Ctrl-C lands, and the figures are of what was flown until then.
+    Ctrl-C lands, and the figures then cover the flight up to that point.
     """
     from skyloop.bench import Machine
 
@@ -80,7 +80,7 @@ def paper(
 
 
 def _prepared(output: Path | None) -> Path:
-    """Make the folder; check before anything flies what would otherwise fail only afterwards."""
+    """Create the folder; check before the flight whatever would otherwise fail after it."""
     from benchmarks.measuring.figures import check_installed as check_figures
     from skyloop.recording.recorder import check_installed as check_recording
 
@@ -88,7 +88,7 @@ def _prepared(output: Path | None) -> Path:
     check_recording()
     folder = output or Path(time.strftime("paper-%Y%m%d-%H%M%S"))
     if (folder / RECORDING).exists():
-        raise UsageError(f"{folder} holds a recording already: give another --output")
+        raise UsageError(f"{folder} already holds a recording: give another --output")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -125,13 +125,13 @@ class _Flight:
     console: Console
     seconds: float
     recording: Path
-    load: float | None = None  #: average number of processes that wanted a core, of the minute before the flight's end
+    load: float | None = None  #: load average of the flight's last minute
     _stopped: bool = False
     _on_stop: Callable[[], None] | None = None
     _printed_s: float = field(default_factory=time.monotonic)
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> None:
-        """``port`` None: the default one of pages. Raises the errors of connecting, of recording and of take-off."""
+        """Fly it; ``port`` None: the default port of pages. Raises the errors of connecting, recording and take-off."""
         from benchmarks.paper.flight import DelayLog, PaperFlight
         from skyloop.motion_capture import mocap
         from skyloop.recording import record
@@ -155,7 +155,7 @@ class _Flight:
             land(drone, self.console)
 
     def _follow(self, drone: Drone, flight: PaperFlight) -> None:
-        """Until the time is over, whichever application flies; one that landed it must release it to start again."""
+        """Fly until the time is over, whoever else flies; a pilot that landed it must release it to restart it."""
         began_s = time.monotonic()
         self.console.print(f"flying through waypoints for {self.seconds:g} s, or until Ctrl-C")
         with Progress(
@@ -189,14 +189,14 @@ class _Flight:
             self.console.print(words)
 
     def _stop(self) -> None:
-        """First Ctrl-C: end the flight in good order."""
+        """End the flight in good order on the first Ctrl-C."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
 
 
 def _put_down(drone: Drone) -> bool:
-    """It is ours to fly, and somebody has landed it."""
+    """Return whether it is ours to fly, and was landed by another application."""
     return drone.authority.state == "held" and not drone.feedback().state.airborne
 
 

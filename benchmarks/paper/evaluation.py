@@ -33,18 +33,18 @@ _CHANNELS: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.EVENTS, Channel.
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """How well the path was flown, by the truth [m], without the time in which somebody else flew."""
+    """The accuracy along the path, by the truth [m], without the time in which others flew."""
 
     samples: int
-    rms_m: float  #: of the distance from where it should have been at that time
+    rms_m: float  #: of the distance from the planned place at that time
     largest_m: float
-    across_rms_m: float  #: of the distance to the nearest point of the round, wherever on it it should have been
+    across_rms_m: float  #: of the distance to the nearest point of the round
     across_largest_m: float
     waypoints: int  #: reached
 
 
 class Way(msgspec.Struct, frozen=True):
-    """The path from above, and the error over time, from which the diagrams are drawn."""
+    """The path from above, and the error over time, for the diagrams."""
 
     at_s: list[float]  #: since the beginning
     x: list[float]  #: the truth, world axes [m]
@@ -58,17 +58,17 @@ class Experiment(msgspec.Struct, frozen=True, tag_field="what", tag="paper"):
 
     vehicle: str  #: its address
     seconds: float  #: of the experiment, between the first and the last stamp
-    delays: Delays  #: at the controller, as ``skyloop`` names it, and at the recorder
+    delays: Delays  #: at the controller (named ``skyloop``) and at the recorder
     deviation_us: dict[str, float]  #: standard deviation of the controller's delays, by channel
-    tracking: Tracking | None  #: None: it never was on its way
+    tracking: Tracking | None  #: None: it never flew the path
     way: Way
-    takeovers: int  #: how often somebody else took over
-    load: float | None = None  #: average number of processes that wanted a core, of the minute before its end
+    takeovers: int  #: number of takeovers by others
+    load: float | None = None  #: load average of its last minute
 
 
 @dataclass(slots=True)
 class DelaySamples:
-    """Samples of one channel: when each was sent, how long it took, its number."""
+    """Samples of one channel: time of sending, delay and number of each."""
 
     sent_ns: list[int] = field(default_factory=list)
     delay_ns: list[int] = field(default_factory=list)
@@ -81,7 +81,7 @@ class DelaySamples:
         self.seq.append(int(seq))
 
     def within(self, first_ns: int, last_ns: int) -> DelaySamples:
-        """Return the samples that were sent in a time [ns]."""
+        """Return the samples sent within a time [ns]."""
         found = DelaySamples()
         for row in zip(self.sent_ns, self.delay_ns, self.seq, strict=True):
             if first_ns <= row[0] <= last_ns:
@@ -91,7 +91,7 @@ class DelaySamples:
 
 @dataclass(slots=True)
 class _Gathered:
-    """The samples that one pass through the recording finds."""
+    """The samples found in one pass through the recording."""
 
     application: int | None = None
     received: dict[str, DelaySamples] = field(
@@ -112,19 +112,21 @@ def evaluate(
 
     Args:
         path: The recording.
-        machine: What it ran on (default: this one).
+        machine: The machine that it ran on (default: this one).
         load: The machine's load at its end.
         progress: Called while the recording is read.
 
     Raises:
-        FileFormatError: The experiment's application is not in the recording, or it is none.
+        FileFormatError: It is no recording of the experiment, or lacks its application.
     """
     recording = Recording.open(path)
     known = recording.drone()
     found = _gather(recording, known.name, known.clock_offset_ns, progress)
     received = found.received
     if found.application is None or found.size is None or not received[FEEDBACK].sent_ns:
-        raise FileFormatError(f"{path} is no recording of the paper's experiment: python -m benchmarks.paper makes one")
+        raise FileFormatError(
+            f"{path} is not a recording of the paper's experiment: python -m benchmarks.paper makes one"
+        )
     for echo in found.echoes:
         if echo.app_id == found.application and not isinstance(echo.asked, Idle):
             received[COMMAND].add(echo.sent_ns, echo.applied_ns - echo.sent_ns, echo.seq)
@@ -159,7 +161,7 @@ def load(path: Path) -> Experiment:
     """Read ``results.json``.
 
     Raises:
-        FileFormatError: It is anything else.
+        FileFormatError: It is not such a file.
     """
     return read_json(path, Experiment, "the results of the experiment", MAX_RESULTS)
 
@@ -220,9 +222,9 @@ def _cells(name: str, size: str, received: dict[str, DelaySamples]) -> list[Cell
 
 
 def numbered(seq: Sequence[int], channel: str) -> int:
-    """Return how many samples were sent, by their numbers.
+    """Return the number of samples sent, from their numbers.
 
-    Commands are only counted as they came: their numbers also count what only keeps the connection alive.
+    Commands are only counted on arrival: their numbers also count packets that only keep the connection alive.
     """
     return len(seq) if channel == COMMAND else max(seq) - min(seq) + 1
 

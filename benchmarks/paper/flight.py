@@ -1,4 +1,4 @@
-"""The experiment's application: a path controller through waypoints by motion capture, and stamps of what it gets."""
+"""The experiment's application: a path controller through waypoints by motion capture, with stamps of its inputs."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 FLUSH_S: Final = 1.0
-_LEG_S: Final = 4.0  # no leg is flown faster, so that so many waypoints are enough
+_LEG_S: Final = 4.0  # the fastest leg, which bounds the number of waypoints
 Row = tuple[int, int, int]
 
 
 class PaperFlight(Waypoints):
-    """Flies rounds through the corners for as long as it runs, and logs where it should be.
+    """Flies rounds through the corners for as long as it runs, and logs its planned place.
 
-    It pauses while somebody else flies: when control is given back, it flies to where it had been on its way and goes
-    on.
+    It pauses while others fly: when control returns, it flies back to its place on the path and continues.
     """
 
     def __init__(self, drone: Drone, source: PositionSource, seconds: float) -> None:
@@ -42,23 +41,23 @@ class PaperFlight(Waypoints):
 
         Args:
             drone: The drone.
-            source: Knows where the vehicle is.
-            seconds: How long it will run at most [s].
+            source: Provides the vehicle's position.
+            seconds: Maximum duration [s].
         """
         rounds = int(seconds / _LEG_S / len(CORNERS)) + 1
         super().__init__(drone, CORNERS * rounds, speed_m_s=SPEED_M_S, hold_s=HOLD_S, source=self._keep)
         self.takeovers = 0
-        self.away = False  #: somebody else flies, or it is on its way back from there
+        self.away = False  #: others fly, or it is on its way back from there
         self._from = source
         self._fix: Fix | None = None
 
     @property
     def off_m(self) -> float | None:
-        """Distance from where it should be now [m]; None while it is not on its way."""
+        """Distance from the planned place now [m]; None while it does not fly the path."""
         return None if self._law is None or self.away else self._law.off_m
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Fly on, or pause while somebody else flies."""
+        """Fly on, or pause while others fly."""
         if self.drone.authority.state in ("preempted", "queued"):
             self.takeovers += not self.away
             self.away = True
@@ -82,7 +81,7 @@ class PaperFlight(Waypoints):
 class DelayLog:
     """Stamps feedback and frames on this application's receiving thread, and logs the stamps each second.
 
-    It does so for as long as its ``with`` block lasts.
+    Runs within its ``with`` block.
 
     Args:
         drone: The drone.

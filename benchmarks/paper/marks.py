@@ -1,4 +1,4 @@
-"""What the experiment's application logs, so that its recording alone holds all that is needed to evaluate it."""
+"""The experiment's log entries, so that its recording alone can be evaluated."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Final
 
 from skyloop.messages import Vector
 
-APPLICATION: Final = "paper.application"  #: a number: which of the applications it is, as echoes of commands name them
-#: Arrays, row by row: when the proxy published it [ns, its clock], how much later it was received [ns], and its number.
+APPLICATION: Final = "paper.application"  #: the application's number, as in echoes of commands
+#: Arrays, row by row: the proxy's time of publishing [ns, its clock], the delay until received [ns], and the number.
 FEEDBACK_HEARD: Final = "paper.delays.feedback"
 VIDEO_HEARD: Final = "paper.delays.video"
-#: An array: x, y, z of where it should be at that time [m], and how many waypoints were reached before.
+#: An array: x, y, z of its planned place at that time [m], and the number of waypoints reached before.
 TARGET: Final = "paper.target"
-WAYPOINTS: Final = "waypoints"  #: under which the cockpit expects them: a row each of x, y, z
+WAYPOINTS: Final = "waypoints"  #: name expected by the cockpit: rows of x, y, z
 
 #: The round of waypoints, in world axes [m]: a square of 2 m that climbs and sinks by 0.4 m.
 CORNERS: Final[tuple[Vector, ...]] = ((1.0, 1.0, 1.0), (-1.0, 1.0, 1.4), (-1.0, -1.0, 1.0), (1.0, -1.0, 1.4))

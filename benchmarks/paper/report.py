@@ -1,4 +1,4 @@
-"""The experiment's figures for people: tables, diagrams, and a page that shows both."""
+"""The experiment's figures for people: tables, diagrams, and a page with both."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ PICTURES: Final = {
     "delays-command": "Distribution of the delays of commands (the paper's figure 3)",
     "delays-video": "Distribution of the delays of frames (figure 4)",
     "delays-evolution": "All delays over the flight (figure 5)",
-    "path": "The path from above: what was flown, and the waypoints' round",
+    "path": "The path from above: the flight, and the waypoints' round",
 }
-#: From what to what each delay is.
+#: The start and end of each delay.
 MEANING: Final = {
     "command": "drone.velocity() has checked its numbers, and encodes → the driver has carried it out",
     "feedback": "the proxy publishes what the driver reported → the controller's receiving thread has it",
@@ -58,7 +58,7 @@ def figures(results: Experiment) -> dict[str, Figure]:
 
 
 def from_above(results: Experiment) -> Figure:
-    """Draw what was flown, by the truth, on the round of waypoints."""
+    """Draw the flown path, by the truth, over the round of waypoints."""
     figure, axes = new_figure(5.4, 5.0)
     x, y, _ = np.array([*CORNERS, CORNERS[0]]).T
     axes.plot(results.way.x, results.way.y, color="#0b6e99", linewidth=0.8, alpha=0.8, label="flown, by the truth")
@@ -78,7 +78,7 @@ def _path_title(results: Experiment) -> str:
 
 
 def delay_table(results: Experiment) -> tables.Table:
-    """Return the paper's Table 1 with our figures beside it, as the controller saw the delays.
+    """Return the paper's Table 1 beside our figures, as seen by the controller.
 
     The recording does not show how many commands were lost.
     """
@@ -100,7 +100,7 @@ def recorder_table(results: Experiment) -> tables.Table:
 
 
 def path_table(results: Experiment) -> tables.Table:
-    """Return how well the path was flown."""
+    """Return the accuracy along the path."""
     error = results.tracking
     rows = [] if error is None else _path_rows(error.rms_m, error.largest_m, error.across_rms_m, error.across_largest_m)
     return tables.Table("Off the path, by the truth", ["distance", "RMS", "largest"], rows)
@@ -143,7 +143,7 @@ def _page(results: Experiment) -> Page:
         off = Line("off", np.array(results.way.off_at_s), np.array(results.way.off_m))
         page.chart("Off the path", "m, from where it should have been", [off], limits([off], least_span=0.2, zero=True))
     page.add("<footer>Delays are in ms unless stated otherwise. The paper's means: Mellado-Bataller et al., IAS-12, ")
-    page.add("2013, Table 1, on one host. flight.mcap beside this page holds all that it is made from.</footer>")
+    page.add("2013, Table 1, on one host. flight.mcap beside this page holds all its data.</footer>")
     return page
 
 

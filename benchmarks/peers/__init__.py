@@ -1,7 +1,7 @@
-"""What a user could take instead of Skyloop, where it is installed: one file each, measured by the same contract.
+"""Alternatives to Skyloop, where installed: one file each, measured by the same contract.
 
-``python -m benchmarks.peers`` measures them beside Skyloop and the bare hand-over, in turns; ``--peers none``: those
-two alone.
+``python -m benchmarks.peers`` measures them beside Skyloop and the bare hand-over, in turns; ``--peers none`` measures
+only those two.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ _LOOKS_WITHIN_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Another library: what it must be possible to import, and the package whose version counts."""
+    """Another library: its required imports, and the package whose version counts."""
 
     title: str
     imports: str
     package: str
     install: str
-    module: str = ""  #: with its two ends, if it is no module of this package
+    module: str = ""  #: with its two ends, if not in this package
 
 
 PEERS: Final = {
@@ -36,7 +36,7 @@ PEERS: Final = {
         "ROS 2 (rclpy)",
         "rclpy, sensor_msgs.msg, geometry_msgs.msg, numpy",
         "rclpy",
-        "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in an environment of its own, "
+        "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in a separate environment, "
         "whose interpreter --ros-python names",
     ),
     "fabric": Peer(NETWORK.title, "zenoh", "eclipse-zenoh", "skyloop install network", NETWORK.module),
@@ -63,7 +63,7 @@ def chosen(text: str) -> list[str]:
 
 
 def find(names: Iterable[str], ros_python: str | None = None) -> tuple[list[Contender], dict[str, str]]:
-    """Return the peers that can be measured here, and why the others can't.
+    """Return the peers that can be measured here, and the reasons against the others.
 
     Args:
         names: The peers' names.
@@ -85,7 +85,7 @@ def find(names: Iterable[str], ros_python: str | None = None) -> tuple[list[Cont
 
 
 def _look(python: str, peer: Peer) -> tuple[str, str]:
-    """Return the version and what is wrong; one of the two is empty."""
+    """Return the version and the problem; one of the two is empty."""
     code = f"import {peer.imports}; from importlib.metadata import version; print(version({peer.package!r}))"
     try:
         ended = subprocess.run(

@@ -1,6 +1,6 @@
 """ROS 2 through rclpy: usual messages, "sensor data" quality of service, the default executor in a thread.
 
-Runs under the interpreter that has ``rclpy``, which need not be Skyloop's own.
+Runs under an interpreter with ``rclpy``, which need not be Skyloop's own.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _End:
     def __init__(self, name: str, address: str) -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         rclpy.init()
-        # A name space of this run alone: there may be other nodes on this host.
+        # A name space for this run alone: there may be other nodes on this host.
         self._node: Any = rclpy.create_node(name, namespace=Path(address).name.replace("-", "_"))
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
@@ -75,7 +75,7 @@ class Vehicle(_End):
         message.height, message.width, _ = image.shape
         message.encoding = "rgb8"
         message.step = 3 * message.width
-        pixels = array("B")  # the type that is taken as it is; bytes are converted one by one
+        pixels = array("B")  # this type is used directly; bytes would be converted one by one
         pixels.frombytes(image.data.cast("B"))
         message.data = pixels
         self._video.publish(message)

@@ -1,7 +1,7 @@
-"""WebRTC through aiortc: video as a track, commands and feedback as data channels that resend nothing, in any order.
+"""WebRTC through aiortc: video as a track, commands and feedback as unordered data channels without retransmission.
 
-Runs under the interpreter that has ``aiortc``, which need not be Skyloop's own. The two ends exchange their offer and
-answer by TCP at the vehicle's address; there are no servers besides.
+Runs under an interpreter with ``aiortc``, which need not be Skyloop's own. The two ends exchange their offer and answer
+over TCP at the vehicle's address; no other servers are involved.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from benchmarks.video_judge import Judge
 
 _CONNECTED_WITHIN_S = 15.0
 _STAMP = struct.Struct("<q")
-_FEEDBACK_BYTES = bytes(200)  # about as much as ours says
+_FEEDBACK_BYTES = bytes(200)  # about the size of ours
 _COMMAND_BYTES = bytes(60)
 _CLOCK_HZ = 90_000
 
@@ -75,7 +75,7 @@ class _End:
 
 
 class _Camera(MediaStreamTrack):  # type: ignore[misc]
-    """The newest picture, each once."""
+    """The newest picture, sent once each."""
 
     kind = "video"
 
@@ -86,7 +86,7 @@ class _Camera(MediaStreamTrack):  # type: ignore[misc]
         self._changed = asyncio.Event()
 
     def show(self, sent_ns: int, image: Image) -> None:
-        """Have a picture sent. Any thread."""
+        """Set the next picture. Any thread."""
         self._loop.call_soon_threadsafe(self._take, (sent_ns, image))
 
     def _take(self, newest: tuple[int, Image]) -> None:

@@ -73,13 +73,13 @@ class Application(_End):
 
 
 def _listen() -> tuple[Any, str]:
-    """A session at a free port, and its address."""
+    """Return a session on a free port, and its address."""
     for port in _PORTS:
         endpoint = f"tcp/127.0.0.1:{port}"
         try:
             return _open("listen", endpoint), endpoint
         except zenoh.ZError:
-            continue  # somebody has it
+            continue  # in use
     raise OSError(f"no port from {_PORTS[0]} to {_PORTS[-1]} is free on 127.0.0.1")
 
 

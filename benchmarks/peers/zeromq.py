@@ -48,7 +48,7 @@ class _End:
     def close(self) -> None:
         for sock in self._outgoing:
             sock.close()
-        self._context.term()  # ends what waits; each thread closes its own socket
+        self._context.term()  # wakes blocked threads; each closes its own socket
         for thread in self._threads:
             thread.join()
 

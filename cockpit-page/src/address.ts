@@ -1,4 +1,4 @@
-// What the page shows, as its address says it: `#alpha,beta` those two drones, `#/` all of them. Pure.
+// The drones that the page shows, from its address: `#alpha,beta` shows these two, `#/` shows all. Pure.
 
 /** The address of the overview; no drone can have this name. */
 export const OVERVIEW = "#/";

@@ -1,35 +1,35 @@
-// What is wrong with a drone, in a line that is always there: nothing is covered, nothing moves under the finger.
-// Each alarm can be acknowledged.
+// The problems of a drone, in a line that is always present, so that nothing is covered or moves under the finger. Each
+// alarm can be acknowledged.
 
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { t } from "./language/index.js";
 import type { Alarm } from "./model.js";
 
-/** An alarm that was away for so long is a new one when it comes back [ms]. */
+/** An alarm that was absent for this long counts as new when it returns [ms]. */
 export const CLEAR_MS = 1000;
-/** So long nobody can have read it: what is pressed then was meant for something else [ms]. */
+/** Too short to read an alarm: a press within this time was meant for something else [ms]. */
 const READ_MS = 600;
 const RANKS = { warning: 1, critical: 2 } as const;
 
 interface Entry {
   rank: number;
-  /** The rank up to which it was acknowledged; 0: it was not. */
+  /** The rank up to which it was acknowledged; 0: not at all. */
   acknowledged: number;
   raised_ms: number;
   seen_ms: number;
 }
 
-/** Which alarms there are, and which of them a person has acknowledged. Pure. */
+/** The present alarms, and which of them a person has acknowledged. Pure. */
 export class AlarmBook {
-  /** Not acknowledged, in the order of the drone: the most severe first. */
+  /** Not acknowledged, in the drone's order: the most severe first. */
   open: readonly Alarm[] = [];
   acknowledged: readonly Alarm[] = [];
-  /** How often an alarm came, or got worse. */
+  /** Counts alarms that appeared or got worse. */
   raised = 0;
   private alarms: readonly Alarm[] = [];
   private readonly entries = new Map<string, Entry>();
 
-  /** The most severe that is not acknowledged; null: there is none. */
+  /** The most severe alarm not acknowledged; null: none. */
   get loudest(): Alarm["severity"] | null {
     return this.open.some((alarm) => alarm.severity === "critical") ? "critical" : this.open.length ? "warning" : null;
   }
@@ -43,14 +43,14 @@ export class AlarmBook {
         this.raised += 1;
         entry.raised_ms = now_ms;
       }
-      // One that got better, and then as bad as it was, is worth a look again.
+      // An alarm that got better and then as bad as before deserves another look.
       this.entries.set(id, { ...entry, rank, acknowledged: Math.min(entry.acknowledged, rank), seen_ms: now_ms });
     }
     this.alarms = alarms;
     this.sort();
   }
 
-  /** Whether it was there for long enough to be read. */
+  /** Whether it was shown long enough to be read. */
   acknowledge(id: string, now_ms: number): boolean {
     const entry = this.entries.get(id);
     if (entry === undefined || now_ms - entry.raised_ms < READ_MS) return false;
@@ -69,7 +69,7 @@ export class AlarmBook {
   }
 }
 
-/** That the pane is old has a banner of its own, with its age, for as long as it lasts. */
+/** The pane's age has its own banner for as long as the pane is old. */
 const isShown = ({ id }: Alarm): boolean => id !== "old";
 
 class Row {
@@ -90,12 +90,12 @@ class Row {
   }
 }
 
-/** The alarms of one drone: the worst that is new in full, in a line of its own; the others are folded into a button. */
+/** The alarms of one drone: the worst new one in full, on its own line; the others are folded into a button. */
 export class AlarmBanner {
   readonly element = h("div", { class: "alarms", hidden: true });
-  /** Shows those that were acknowledged. */
+  /** Shows the acknowledged alarms. */
   readonly chip = h("button", { type: "button", class: "small alarm-chip", "aria-expanded": "false", hidden: true, onclick: () => this.unfold() });
-  /** What a screen reader says: each alarm once, not with every figure that changes. */
+  /** Text for screen readers: each alarm once, not with every change of its value. */
   readonly voice = h("p", { class: "unseen", role: "alert" });
   private readonly rows = new Map<string, Row>();
   private raised = 0;
@@ -106,7 +106,7 @@ export class AlarmBanner {
     return this.chip.getAttribute("aria-expanded") === "true";
   }
 
-  /** How many have room in the line; a page that shows old things has it for that. */
+  /** How many fit into the line; a page that shows old data needs the line for that. */
   room = 1;
 
   show(): void {

@@ -1,4 +1,4 @@
-// Alarms that are heard and felt: a tone where the browser allows it, and a vibration where there is a motor for it.
+// Audible alarms: a tone where the browser allows it, and a vibration where the device supports it.
 
 import { h, setAttribute, setText, setTone, svg } from "./dom.js";
 import { t } from "./language/index.js";
@@ -8,7 +8,7 @@ import { settings } from "./settings.js";
 type Severity = Alarm["severity"];
 
 const LOOK_MS = 250;
-/** A critical alarm is repeated until it is acknowledged; a warning is heard once. */
+/** A critical alarm repeats until it is acknowledged; a warning sounds once. */
 export const REPEAT_MS = 2500;
 const VIBRATIONS: Readonly<Record<Severity, number[]>> = { warning: [180], critical: [400, 150, 400, 150, 400] };
 /** Frequency [Hz] and start [s] of each tone. */
@@ -19,18 +19,18 @@ const TONES: Readonly<Record<Severity, readonly (readonly [number, number])[]>> 
 const TONE_S = 0.13;
 const VOLUME = 0.25;
 
-/** Where alarms come from: a drone that is open, or all of the list. */
+/** A source of alarms: an open drone, or the whole list. */
 export interface AlarmSource {
   name: string;
-  /** How often an alarm came, or got worse. */
+  /** Counts alarms that appeared or got worse. */
   raised: number;
-  /** The most severe that nobody has acknowledged. */
+  /** The most severe alarm not acknowledged. */
   loudest: Severity | null;
-  /** Whether somebody can acknowledge it there, and so it may go on until then. */
+  /** Whether it can be acknowledged there, so that it may repeat until then. */
   repeats: boolean;
 }
 
-/** When something is to be heard. Pure. */
+/** Decides when to sound. Pure. */
 export class Ringing {
   private raised = new Map<string, number>();
   private next_ms = 0;
@@ -47,7 +47,7 @@ export class Ringing {
 }
 
 export class AlarmSound {
-  /** Switches the sound off and on, and says when the browser forbids it. */
+  /** Switches the sound on and off, and shows when the browser blocks it. */
   readonly button: HTMLButtonElement;
   private readonly text = h("span", { class: "sound-text" });
   private readonly ringing = new Ringing();
@@ -58,7 +58,7 @@ export class AlarmSound {
     const picture = svg("svg", { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { d: "M2 6v4h2.6L9 13.4V2.6L4.6 6z", fill: "currentColor" }), this.wave);
     this.button = h("button", { type: "button", class: "small sound", onclick: () => this.mute(!this.isMuted) }, picture, this.text);
     // Browsers allow sound only after the first touch of the page.
-    // At the end of a press: what the button says changes its width, and nothing may move under the finger that is down.
+    // At the end of a press: the text changes the button's width, and nothing may move under a pressed finger.
     for (const touch of ["pointerup", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
     settings.on("sound", () => this.show());
     setInterval(() => this.look(), LOOK_MS);
@@ -75,14 +75,14 @@ export class AlarmSound {
 
   private mute(muted: boolean): void {
     settings.set("sound", muted ? "off" : "on");
-    if (!muted) this.play("warning"); // so that one knows what it is like
+    if (!muted) this.play("warning"); // a sample, so that the person knows the sound
   }
 
   private look(): void {
     const due = this.ringing.due(this.sources(), performance.now());
     this.show();
     if (due === null) return;
-    // Before the first touch a browser forbids this too, and complains.
+    // Before the first touch, browsers also forbid this, and complain.
     if (navigator.userActivation?.hasBeenActive ?? true) navigator.vibrate?.(VIBRATIONS[due]);
     if (!this.isMuted) this.play(due);
   }
@@ -92,7 +92,7 @@ export class AlarmSound {
       this.context ??= new AudioContext();
       void this.context.resume().then(() => this.show());
     } catch {
-      // No sound on this machine: the button says that it is blocked.
+      // No sound on this machine: the button shows that it is blocked.
     }
   }
 
@@ -121,7 +121,7 @@ export class AlarmSound {
     setTone(this.button, !muted && blocked ? "warn" : "quiet");
     this.wave.setAttribute("visibility", muted || blocked ? "hidden" : "visible");
     setAttribute(this.button, "aria-pressed", String(!muted));
-    setAttribute(this.button, "aria-label", t.alarms.sound(state || t.alarms.on)); // with what is read on it, for who speaks to the page
+    setAttribute(this.button, "aria-label", t.alarms.sound(state || t.alarms.on)); // with the visible text, for speech control
     setAttribute(this.button, "title", muted ? t.alarms.isMuted : blocked ? t.alarms.isBlocked : t.alarms.isHeard);
   }
 }

@@ -21,10 +21,10 @@ async function ask(path: string, options: RequestInit): Promise<unknown> {
   }
 }
 
-/** Throws Refused with the server's words. */
+/** Throws Refused with the server's message. */
 export const get = async <T>(path: string): Promise<T> => (await ask(path, {})) as T;
 
-/** Throws Refused with the server's words. */
+/** Throws Refused with the server's message. */
 export const post = async <T>(path: string, values: object = {}): Promise<T> =>
   (await ask(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(values) })) as T;
 

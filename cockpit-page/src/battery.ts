@@ -1,4 +1,4 @@
-// A battery, drawn and in words.
+// A battery, drawn and as text.
 
 import { h, setAttribute, setText, setTone, svg } from "./dom.js";
 import { t } from "./language/index.js";
@@ -17,7 +17,7 @@ export class Battery {
     this.show(null, []);
   }
 
-  /** `share` from 0 to 1; null where it is not known. Whether it is low is for the drone's alarms to say. */
+  /** `share` from 0 to 1; null if unknown. The drone's alarms decide whether it is low. */
   show(share: number | null, alarms: readonly Alarm[]): void {
     const severity = alarms.find((alarm) => alarm.id === "battery")?.severity;
     setTone(this.element, share === null ? "quiet" : severity === "critical" ? "bad" : severity === "warning" ? "warn" : "ok");

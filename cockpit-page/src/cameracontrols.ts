@@ -1,11 +1,11 @@
-// The parameters of the cameras that are shown, beside their pictures.
+// The parameters of the visible cameras, beside their pictures.
 
 import { h, setAttribute, setHidden } from "./dom.js";
 import { t } from "./language/index.js";
 import type { Value } from "./model.js";
 import { Parameters } from "./parameters.js";
 
-/** Whether a parameter is of one of the cameras that are shown: `camera.NAME.…`, or `camera.…` of them all. Pure. */
+/** Whether a parameter belongs to one of the visible cameras: `camera.NAME.…`, or `camera.…` for all. Pure. */
 export function isOfCamera(parameter: string, cameras: readonly string[], shown: ReadonlySet<string>): boolean {
   const [kind, name = "", ...more] = parameter.split(".");
   if (kind !== "camera") return false;
@@ -24,7 +24,7 @@ export class CameraControls {
     this.element = h("div", { class: "camera-controls", hidden: true }, this.parameters.element);
   }
 
-  /** Which cameras there are, and which of them are shown. */
+  /** All cameras, and which of them are visible. */
   of(cameras: readonly string[], shown: ReadonlySet<string>): void {
     this.cameras = cameras;
     this.shown = shown;

@@ -1,4 +1,4 @@
-// What comes how fast, how late, how old, and what is missing; as the cockpit receives it.
+// Rates, delays, ages and losses of the channels, as the cockpit receives them.
 
 import { h, setText } from "./dom.js";
 import { figure, type Known } from "./format.js";
@@ -38,7 +38,7 @@ export class Channels {
   }
 }
 
-/** Milliseconds with one decimal while it matters. */
+/** Milliseconds, with one decimal while it matters. */
 export function milliseconds(seconds: Known): string {
   if (seconds === null || seconds === undefined) return "–";
   if (Math.abs(seconds) >= 10) return `${figure(seconds, 0)} s`;

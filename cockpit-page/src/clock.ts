@@ -1,16 +1,16 @@
 // The cockpit's clock, as this page knows it. Pure.
 //
-// A pong has the cockpit's time between a ping and its answer: that gives the offset of the two clocks, right to half
-// of the time there and back. Any other message with a time shows that it is at least that late there.
+// A pong carries the cockpit's time between a ping and its answer: it gives the offset of the two clocks to within half
+// the round trip. Any other message with a time gives a lower bound of the time there.
 
-/** Clocks of two machines run apart by at most so much [s/s]. */
+/** Clocks of two machines drift apart by at most this [s/s]. */
 const DRIFT = 2e-4;
-/** What timers of browsers are rounded to, and more [s]. */
+/** More than browsers' timers are rounded to [s]. */
 const COARSE_S = 0.002;
 
 export interface Stamp {
   at_s: number;
-  /** By how much that may be wrong. */
+  /** The uncertainty. */
   unsure_s: number;
 }
 
@@ -18,7 +18,7 @@ export class ServerClock {
   private best: { offset_s: number; unsure_s: number; at_ms: number } | null = null;
   private floor: { offset_s: number; at_ms: number } | null = null;
 
-  /** Another connection, perhaps to another cockpit: nothing is known any more. */
+  /** A new connection, perhaps to another cockpit: forget everything. */
   reset(): void {
     this.best = this.floor = null;
   }
@@ -33,19 +33,19 @@ export class ServerClock {
     this.received(received_ms, now_s);
   }
 
-  /** A message that the cockpit sent at `now_s` has arrived: it is no earlier there by now. */
+  /** A message that the cockpit sent at `now_s` has arrived: its clock is not behind that. */
   received(received_ms: number, now_s: number): void {
     const offset_s = now_s - received_ms / 1000;
     if (this.floor === null || offset_s >= this.lowest(this.floor, received_ms)) this.floor = { offset_s, at_ms: received_ms };
   }
 
-  /** The cockpit's time at this moment of the page; null while it is not known. */
+  /** The cockpit's time now; null while unknown. */
   at(ms: number): Stamp | null {
     const known = this.known(ms);
     return known && { at_s: ms / 1000 + known.offset_s, unsure_s: known.unsure_s };
   }
 
-  /** Least age of what the cockpit sent at `now_s`; null while no time is known. */
+  /** Minimum age of a message that the cockpit sent at `now_s`; null while no time is known. */
   age_s(now_s: number, ms: number): number | null {
     return this.floor && Math.max(0, ms / 1000 + this.lowest(this.floor, ms) - now_s);
   }

@@ -1,25 +1,25 @@
-// Commands on their way: each carries the time of the press, and its outcome is kept for as long as it matters.
+// Commands under way: each carries the time of the press, and its outcome is kept for as long as it matters.
 //
-// The cockpit does nothing that may be older than 0.5 s. So a command that can't be sent now is never sent, except an
-// emergency stop: that one is tried for two seconds, while the page shows it as pending.
+// The cockpit refuses commands that may be older than 0.5 s. A command that can't be sent now is therefore never sent,
+// except an emergency stop: the page retries it for two seconds and shows it as pending.
 
 import type { ServerClock } from "./clock.js";
 import { t } from "./language/index.js";
 import type { Handlers } from "./socket.js";
 
-/** A command that is older is not executed [ms]. */
+/** An older command is not executed [ms]. */
 export const LATE_MS = 500;
-/** Nor is an emergency stop that is older than this. */
+/** Nor is an emergency stop older than this. */
 export const STOP_LATE_MS = 2000;
-/** Without a pong for so long nothing is known to arrive, and what is shown is old. */
+/** After this long without a pong the link counts as dead, and the data shown as old. */
 export const STALE_MS = 1000;
-/** The answer may be under way for as long again. */
+/** The answer may take as long again. */
 const ANSWER_MS = 1000;
 const SENT_SHOWN_MS = 2500;
 const FAILED_SHOWN_MS = 8000;
 const STOPS: ReadonlySet<string> = new Set(["stop", "stop_all"]);
 
-/** As much of a socket as is used. */
+/** The part of a socket used here. */
 export interface CommandSocket {
   readonly isOpen: boolean;
   send(message: object): boolean;
@@ -27,7 +27,7 @@ export interface CommandSocket {
 }
 
 /** `sent`: the cockpit passed it on. `refused`: by the cockpit or the drone, with a reason. `not_sent`: it never left, or
- *  came too late to count. `no_answer`: it left in time, and nothing came back. */
+ *  was too late to count. `no_answer`: it left in time, without an answer. */
 export type Fate = "pending" | "sent" | "refused" | "not_sent" | "no_answer";
 
 /** The outcome of the newest command of its kind. */
@@ -40,9 +40,9 @@ interface Pending {
   command: { do: string };
   n: number;
   pressed_ms: number;
-  /** It went over the connection that is open now. */
+  /** Sent over the connection that is open now. */
   on_its_way: boolean;
-  /** It went over any. */
+  /** Sent over any connection. */
   went: boolean;
 }
 
@@ -55,18 +55,18 @@ export interface Answer {
 }
 
 export interface CommandListener {
-  /** The connection is there, or gone. */
+  /** The connection has opened or closed. */
   linked(open: boolean): void;
   /** Any other message of the cockpit. */
   received(message: Answer): void;
-  /** A command will not be executed: refused by the cockpit, or given up by this page. */
+  /** A command will not be executed: the cockpit refused it, or this page gave up on it. */
   refused(command: string, why: string, n: number): void;
-  /** The outcome of a command is known, or is no longer shown. */
+  /** The outcome of a command has become known, or is no longer shown. */
   changed(): void;
 }
 
 export class CommandSender {
-  /** There and back to the cockpit [s]; null while not known. */
+  /** Round trip to the cockpit [s]; null while unknown. */
   round_trip_s: number | null = null;
   private readonly socket: CommandSocket;
   private number = 0;
@@ -87,24 +87,24 @@ export class CommandSender {
     this.socket = connect({ message: (data) => this.onMessage(data), state: (open) => this.linked(open) });
   }
 
-  /** How old the newest answer is [ms]; null before the first one of this connection. */
+  /** Age of the newest answer [ms]; null before the first on this connection. */
   age_ms(now_ms = this.now_ms()): number | null {
     const age_s = this.answered_s === null ? null : this.clock.age_s(this.answered_s, now_ms);
     return age_s === null ? null : age_s * 1000;
   }
 
-  /** What is sent now is known to arrive in time, as far as can be known. */
+  /** A command sent now should arrive in time. */
   get isLive(): boolean {
     const age_ms = this.age_ms();
     return this.socket.isOpen && age_ms !== null && age_ms <= STALE_MS;
   }
 
-  /** The outcome of the newest command of this kind; null if that does not matter any more. */
+  /** The outcome of the newest command of this kind; null if it no longer matters. */
   result(what: string): Result | null {
     return this.results.get(what) ?? null;
   }
 
-  /** The number of the command that was sent last, by which the cockpit's answers name it. */
+  /** The number of the last command sent, as used in the cockpit's answers. */
   get newest(): number {
     return this.sent;
   }
@@ -114,7 +114,7 @@ export class CommandSender {
     return this.isLive || STOPS.has(command.do);
   }
 
-  /** Send a command. False if it can't be sent; the listener has been called then. */
+  /** Send a command. False if it can't be sent; the listener has then been called. */
   send(command: { do: string }): boolean {
     const now_ms = this.now_ms();
     this.sent = this.number += 1;
@@ -128,18 +128,18 @@ export class CommandSender {
     return this.transmit(pending) || STOPS.has(command.do);
   }
 
-  /** Sticks: what does not go now is forgotten. */
+  /** Sticks: a command that can't be sent now is dropped. */
   steer<Message extends { do: string }>(command: Message): boolean {
     return this.isLive && this.attempt(command);
   }
 
-  /** Sent even if nothing is known to arrive: for what only ends a flight, and is of no use later. */
+  /** Sent even over a dead link: for commands that only end a flight and are useless later. */
   attempt<Message extends { do: string }>(command: Message): boolean {
     const stamp = this.clock.at(this.now_ms());
     return stamp !== null && this.socket.send({ ...command, ...stamp });
   }
 
-  /** Called many times a second; `pause_ms` between two pings. */
+  /** Called many times per second; `pause_ms` between two pings. */
   tick(pause_ms: number): void {
     const now_ms = this.now_ms();
     if (now_ms - this.pinged_ms >= pause_ms) this.ping(now_ms);
@@ -227,7 +227,7 @@ export class CommandSender {
   private settle(answer: Answer, fate: Fate): void {
     const what = answer.do ?? "";
     const pending = this.pending.get(what);
-    if (answer.n && answer.n !== (pending?.n ?? this.settled.get(what))) return; // of an earlier one
+    if (answer.n && answer.n !== (pending?.n ?? this.settled.get(what))) return; // answers an earlier one
     this.pending.delete(what);
     if (pending) this.settled.set(what, pending.n);
     this.show(what, fate, answer.why ?? "");

@@ -1,11 +1,11 @@
-// Panels that share one place: buttons choose which is seen. Plain buttons, not tabs: arrow keys are for flying.
+// Panels that share one place: buttons select the visible one. Plain buttons, not tabs, as arrow keys are for flying.
 
 import { h, memory, setAttribute } from "./dom.js";
 
 export interface Leaf {
   name: string;
   element: HTMLElement;
-  /** It is seen now. */
+  /** It becomes visible. */
   opened?: () => void;
 }
 

@@ -1,11 +1,11 @@
-// Small things that every panel needs. What does not change is not written, so that nothing is announced twice.
-// Styles are classes and single properties: the page's policy forbids style attributes.
+// Small helpers for all panels. Unchanged values are not written, so that nothing is announced twice. Styles are classes
+// and single properties: the page's policy forbids style attributes.
 
 export type Tone = "ok" | "warn" | "bad" | "busy" | "quiet";
 type Child = Node | string | null;
 type Attributes = Record<string, string | number | boolean | ((event: never) => void)>;
 
-/** An element: attributes by name, listeners as `onclick`, true and false for those that are there or not. */
+/** An element: attributes by name, listeners as `onclick`, true and false for attributes without a value. */
 export function h<Name extends keyof HTMLElementTagNameMap>(
   name: Name,
   attributes: Attributes = {},
@@ -62,7 +62,7 @@ export function unique(prefix: string): string {
   return `${prefix}-${numbers}`;
 }
 
-/** A canvas as large as its box on the screen, in the screen's own pixels; returns how many there are per CSS pixel. */
+/** Size a canvas to its box in screen pixels; returns the screen pixels per CSS pixel. */
 export function fit(canvas: HTMLCanvasElement): number {
   const density = Math.min(2, window.devicePixelRatio || 1);
   const [width, height] = [Math.round(canvas.clientWidth * density), Math.round(canvas.clientHeight * density)];
@@ -71,7 +71,7 @@ export function fit(canvas: HTMLCanvasElement): number {
   return density;
 }
 
-/** What this browser remembers of this page; storage may be forbidden: then nothing is remembered. */
+/** Values that this browser remembers for the page; if storage is forbidden, none are. */
 export const memory = {
   get(name: string): string | null {
     try {

@@ -1,22 +1,22 @@
-// Draws the shapes that controllers and processors published, over the picture that they belong to.
+// Draws shapes published by controllers and processors over the picture they belong to.
 
 import type { Shape } from "./model.js";
 
-/** Drawings of a frame further away than this are of another moment [ns]. */
+/** Drawings of a frame further away than this belong to another moment [ns]. */
 export const REACH_NS = 300_000_000n;
-/** Those that come later than this after the picture that they were drawn on are not shown: things are elsewhere by now [ns]. */
+/** Drawings that arrive later than this after their picture are not shown: things have moved on [ns]. */
 export const LATEST_NS = 1_000_000_000n;
 
-/** What is older was not late: a page that is opened gets the last that was ever drawn [ns]. */
+/** Older drawings are not late: a newly opened page gets the last one ever published [ns]. */
 const LEFT_OVER_NS = 10_000_000_000n;
 
-/** How long after its picture a drawing comes; 0 for one in time. Pure. */
+/** Delay of a drawing after its picture; 0 if in time. Pure. */
 export function lateness(drawing: { captured_ns: string }, shown: bigint | null): bigint {
   const late = shown === null ? 0n : shown - BigInt(drawing.captured_ns);
   return late < REACH_NS || late > LEFT_OVER_NS ? 0n : late;
 }
 
-/** Whether a drawing that came so late belongs over a picture: `live`, over its own; `late`, over a newer one; or not. Pure. */
+/** Whether a drawing with this delay belongs over a picture: `live`, over its own; `late`, over a newer one; or not. Pure. */
 export function belongs(drawing: { captured_ns: string }, late: bigint, shown: bigint): "live" | "late" | "" {
   const apart = shown - BigInt(drawing.captured_ns);
   if (apart < REACH_NS && apart > -REACH_NS) return "live";
@@ -33,7 +33,7 @@ export interface Fit {
   density: number;
 }
 
-/** Where a picture lies in a box that it fills as far as its shape lets it. */
+/** The place of a picture in a box that it fills as far as its aspect ratio allows. */
 export function contain(width: number, height: number, box: { width: number; height: number }, density: number): Fit {
   const scale = Math.min(box.width / width, box.height / height);
   const [w, h] = [width * scale, height * scale];
@@ -41,7 +41,7 @@ export function contain(width: number, height: number, box: { width: number; hei
 }
 
 const rgb = ([red, green, blue]: readonly number[]): string => `rgb(${red} ${green} ${blue})`;
-const EDGE = "rgb(0 0 0 / 55%)"; // below lines and dots: they are to be seen on any picture
+const EDGE = "rgb(0 0 0 / 55%)"; // below lines and dots, so that they are visible on any picture
 
 export function draw(pen: CanvasRenderingContext2D, shapes: readonly Shape[], fit: Fit): void {
   pen.lineJoin = pen.lineCap = "round";

@@ -8,7 +8,7 @@ import type { DroneEvent } from "./model.js";
 const MOST_EVENTS = 300;
 const TONES: Readonly<Record<string, Tone>> = { info: "quiet", warning: "warn", error: "bad" };
 
-/** The newest first; words and severity choose what is shown. */
+/** The newest first; words and severity filter the list. */
 export class Events {
   readonly element: HTMLElement;
   private readonly list = h("ol", { class: "events", tabindex: 0, "aria-label": t.events.label });
@@ -22,7 +22,7 @@ export class Events {
     this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, this.severity), this.list, this.none);
   }
 
-  /** Returns those that are new. */
+  /** Returns the new ones. */
   add(events: readonly DroneEvent[]): DroneEvent[] {
     const fresh = events.filter((event) => event.n > this.newest);
     for (const event of fresh) {
@@ -36,7 +36,7 @@ export class Events {
     return fresh;
   }
 
-  /** The cockpit was restarted and numbers them from 1. */
+  /** The cockpit was restarted and counts from 1 again. */
   restart(): void {
     this.newest = 0;
     this.shown.length = 0;
@@ -54,7 +54,7 @@ export class Events {
   }
 }
 
-/** Whether an event is among those asked for. */
+/** Whether an event passes the filter. */
 export function passes(event: DroneEvent, needle: string, severity: string): boolean {
   const grades = ["info", "warning", "error"];
   if (grades.indexOf(event.severity) < grades.indexOf(severity || "info")) return false;

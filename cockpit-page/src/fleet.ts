@@ -1,4 +1,4 @@
-// All drones that were found, each in a card: a click opens one alone, its second button opens it beside the others.
+// All drones found, each as a card: a click opens one alone, its second button opens it beside the others.
 
 import { Battery } from "./battery.js";
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";

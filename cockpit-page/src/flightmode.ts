@@ -1,5 +1,5 @@
-// The flight mode: one drone's picture on the whole screen, with its sticks, state and controls upon it. It is the same pane,
-// arranged otherwise (style/flightmode.css): the rules for flying are the same, as nothing of it is made twice.
+// The flight mode: one drone's picture on the whole screen, with its sticks, state and controls on top. It is the same pane
+// with another layout (style/flightmode.css), so the rules for flying are the same.
 
 import { h, setAttribute, setText, setTone, svg, type Tone } from "./dom.js";
 import { named, t } from "./language/index.js";
@@ -7,13 +7,13 @@ import { isModalOpen } from "./modal.js";
 import type { State } from "./model.js";
 import { lengthText, speedText } from "./units.js";
 
-/** A touch screen of a telephone's size: there the flight mode begins by itself. */
+/** A touch screen of a phone's size: flight mode starts there automatically. */
 const TELEPHONE = "(pointer: coarse) and (max-width: 600px), (pointer: coarse) and (max-height: 500px)";
 const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 
 export interface FlightPane {
   readonly element: HTMLElement;
-  /** Arrange it for flight, or as usual. */
+  /** Lay it out for flight, or as usual. */
   arrange(flight: boolean): void;
   notify(text: string, tone: Tone): void;
 }
@@ -25,7 +25,7 @@ export class FlightMode {
   private isFull = false;
   private lock: WakeLockSentinel | null = null;
 
-  /** @param rest Nothing that is held counts any longer: everything under a finger has moved. */
+  /** @param rest Called so that nothing held counts any more: everything under a finger has moved. */
   constructor(private readonly rest: () => void) {
     window.addEventListener("popstate", () => {
       this.pushed = false;
@@ -37,14 +37,14 @@ export class FlightMode {
     window.matchMedia("(orientation: portrait)").addEventListener("change", () => this.pane && this.rest());
     document.addEventListener("visibilitychange", () => !document.hidden && this.pane && void this.keepAwake());
     document.addEventListener("fullscreenchange", () => {
-      // Escape, and Back on a telephone, end the whole screen first and are not seen here: they mean both.
+      // Escape, and Back on a phone, first end the full screen and are not seen here: they mean both.
       if (this.isFull && document.fullscreenElement === null) this.leave();
       this.isFull = this.pane !== null && document.fullscreenElement === document.documentElement;
       this.show();
     });
   }
 
-  /** By the person, whose press allows the browser to give it the whole screen; or by itself on a telephone. */
+  /** By the person, whose press lets the browser show it full screen; or automatically on a phone. */
   enter(pane: FlightPane, byPerson: boolean): void {
     if (this.pane === pane) return;
     this.end();
@@ -58,7 +58,7 @@ export class FlightMode {
     void this.keepAwake();
   }
 
-  /** A drone was opened: on a telephone it is flown at once. */
+  /** A drone was opened: on a phone it is flown at once. */
   offer(pane: FlightPane): void {
     if (this.pane === null && window.matchMedia(TELEPHONE).matches) this.enter(pane, false);
   }
@@ -74,12 +74,12 @@ export class FlightMode {
     if (this.pushed) history.back();
   }
 
-  /** The pane is closed. */
+  /** The pane was closed. */
   gone(pane: FlightPane): void {
     if (this.pane === pane) this.end();
   }
 
-  /** Without the browser's bars, where the browser can: Safari on an iPhone can't, and shows it between them. */
+  /** Without the browser's bars, where the browser supports it: Safari on an iPhone shows it between them. */
   fillScreen(): void {
     void document.documentElement.requestFullscreen?.({ navigationUI: "hide" }).catch(() => undefined);
   }
@@ -102,7 +102,7 @@ export class FlightMode {
     setAttribute(document.documentElement, "data-full", String(document.fullscreenElement !== null || !document.fullscreenEnabled));
   }
 
-  /** A dark screen hides the page, and then the drone hovers: safe, but a surprise. */
+  /** A dark screen hides the page, and the drone then hovers: safe, but a surprise. */
   private async keepAwake(): Promise<void> {
     const { pane } = this;
     try {
@@ -110,17 +110,17 @@ export class FlightMode {
       if (this.pane === null) await lock.release();
       else this.lock = lock;
     } catch {
-      // Browsers have it only on this machine itself or over https, and not with a low battery.
+      // Browsers offer it only on this machine or over https, and not with a low battery.
       pane?.notify(t.flight.mayTurnOff, "quiet");
     }
   }
 }
 
-/** The sign for the whole screen: its four corners. */
+/** The full-screen icon: four corners. */
 export const corners = (): Element =>
   svg("svg", { viewBox: "0 0 20 20", width: 20, height: 20, "aria-hidden": "true" }, svg("path", { d: "M3 7V3h4M13 3h4v4M17 13v4h-4M7 17H3v-4", fill: "none", stroke: "currentColor", "stroke-width": 1.8 }));
 
-/** What the flight mode shows of the instruments, in a line. */
+/** The instruments of the flight mode, in a line. */
 export class FlightHud {
   readonly element: HTMLElement;
   private readonly altitude = h("b", { "data-hud": "altitude" }, "–");

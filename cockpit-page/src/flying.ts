@@ -1,4 +1,4 @@
-// Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
+// Keys, gamepad and thumbs fly the selected drone; nothing else on the page does.
 
 import { chosen, GamepadReader, plugged } from "./gamepad.js";
 import { type Deed, isEnter, Keys, stopKeys } from "./keys.js";
@@ -10,29 +10,29 @@ import { settings } from "./settings.js";
 import { CENTRED, type Hands, PACES, type Pace, scale } from "./sticks.js";
 import type { Thumbs } from "./thumbs.js";
 
-/** A page that stood still for so long, as in the browser's cache or a computer that slept, does not know what hands did meanwhile. */
+/** A page suspended for this long, as in the browser's cache or a sleeping computer, does not know what hands did meanwhile. */
 const STOOD_STILL_MS = 1000;
 
-/** One drone that this page may fly, and what hands do to it. */
+/** One drone that this page may fly, and the state of the hands on it. */
 export interface Flown {
   pilot: Pilot;
   hands: Hands;
   thumbs: Pick<Thumbs, "sticks" | "touches" | "release">;
-  /** Its motors are stopped, whoever stopped them: what is held all the while flies nothing after the reset. */
+  /** Its motors are stopped, by anyone: a stick held throughout flies nothing after the reset. */
   isStopped: boolean;
 }
 
-/** Which drone the keys fly, and what else they do. */
+/** The drone that keys fly, and their other functions. */
 export interface Cabin {
-  /** Of all drones that are open here. */
+  /** All drones open here. */
   flown(): Flown[];
-  /** The one that hands fly. */
+  /** The drone under control of the hands. */
   selected(): Flown | null;
-  /** A deed by key or gamepad, for the selected drone. */
+  /** An action by key or gamepad, for the selected drone. */
   act(deed: Deed): void;
-  /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: released. */
+  /** The emergency stop is held by keys or gamepad: for the visible drone, or all; null: released. */
   hold(which: "one" | "all" | null): void;
-  /** What the inputs look like now. */
+  /** The present state of the inputs. */
   inputs(view: InputView): void;
 }
 
@@ -43,7 +43,7 @@ export interface InputView {
   sticks: Sticks;
 }
 
-/** What has the focus may name keys of its own (`data-keys`), as the map its arrows: these don't fly meanwhile, all others do. */
+/** The focused element may claim keys of its own (`data-keys`), such as the map its arrows; only the others fly meanwhile. */
 const ownKeys = (): Set<string> | null => {
   const named = (document.activeElement as HTMLElement | null)?.dataset["keys"];
   return named === undefined ? null : new Set(named.split(" "));
@@ -53,7 +53,7 @@ const TAKES_KEYS = "input, select, textarea, [contenteditable]";
 
 export class Flying {
   pace: Pace = PACES[1] as Pace;
-  /** The gamepad commands nothing, as its buttons are being assigned. */
+  /** The gamepad commands nothing while its buttons are being assigned. */
   padSilent = false;
   private readonly keys = new Keys();
   private readonly pad = new GamepadReader(padMaps);
@@ -61,7 +61,7 @@ export class Flying {
   private stopping: "keys" | "pad" | null = null;
 
   constructor(private readonly cabin: Cabin) {
-    // Seen before anything else on the page can keep a key to itself.
+    // Runs before any other element can claim a key.
     window.addEventListener("keydown", (event) => this.down(event), { capture: true });
     window.addEventListener("keyup", (event) => this.up(event), { capture: true });
     window.addEventListener("blur", () => this.leave());
@@ -72,7 +72,7 @@ export class Flying {
     setInterval(() => this.round(), STEER_MS);
   }
 
-  /** Nothing that is held counts any longer, and what was under way hovers. */
+  /** Nothing held counts any more, and a flight under way ends in hover. */
   rest(): void {
     this.keys.clear();
     this.pad.reset();
@@ -83,7 +83,7 @@ export class Flying {
     }
   }
 
-  /** Releases that come now are not seen: keys that counted as held would keep the gamepad from stopping the motors. */
+  /** Later releases are not seen: keys that still counted as held would keep the gamepad from stopping the motors. */
   private leave(): void {
     if (this.stopping === "keys") this.stop("keys", null);
     this.rest();
@@ -92,14 +92,14 @@ export class Flying {
   private down(event: KeyboardEvent): void {
     const stops = stopKeys(event);
     if (stops !== null) {
-      event.preventDefault(); // also in a text field: it writes nothing there
+      event.preventDefault(); // also in a text field, where it must not type anything
       event.stopImmediatePropagation();
       if (!event.repeat) this.stop("keys", stops);
       return;
     }
     if (event.repeat && isEnter(event.code) && document.activeElement?.matches("textarea") !== true) {
-      // A press chooses a place, or marks a target, and the focus moves on to what flies there: a key that is held does
-      // not go with it.
+      // A press chooses a place or marks a target, and the focus moves to the button that flies there: a key that is held
+      // must not follow it.
       event.preventDefault();
       event.stopImmediatePropagation();
       return;

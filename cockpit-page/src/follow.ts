@@ -1,9 +1,9 @@
-// Marking what is to be followed: pointers to pixels of the frame, boxes, and what was detected. Pure.
+// Marking a target: pointers to pixels of the frame, boxes, and detections. Pure.
 
 import { type Fit, REACH_NS } from "./drawing.js";
 import type { Drawing, Shape } from "./model.js";
 
-/** x, y of the upper left corner, width, height, in pixels of a frame: its edges, so that 0 is the left edge of the first column. */
+/** x, y of the upper left corner, width, height, in pixels of a frame: edges, so that 0 is the left edge of the first column. */
 export type Box = readonly [number, number, number, number];
 export type Point = readonly [number, number];
 export interface Size {
@@ -14,10 +14,10 @@ export interface Size {
 export type FollowMode = "follow" | "orbit" | "look";
 export const FOLLOW_MODES: readonly FollowMode[] = ["follow", "orbit", "look"];
 
-/** What the cockpit says of it: docs/cockpit.md. */
+/** The cockpit's report on it: docs/cockpit.md. */
 export interface FollowMessage {
   type: "follow";
-  /** `selecting`: frames are kept since `since_ns`. `tracking`: nothing flies. `waiting`: it hovers, as no frames come. */
+  /** `selecting`: frames are kept since `since_ns`. `tracking`: not flying. `waiting`: hovering, as no frames arrive. */
   state: "selecting" | "tracking" | "flying" | "waiting" | "ended";
   camera: string;
   since_ns?: string;
@@ -31,39 +31,39 @@ export interface FollowMessage {
   range_m?: number | null;
   range_deviation_m?: number | null;
   lost_s?: number | null;
-  /** To keep. */
+  /** The distance to keep. */
   distance_m?: number | null;
 }
 
-/** A box on the frame that was captured then. */
+/** A box on the frame with this capture time. */
 export interface Mark {
   camera: string;
   captured_ns: string;
   box: Box;
-  /** Of the picture that it is drawn on [pixels]. */
+  /** Size of the picture under it [pixels]. */
   size: [number, number];
   class_name?: string;
 }
 
-/** Something that a processor has found. */
+/** A processor's detection. */
 export interface Found {
   box: Box;
   name: string;
   captured_ns: string;
 }
 
-/** A smaller box has too little in it to be tracked [pixels of the frame]. */
+/** A smaller box has too little content to track [pixels of the frame]. */
 export const LEAST_PX = 6;
-/** What is drawn of the target itself. */
+/** The name of the target's own drawing. */
 export const SOURCE = "follow";
 const NAMED = /^(.+) [01]?\.\d+$/;
 
 const within = (value: number, low: number, high: number): number => Math.max(low, Math.min(high, value));
 
-/** A place in the view, in the same pixels as the fit, as a place in the frame; beyond the picture's edge it is at the edge. */
+/** A place in the view, in the pixels of the fit, as a place in the frame, clamped to the picture. */
 export const toFrame = (fit: Fit, [x, y]: Point): Point => [within((x - fit.x) / fit.scale, 0, fit.width / fit.scale), within((y - fit.y) / fit.scale, 0, fit.height / fit.scale)];
 
-/** A box of the frame in the view. */
+/** A box of the frame, in the view. */
 export const toView = (fit: Fit, [x, y, width, height]: Box): Box => [fit.x + x * fit.scale, fit.y + y * fit.scale, width * fit.scale, height * fit.scale];
 
 /** The box between two corners, to tenths of a pixel. */
@@ -75,7 +75,7 @@ export function between([x0, y0]: Point, [x1, y1]: Point): Box {
 
 export const isLarge = ([, , width, height]: Box): boolean => width >= LEAST_PX && height >= LEAST_PX;
 
-/** What was detected in a frame of this size, or in another of the same moment: closed outlines of four corners, and the text that follows each. */
+/** The detections in a frame of this size, or another of the same moment: closed outlines of four corners, each followed by its text. */
 export function foundIn(drawings: Iterable<Drawing>, captured_ns: string, size: Size): Found[] {
   const found: Found[] = [];
   for (const drawing of drawings) {
@@ -94,18 +94,18 @@ export function foundIn(drawings: Iterable<Drawing>, captured_ns: string, size: 
   return found;
 }
 
-/** `person` of the text `person 0.87`; empty if it is no such text. */
+/** `person` for the text `person 0.87`; empty for any other text. */
 function nameIn(shape: Shape | undefined): string {
   return shape?.kind === "text" ? (NAMED.exec(shape.text)?.[1] ?? "") : "";
 }
 
-/** The smallest of those that a place is in; null: none. */
+/** The smallest one that contains a place; null: none. */
 export function foundAt(all: readonly Found[], [px, py]: Point): Found | null {
   const hit = all.filter(({ box: [x, y, width, height] }) => px >= x && px <= x + width && py >= y && py <= y + height);
   return hit.reduce<Found | null>((best, one) => (best === null || one.box[2] * one.box[3] < best.box[2] * best.box[3] ? one : best), null);
 }
 
-/** A box that is moved, or made larger or smaller around its middle, and stays in the frame; to begin with one in its middle. */
+/** A box moved, or resized around its centre, within the frame; at first one in the centre. */
 export function nudged(box: Box | null, [right, down]: Point, grows: boolean, { width, height }: Size): Box {
   if (box === null) return [width * 0.4, height * 0.3, width * 0.2, height * 0.4];
   const [dx, dy] = [right * width * 0.02, down * height * 0.02];
@@ -114,7 +114,7 @@ export function nudged(box: Box | null, [right, down]: Point, grows: boolean, { 
   return [within(box[0] - (w - box[2]) / 2, 0, width - w), within(box[1] - (h - box[3]) / 2, 0, height - h), w, h];
 }
 
-/** Where a panel lies beside a box in the view: below it, else above it, else over its lower edge; never beyond the view. */
+/** The place for a panel beside a box in the view: below, else above, else over its lower edge; never beyond the view. */
 export function beside([x, y, width, height]: Box, panel: Size, view: Size, gap = 8): Point {
   const left = within(x + width / 2 - panel.width / 2, gap, Math.max(gap, view.width - panel.width - gap));
   const below = y + height + gap;

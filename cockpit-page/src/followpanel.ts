@@ -1,4 +1,4 @@
-// The panel of a target that was marked: what to do about it, how it goes, and Stop.
+// The panel of a marked target: how to follow it, its state, and Stop.
 
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { FOLLOW_MODES, type FollowMessage, type FollowMode, type Point, type Size } from "./follow.js";
@@ -9,11 +9,11 @@ import { lengthText } from "./units.js";
 
 export interface FollowDeeds {
   go(mode: FollowMode, distance_m: number | null): void;
-  /** Stop, or forget what was marked. */
+  /** Stop, or forget the target. */
   stop(): void;
 }
 
-/** Confidence, distance and how well it is known, in a line; what is not known is left out. Pure. */
+/** Confidence, distance and its certainty, in a line; unknown values are omitted. Pure. */
 export function figures({ confidence = null, range_m = null, range_deviation_m = null, lost_s = null }: Partial<FollowMessage>): string {
   const range = range_m === null ? "" : `${lengthText(range_m, 1)}${range_deviation_m === null ? "" : ` ± ${lengthText(range_deviation_m, 1)}`}`;
   return [confidence === null ? "" : t.follow.sure(Math.round(confidence * 100)), range, lost_s ? t.follow.lostFor(figure(lost_s, 1)) : ""].filter(Boolean).join(" · ");
@@ -29,7 +29,7 @@ export class FollowPanel {
   private readonly stop = h("button", { type: "button", class: "follow-stop", onclick: () => this.deeds.stop() });
   private problem = "";
   private can = "";
-  /** It opens under the finger that marked the target: a second press that was meant for the picture is no choice. */
+  /** It opens under the finger that marked the target: a second press meant for the picture is no choice. */
   private unread: ReturnType<typeof setTimeout> | null = null;
   private at: ((size: Size) => Point) | null = null;
   private height = 0;
@@ -48,7 +48,7 @@ export class FollowPanel {
     return !this.element.hidden;
   }
 
-  /** What was marked is being tracked; nothing flies. `at`: where a panel of that size lies in the view. */
+  /** The target is being tracked; nothing flies. `at`: the place for a panel of that size in the view. */
   open(at: (size: Size) => Point): void {
     this.at = at;
     this.distance.value = "";
@@ -60,20 +60,20 @@ export class FollowPanel {
 
   close(): void {
     this.read();
-    // What had the focus here would leave it nowhere, and a text field would go on keeping the keys.
+    // Otherwise the focus would go nowhere, and a text field would keep the keys.
     if (this.element.contains(document.activeElement)) this.element.closest<HTMLElement>(".pane")?.focus({ preventScroll: true });
     setHidden(this.element, true);
     this.height = 0;
   }
 
-  /** Why nothing can be flown now, in words; empty: it can. */
+  /** The reason why nothing can be flown now; empty: it can. */
   allow(why: string): void {
     this.can = why;
     for (const mode of FOLLOW_MODES) setDisabled(this.modes[mode], why !== "" || this.unread !== null);
     this.explain();
   }
 
-  /** It may be chosen from now on, by Enter too if the focus was not moved meanwhile. */
+  /** It can be chosen from now on, also by Enter if the focus was not moved meanwhile. */
   private read(): void {
     if (this.unread === null) return;
     clearTimeout(this.unread);
@@ -98,7 +98,7 @@ export class FollowPanel {
     this.explain();
   }
 
-  /** It stays where it is, unless it grows. */
+  /** It stays in place unless it grows. */
   private place(): void {
     const { offsetWidth: width, offsetHeight: height } = this.element;
     if (this.at === null || height === this.height) return;

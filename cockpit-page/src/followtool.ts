@@ -1,5 +1,5 @@
-// Marks on the picture of one camera what is to be followed: a box that is dragged, or what was detected. The picture
-// stands still while a box is drawn; the box belongs to that very frame, which the cockpit has kept.
+// Marks a target on the picture of one camera: a dragged box, or a detection. The picture is frozen while a box is drawn;
+// the box belongs to that very frame, which the cockpit has kept.
 
 import { h, setAttribute, setHidden, setText, svg } from "./dom.js";
 import { contain, type Fit } from "./drawing.js";
@@ -10,21 +10,21 @@ import { arrow } from "./maptool.js";
 import { isModalOpen } from "./modal.js";
 import type { Drawing } from "./model.js";
 
-/** A press that moves less than this is a click [CSS pixels]. */
+/** A press that moves less is a click [CSS pixels]. */
 const CLICK_PX = 6;
 
-/** As much of a camera's view as is used. */
+/** The part of a camera's view used here. */
 export interface FollowView {
   readonly element: HTMLElement;
   readonly canvas: HTMLCanvasElement;
   readonly camera: { readonly name: string };
-  /** The frame that is on the screen. */
+  /** The frame on the screen. */
   readonly frame: (Size & { captured_ns: string }) | null;
   readonly allDrawings: Iterable<Drawing>;
 }
 
 export interface FollowHost {
-  /** Frames of a camera are to be kept, as a box is about to be drawn; null: no longer. */
+  /** Keep a camera's frames while a box is drawn; null: stop keeping them. */
   select(camera: string | null): void;
   mark(mark: Mark): void;
   go(mode: FollowMode, distance_m: number | null): void;
@@ -46,9 +46,9 @@ export class FollowTool {
   private readonly panel: FollowPanel;
   private state: "off" | "selecting" | "marked" | "flying" = "off";
   private since: bigint | null = null;
-  /** The frame under the pointer that is down; its picture stands still. */
+  /** The frame under the pressed pointer; its picture is frozen. */
   private pressed: { still: Still; at: Point; id: number } | null = null;
-  /** Drawn by keys. */
+  /** The box drawn by keys. */
   private keyed: { box: Box; name: string; captured_ns: string | null } | null = null;
   private readonly escape = (event: KeyboardEvent): void => this.onEscape(event);
   private readonly hidden = (): void => void (document.hidden && this.state === "selecting" && this.off());
@@ -75,7 +75,7 @@ export class FollowTool {
     return this.state !== "off";
   }
 
-  /** Mark something, change one's mind about that, or stop. */
+  /** Mark a target, cancel that, or stop. */
   toggle(): void {
     if (this.state === "off") this.begin();
     else if (this.state === "selecting") this.off();
@@ -86,7 +86,7 @@ export class FollowTool {
     this.panel.allow(why);
   }
 
-  /** What the cockpit says of a target in this camera. */
+  /** The cockpit's report on a target in this camera. */
   update(message: FollowMessage): void {
     if (message.state === "selecting") {
       this.since = BigInt(message.since_ns ?? 0);
@@ -100,7 +100,7 @@ export class FollowTool {
     }
   }
 
-  /** A command was refused: true if that is shown here. */
+  /** A command was refused: true if shown here. */
   refused(command: string, why: string): boolean {
     if (this.state === "off") return false;
     if (command === "follow_select") this.close();
@@ -112,7 +112,7 @@ export class FollowTool {
     return false;
   }
 
-  /** Its view goes. */
+  /** Its view is closing. */
   end(): void {
     if (this.state === "selecting") this.host.select(null);
     else if (this.state !== "off") this.host.stop();
@@ -177,7 +177,7 @@ export class FollowTool {
     else setText(this.hint, t.follow.small);
   }
 
-  /** Its frame stands still no longer. */
+  /** Unfreeze the picture. */
   private release(): void {
     this.pressed = null;
     setHidden(this.still, true);
@@ -205,7 +205,7 @@ export class FollowTool {
     }
   }
 
-  /** By keys, one detection after the other, from left to right. */
+  /** By keys, one detection after another, from left to right. */
   private choose(step: 1 | -1): void {
     const all = [...this.found].sort((a, b) => a.box[0] - b.box[0]);
     if (all.length === 0) return setText(this.hint, t.follow.none);
@@ -214,7 +214,7 @@ export class FollowTool {
     this.keyed = (step > 0 ? beyond[0] : beyond.at(-1)) ?? (step > 0 ? all[0] : all.at(-1)) ?? null;
   }
 
-  /** `size`: of the picture that the box is drawn on, which may have been sent smaller than the frame is. */
+  /** `size`: of the picture under the box, which may have been sent smaller than the frame. */
   private mark(captured_ns: string, box: Box, name: string, { width: across, height: down }: Size): void {
     this.state = "marked";
     this.keyed = null;
@@ -225,7 +225,7 @@ export class FollowTool {
     this.panel.open((size) => beside(toView(fit, box), size, { width, height }));
   }
 
-  /** Copy what is on the screen; null if the cockpit has not kept that frame. */
+  /** Copy the picture on the screen; null if the cockpit has not kept that frame. */
   private freeze(): Still | null {
     const { frame, canvas } = this.view;
     if (frame === null || !this.isKept(frame.captured_ns)) return null;
@@ -246,7 +246,7 @@ export class FollowTool {
     return frame === null ? [] : foundIn(this.view.allDrawings, frame.captured_ns, frame);
   }
 
-  /** Where the picture lies in the view [CSS pixels]. */
+  /** The place of the picture in the view [CSS pixels]. */
   private get fit(): Fit {
     const { clientWidth: width, clientHeight: height } = this.view.element;
     return contain(this.view.canvas.width, this.view.canvas.height, { width, height }, 1);
@@ -290,7 +290,7 @@ export class FollowTool {
     document.removeEventListener("visibilitychange", this.hidden);
   }
 
-  /** Before it leaves the flight mode. What flies is not stopped by it, as it also closes dialogs. */
+  /** Before Escape leaves the flight mode. It does not stop a flight, as it also closes dialogs. */
   private onEscape(event: KeyboardEvent): void {
     if (event.code !== "Escape" || isModalOpen() || this.state === "flying") return;
     event.preventDefault();
@@ -300,6 +300,6 @@ export class FollowTool {
   }
 }
 
-/** The corners of a box, and what is in it. */
+/** The corners of a box, and its content. */
 const icon = (): SVGElement =>
   svg("svg", { viewBox: "0 0 20 20", width: 18, height: 18, "aria-hidden": "true" }, svg("path", { d: "M3 7V3h4M13 3h4v4M17 13v4h-4M7 17H3v-4M10 7.5a2.5 2.5 0 1 0 .01 0z", fill: "none", stroke: "currentColor", "stroke-width": 1.6, "stroke-linejoin": "round" }));

@@ -1,4 +1,4 @@
-// Numbers for people: from SI units and radians, with a true minus sign; a dash for what is not known.
+// Numbers for people: from SI units and radians, with a true minus sign; a dash for unknown values.
 
 export type Known = number | null | undefined;
 
@@ -16,7 +16,7 @@ export function figure(value: Known, decimals: number): string {
   return value < 0 && Number(text) !== 0 ? `−${text}` : text;
 }
 
-/** Three digits, as compasses have them. */
+/** Three digits, as on compasses. */
 export function headingText(yaw: Known): string {
   if (yaw === null || yaw === undefined) return "–";
   return String(Math.round(heading(yaw)) % 360).padStart(3, "0");
@@ -30,7 +30,7 @@ export function duration(seconds: Known): string {
   return seconds < 100 ? `${figure(seconds, 1)} s` : clock(seconds);
 }
 
-/** Minutes and seconds, with hours when there are any. */
+/** Minutes and seconds, and hours if any. */
 export function clock(seconds: Known): string {
   if (seconds === null || seconds === undefined || !Number.isFinite(seconds)) return "–";
   const whole = Math.max(0, Math.floor(seconds));
@@ -39,7 +39,7 @@ export function clock(seconds: Known): string {
   return h ? `${h}:${tail}` : tail;
 }
 
-/** About so long, in words. */
+/** A rough duration, in words. */
 export function lasting(seconds: number): string {
   if (seconds < 90) return `${Math.ceil(seconds)} s`;
   return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${plain(Math.round(seconds / 360) / 10)} h`;
@@ -57,7 +57,7 @@ export function bytes(count: Known): string {
   return `${value.toFixed(unit === 0 || value >= 99.5 ? 0 : 1)} ${units[unit]}`;
 }
 
-/** A number whose size is not known beforehand: four digits that matter. `coarse`: what is less than half of 0.0001 is 0. */
+/** A number of unknown magnitude: four significant digits. `coarse`: less than half of 0.0001 is 0. */
 export function short(value: Known, coarse = false): string {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);

@@ -6,7 +6,7 @@ import { PAD_DEEDS, type PadDeed, type PadMap, type PadMaps, type Source, source
 import type { Values } from "./settings.js";
 import { type Axis, CENTRED, Latch } from "./sticks.js";
 
-/** As much of a Gamepad as is read. */
+/** The part of a Gamepad that is read. */
 export interface Pad {
   id: string;
   index?: number | undefined;
@@ -21,21 +21,21 @@ export interface PadReading {
   deeds: Deed[];
   /** Its name; null without one. */
   name: string | null;
-  /** The buttons of the emergency stop are pressed, which is to be held. */
+  /** The buttons of the emergency stop are pressed; it must be held. */
   stops: boolean;
-  /** The one that was there a moment ago is gone, or another one is in its place. */
+  /** The gamepad that was there a moment ago is gone or was replaced. */
   lost: boolean;
-  /** Counts what hands have moved. */
+  /** Counts movements by hands. */
   touches: number;
 }
 
-/** The gamepads that are there: the one that flies first. */
+/** The connected gamepads, the one that flies first. */
 export function plugged(): Pad[] {
-  // Without a secure context there may be no such function.
+  // Without a secure context this function may be missing.
   return (navigator.getGamepads?.() ?? []).filter((pad): pad is Gamepad => pad?.connected ?? false).sort((a, b) => Number(b.mapping === "standard") - Number(a.mapping === "standard"));
 }
 
-/** What its axes fly: as they were assigned, else by the mode if browsers know its layout, else nothing. */
+/** What its axes fly: as assigned, else by the mode if browsers know its layout, else nothing. */
 export function sources(pad: Pad, map: PadMap, mode: Values["mode"]): Readonly<Record<Axis, Source | null>> {
   const none = { forward: null, left: null, up: null, yaw_rate: null };
   return map.sources ?? (pad.mapping === "standard" ? sourcesOf(mode) : none);
@@ -43,13 +43,13 @@ export function sources(pad: Pad, map: PadMap, mode: Values["mode"]): Readonly<R
 
 const isSame = (one: Pad | null, other: Pad | null): boolean => one?.id === other?.id && one?.index === other?.index;
 
-/** The one that flies: in flight no other one takes its place while it is there. */
+/** The gamepad that flies: in flight no other one replaces it while it is connected. */
 export const chosen = (pads: readonly Pad[], before: Pad | null, inFlight: boolean): Pad | null => (inFlight && pads.find((pad) => isSame(pad, before))) || (pads[0] ?? null);
 
 export const pressedOf = (pad: Pad): number[] => pad.buttons.flatMap(({ pressed }, button) => (pressed ? [button] : []));
 
 export class GamepadReader {
-  /** As it was read last. */
+  /** As last read. */
   pad: Pad | null = null;
   private readonly latch = new Latch();
   private before: PadDeed[] | null = null;
@@ -57,7 +57,7 @@ export class GamepadReader {
 
   constructor(private readonly maps: Pick<PadMaps, "get">) {}
 
-  /** Ask for centred sticks and released buttons before they count, as when control begins. */
+  /** Require centred sticks and released buttons before they count, as when control begins. */
   reset(): void {
     this.latch.reset();
     this.before = null;
@@ -72,7 +72,7 @@ export class GamepadReader {
     if (lost || pad === null || map === null) this.reset();
     if (pad === null || map === null) return { sticks: { ...CENTRED }, deeds: [], name: null, stops: false, lost, touches: this.touches };
     const pressed = PAD_DEEDS.filter((deed) => map.buttons[deed].length > 0 && map.buttons[deed].every((button) => pad.buttons[button]?.pressed));
-    // Browsers show a gamepad when it is first pressed: that press says no more than "here I am". The emergency stop is held for long.
+    // Browsers reveal a gamepad at its first press, which therefore only means "here I am". The emergency stop must be held anyway.
     const { before } = this;
     const deeds = pressed.filter((deed): deed is Exclude<PadDeed, "stop"> => deed !== "stop" && before !== null && !before.includes(deed));
     this.before = pressed;

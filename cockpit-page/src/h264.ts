@@ -1,34 +1,34 @@
-// Decodes one camera's H.264 by WebCodecs. Pictures build on one another: what can't be decoded is left out up to the
-// next key picture, which the server is asked for.
+// Decodes one camera's H.264 with WebCodecs. Pictures depend on one another: after a failure they are skipped until the
+// next key picture, which the page requests from the server.
 
-/** How a picture is encoded, as the server says it. */
+/** How a picture is encoded, as reported by the server. */
 export interface Encoding {
   key: boolean;
-  /** As the vehicle itself does it; once for all pages that ask for the same; for this page alone. */
+  /** By the vehicle itself; once for all pages with the same request; for this page alone. */
   kind: "vehicle" | "shared" | "own";
   kbit_s: number | null;
-  /** For this page alone, as pictures come late to the cockpit itself. */
+  /** For this page alone, because pictures reach the cockpit itself late. */
   late?: boolean;
 }
 
-/** Why a page gets less than others: its connection, the computer that it runs on, or what lies before the cockpit. */
+/** Why a page gets less than others: its connection, its computer, or the path before the cockpit. */
 export type Cause = "connection" | "computer" | "source";
-/** A page that stands still for longer, or needs longer for a picture, is on a busy computer [ms] … */
+/** A page that stalls for longer, or needs longer for a picture, runs on a busy computer [ms] … */
 export const BUSY_MS = 150;
-/** … and that was the cause of what happens within this time [ms]. */
+/** … and that explains events within this time [ms]. */
 export const LATELY_MS = 3000;
 
-/** Why this page has a stream of its own. Pure. */
+/** Why this page has its own stream. Pure. */
 export class Pace {
   private busy_ms = Number.NEGATIVE_INFINITY;
   private cause: Cause | null = null;
 
-  /** Something that takes a moment took so long here. */
+  /** Reports a step that took this long here. */
   took(ms: number, now_ms: number): void {
     if (ms > BUSY_MS) this.busy_ms = now_ms;
   }
 
-  /** Null while it gets what all get; the cause stays until then, as a smaller picture is what ends its signs. */
+  /** Null while it gets the shared stream; the cause is kept until then, as a smaller picture removes its signs. */
   why(encoding: Encoding | null, now_ms: number): Cause | null {
     if (encoding?.kind !== "own") this.cause = null;
     else if (encoding.late) this.cause = "source";
@@ -45,7 +45,7 @@ export interface Unit {
   h264: Encoding;
 }
 
-/** As much of WebCodecs as is used. */
+/** The part of WebCodecs used here. */
 export interface Decoder {
   configure(config: VideoDecoderConfig): void;
   decode(chunk: EncodedVideoChunk): void;
@@ -69,14 +69,14 @@ const browser: Codecs<VideoFrame> = {
   cancel: (timer) => clearTimeout(timer as number),
 };
 
-/** What the proxy encodes: Main profile; any level. */
+/** The proxy's encoding: Main profile; any level. */
 const COMMON = "avc1.4D4028";
-/** A decoder that gives nothing for so long is begun anew [ms]. */
+/** A decoder without output for this long is restarted [ms]. */
 export const PATIENCE_MS = 1000;
-/** With so many failures in a row JPEGs are asked for instead. */
+/** After this many failures in a row the page requests JPEGs instead. */
 export const MOST_FAILURES = 3;
 
-/** Why there is no H.264 in this browser; "" if there is, "insecure" where it would be over https. */
+/** Why this browser has no H.264; "" if it has, "insecure" if it would over https. */
 export type WhyJpeg = "" | "insecure" | "browser";
 let known: Promise<WhyJpeg> | null = null;
 
@@ -96,7 +96,7 @@ async function ask(): Promise<WhyJpeg> {
   }
 }
 
-/** The codec's name by profile, constraints and level in the sequence parameter set; "" if there is none (Annex B). */
+/** The codec's name from profile, constraints and level in the sequence parameter set; "" if there is none (Annex B). */
 export function codecOf(data: Uint8Array): string {
   for (let at = 0; at + 6 < data.length; at += 1) {
     if (data[at] !== 0 || data[at + 1] !== 0 || data[at + 2] !== 1 || ((data[at + 3] ?? 0) & 0x1f) !== 7) continue;
@@ -113,20 +113,20 @@ interface Pending<P> {
 export class StreamDecoder<P extends Picture = VideoFrame> {
   private decoder: Decoder | null = null;
   private config = "";
-  private last: number | null = null; // seq of what was decoded last; null: wait for a key
+  private last: number | null = null; // seq of the last picture decoded; null: wait for a key
   private stamp = 0;
   private failures = 0;
   private closed = false;
   private readonly pending = new Map<number, Pending<P>>();
 
-  /** `lost` asks for a key picture; `failed` for JPEGs, as this browser can't decode what comes. */
+  /** `lost` requests a key picture; `failed` requests JPEGs, as this browser can't decode the stream. */
   constructor(
     private readonly lost: () => void,
     private readonly failed: () => void,
     private readonly around: Codecs<P> = browser as unknown as Codecs<P>,
   ) {}
 
-  /** The picture, which must be closed; null if it can't be decoded, or was passed by. */
+  /** The picture, which must be closed; null if it can't be decoded or was skipped. */
   decode(unit: Unit, data: Uint8Array): Promise<P | null> {
     const { key } = unit.h264;
     if (this.closed) return Promise.resolve(null);
@@ -158,7 +158,7 @@ export class StreamDecoder<P extends Picture = VideoFrame> {
     const codec = codecOf(data) || COMMON;
     const config = `${codec} ${unit.width} ${unit.height}`;
     if (this.decoder !== null && config === this.config) return;
-    // What it has not given yet is passed by, as this picture needs none of it.
+    // Skip its pending output, as this picture needs none of it.
     for (const [stamp, older] of this.pending) if (stamp < this.stamp) this.settle(stamp, older, null);
     this.decoder?.close();
     this.config = config;
@@ -169,7 +169,7 @@ export class StreamDecoder<P extends Picture = VideoFrame> {
       },
     );
     this.decoder = decoder;
-    // No description: parameter sets come in the stream, in Annex B form.
+    // No description: parameter sets are in the stream, in Annex B form.
     decoder.configure({ codec, optimizeForLatency: true });
   }
 

@@ -1,4 +1,4 @@
-// The map of keys and of the gamepad, and what the inputs do now.
+// The map of keys and gamepad, and the present state of the inputs.
 
 import { h, setAttribute, setText, setTone } from "./dom.js";
 import type { Flying, InputView } from "./flying.js";

@@ -1,17 +1,17 @@
-// What plots and maps remember: every number received, and where the drone flew. Pure.
+// The data behind plots and maps: every number received, and the drone's path. Pure.
 
 export const KEPT_S = 120;
-/** Shares of the present rate and more: the arrays never move. */
+/** Takes the present rate and more: the arrays never move. */
 const CAPACITY = 4096;
 
-/** Numbers by name against one time axis; the oldest are overwritten. What is missing is NaN. */
+/** Numbers by name over one time axis; the oldest are overwritten. Missing values are NaN. */
 export class History {
   readonly names = new Set<string>();
   private readonly times = new Float64Array(CAPACITY).fill(Number.NaN);
   private readonly series = new Map<string, Float32Array>();
   private written = 0;
 
-  /** `at_s` of a clock that does not go back. */
+  /** `at_s` of a clock that never goes back. */
   add(at_s: number, values: Readonly<Record<string, number | null>>): void {
     const slot = this.written % CAPACITY;
     this.times[slot] = at_s;
@@ -27,7 +27,7 @@ export class History {
     for (const one of this.series.values()) one.fill(Number.NaN);
   }
 
-  /** Time and values since `from_s`, oldest first; null for what was not known. */
+  /** Times and values since `from_s`, oldest first; null for unknown values. */
   since(from_s: number, names: readonly string[]): (number | null)[][] {
     const rows: (number | null)[][] = [[], ...names.map(() => [])];
     const first = Math.max(0, this.written - CAPACITY);
@@ -58,7 +58,7 @@ export class History {
   }
 }
 
-/** Where it was: a point for each step, and none older than asked. */
+/** The path: a point for each step, none older than requested. */
 export class Trail {
   points: { at_s: number; place: readonly [number, number, number] }[] = [];
 

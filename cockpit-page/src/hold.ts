@@ -1,13 +1,13 @@
-// The emergency stop's gesture: press and hold. It is hardly done by accident, and the countdown shows.
+// The emergency stop's gesture: press and hold. It hardly happens by accident, and shows a countdown.
 
 import { h, setAttribute, setText } from "./dom.js";
 import { t } from "./language/index.js";
 
-/** So long it is held [ms]. */
+/** How long it is held [ms]. */
 export const HOLD_MS = 800;
 const HINT_MS = 1500;
 
-/** What a held press comes to. Pure. */
+/** The outcome of a held press. Pure. */
 export class Hold {
   private since_ms: number | null = null;
 
@@ -28,7 +28,7 @@ export class Hold {
     return this.since_ms === null ? null : Math.min(1, (now_ms - this.since_ms) / HOLD_MS);
   }
 
-  /** Whether it has been held for long enough, which it is once. */
+  /** Whether it has been held long enough; true only once. */
   isDone(now_ms: number): boolean {
     if (this.since_ms === null || now_ms - this.since_ms < HOLD_MS) return false;
     this.since_ms = null;
@@ -36,13 +36,13 @@ export class Hold {
   }
 }
 
-/** What is done when it was held, and whose motors it is about, in words. */
+/** What happens after holding, and whose motors it concerns, in words. */
 export interface Deadly {
   what: string;
   act: () => void;
 }
 
-/** Counts what is held, wherever that began, in the middle of the screen and above everything that is there. */
+/** Shows the countdown of a hold, wherever that began, in the middle of the screen and above everything else. */
 export class Countdown {
   readonly element: HTMLElement;
   private readonly what = h("b", {});
@@ -64,12 +64,12 @@ export class Countdown {
     return this.hold.isHeld;
   }
 
-  /** Whether it is this that is held, and nothing that began elsewhere: only that is ended by who began it. */
+  /** Whether this one is held, not one that began elsewhere: a hold is ended only by its own origin. */
   holds(deadly: Deadly | null): boolean {
     return deadly !== null && this.held === deadly;
   }
 
-  /** What is held already goes on. `button`: where it is held; once that is gone, nobody sees that it is let go. */
+  /** A hold under way continues. `button`: where it is held; if that disappears, the release would go unseen. */
   press(deadly: Deadly, button: Element | null = null): void {
     if (this.hold.isHeld) return;
     clearTimeout(this.hint);
@@ -119,10 +119,10 @@ export class Countdown {
   }
 }
 
-/** A button that is held: by pointer, or by the space bar or Enter. `deadly` is asked when the press begins. */
+/** A button to hold: by pointer, or by the space bar or Enter. `deadly` is called when the press begins. */
 export function holdButton(countdown: Countdown, deadly: () => Deadly | null, attributes: Record<string, string>, ...children: (Node | string)[]): HTMLButtonElement {
   const button = h("button", { type: "button", ...attributes }, ...children);
-  let pressed: { by: number | string; meant: Deadly } | null = null; // by which finger or key: to let go of another one ends nothing
+  let pressed: { by: number | string; meant: Deadly } | null = null; // the finger or key: releasing another one ends nothing
   const press = (by: number | string): void => {
     const meant = deadly();
     if (meant === null || button.disabled) return;
@@ -136,7 +136,7 @@ export function holdButton(countdown: Countdown, deadly: () => Deadly | null, at
     const { meant } = pressed;
     pressed = null;
     setAttribute(button, "data-held", "false");
-    if (countdown.holds(meant)) countdown.release(); // or it is done, and what is held now was begun elsewhere
+    if (countdown.holds(meant)) countdown.release(); // otherwise it is done, and the present hold began elsewhere
   };
   button.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;
@@ -144,7 +144,7 @@ export function holdButton(countdown: Countdown, deadly: () => Deadly | null, at
     press(event.pointerId);
   });
   for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) button.addEventListener(end, (event) => release(event.pointerId));
-  // Keys are let go elsewhere then. A finger is captured: wherever the focus goes, it is seen here.
+  // Keys are then released elsewhere. A finger is captured: its release is seen wherever the focus goes.
   button.addEventListener("blur", () => typeof pressed?.by === "string" && release(pressed.by));
   button.addEventListener("contextmenu", (event) => event.preventDefault()); // a long press on a touch screen
   button.addEventListener("keydown", (event) => {

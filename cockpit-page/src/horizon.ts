@@ -12,7 +12,7 @@ const [LEFT, RIGHT, TOP, BOTTOM] = [56, 264, 6, 186];
 const [MID_X, MID_Y] = [(LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2];
 const DESCRIBED_MS = 2000;
 
-/** A scale that moves behind a mark. Its few labels are used again and again. */
+/** A scale that moves behind a mark. Its few labels are reused. */
 class Tape {
   readonly group = svg("g", { class: "tape" });
   private readonly box: SVGTextElement;
@@ -25,7 +25,7 @@ class Tape {
     private readonly step: number,
     private readonly unit_px: number,
     private readonly name: (value: number) => string,
-    /** Of lengths and speeds: the scale is the person's. */
+    /** For lengths and speeds: the scale is in the person's units. */
     private readonly of: "length" | "speed" | null = null,
   ) {
     const { x, y, width, height } = from;
@@ -52,7 +52,7 @@ class Tape {
     );
   }
 
-  /** `value` in SI units or degrees, shown in the person's with so many decimals, or as `text`. */
+  /** `value` in SI units or degrees, shown in the person's units with this many decimals, or as `text`. */
   show(si: Known, decimals: number, text?: string): void {
     const { factor, name } = this.of ? unit(this.of) : { factor: 1, name: "" };
     const value = si === null || si === undefined ? si : si * factor;
@@ -69,7 +69,7 @@ class Tape {
       const [px, py] = this.vertical ? [x + width / 2, y + height / 2 - away] : [x + width / 2 + away, y + height / 2];
       label.setAttribute("transform", `translate(${px.toFixed(1)} ${py.toFixed(1)})`);
       setText(label, this.name(at));
-      const half = (step * unit_px) / 2; // a line between each two
+      const half = (step * unit_px) / 2; // one line between two labels
       const ends = this.vertical ? [x + width / 2 - 5, py - half, x + width / 2 + 5, py - half] : [px + half, y + height / 2 - 4, px + half, y + height / 2 + 4];
       ["x1", "y1", "x2", "y2"].forEach((key, place) => line.setAttribute(key, (ends[place] as number).toFixed(1)));
     });

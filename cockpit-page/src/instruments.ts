@@ -1,4 +1,4 @@
-// Beside the pictures: the flight display, figures, who has control, and the links from this page to the vehicle.
+// Beside the pictures: the flight display, figures, the holder of control, and the links from this page to the vehicle.
 
 import { h, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { degrees, duration, figure, headingText, words } from "./format.js";
@@ -67,7 +67,7 @@ export class Instruments {
     this.links(state, connected, round_trip_s);
   }
 
-  /** The proxy does not answer: nothing else is known, but why. */
+  /** The proxy does not answer: only the reason is known. */
   lost(state: State): void {
     this.links(state, true, null);
   }
@@ -76,7 +76,7 @@ export class Instruments {
     const slow = round_trip_s !== null && round_trip_s > SLOW_S;
     this.page.show(connected ? (round_trip_s === null ? named(t.linkStates, "up") : t.flight.milliseconds(Math.max(1, Math.round(round_trip_s * 1000)))) : named(t.linkStates, "lost"), connected ? (slow ? "warn" : "ok") : "bad");
     const hop = (name: string | undefined): [string, Tone] => (connected && name ? [named(t.linkStates, name), LINK_TONES[name] ?? "quiet"] : ["–", "quiet"]);
-    const over = state?.links.vehicle === "closed"; // a recording, which ends some time
+    const over = state?.links.vehicle === "closed"; // a recording that has ended
     this.application.show(...hop(state?.links.application));
     this.vehicle.show(...(over && connected ? ([t.linkStates["over"], "quiet"] as [string, Tone]) : hop(state?.links.vehicle)));
     setText(this.reason, connected ? (state?.links.reason ?? "") : "");
@@ -84,7 +84,7 @@ export class Instruments {
   }
 }
 
-/** The command that was applied last, in words. */
+/** The last command applied, in words. */
 export function commandText(state: State | null): string {
   const applied = state?.set_points;
   if (!applied) return t.instruments.noCommand;
@@ -94,12 +94,12 @@ export function commandText(state: State | null): string {
   return t.instruments.applied(`${words(applied.action)}${shown ? ` · ${shown}` : ""}`, age_s > 1 ? duration(age_s) : "");
 }
 
-/** Who has control, in words, when the newest state is too old to be sure. */
+/** The holder of control, in words, when the newest state is too old to be sure. */
 export function oldHolderText(mine: boolean): { who: string; more: string; tone: Tone } {
   return { who: t.instruments.unknownHolder, more: mine ? t.instruments.youHad : t.instruments.whoHas, tone: "quiet" };
 }
 
-/** Who has control, in words; `authority` is the state of this page's own connection, where there is one. */
+/** The holder of control, in words; `authority` is the state of this page's own connection, if any. */
 export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
   if (authority?.mine) return { who: t.instruments.youAs(authority.app), more: t.instruments.youHave(String(authority.priority ?? "–")), tone: "busy" };
   const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});

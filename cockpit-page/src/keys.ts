@@ -1,4 +1,4 @@
-// The map of keys. By place on the keyboard, not by letter: the same on every layout.
+// The map of keys. By position on the keyboard, not by letter, so that it is the same on every layout.
 
 import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
@@ -17,7 +17,7 @@ const STICKS: Readonly<Record<string, [Axis, 1 | -1]>> = {
   ArrowRight: ["yaw_rate", -1],
 };
 
-/** Browsers on macOS do not tell which keys are released while Cmd is down. */
+/** Browsers on macOS do not report key releases while Cmd is held. */
 const COMMAND = /^(Meta|OS)(Left|Right)$/;
 
 const DEEDS: Readonly<Record<string, Deed>> = {
@@ -54,28 +54,28 @@ export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
 export interface Press {
   code: string;
   repeat: boolean;
-  /** With Ctrl, Alt or Meta: the browser's own. */
+  /** With Ctrl, Alt or Meta: left to the browser. */
   modified: boolean;
-  /** What has the focus takes letters and arrows itself: a text field, a list. */
+  /** Whether the focused element uses letters and arrows itself: a text field, a list. */
   typing: boolean;
 }
 
 export const isEnter = (code: string): boolean => code === "Enter" || code === "NumpadEnter";
 
-/** Ctrl and Enter, held: motors off, whatever has the focus. With Shift those of all drones; null: something else. */
+/** Ctrl and Enter, held: motors off, whatever has the focus. With Shift, of all drones; null: another key. */
 export function stopKeys(event: { code: string; ctrlKey: boolean; shiftKey: boolean; altKey: boolean; metaKey: boolean }): "one" | "all" | null {
   if (!event.ctrlKey || event.altKey || event.metaKey) return null;
   if (!isEnter(event.code)) return null;
   return event.shiftKey ? "all" : "one";
 }
 
-/** Keys that are held, and what single presses mean. */
+/** The keys held, and the meaning of single presses. */
 export class Keys {
-  /** Counts what fingers have pressed. */
+  /** Counts presses of keys. */
   touches = 0;
   private readonly held = new Set<string>();
 
-  /** What a press means: a deed, "stick" for one that flies, or null. */
+  /** The meaning of a press: an action, "stick" for one that flies, or null. */
   down(press: Press): Deed | "stick" | null {
     if (COMMAND.test(press.code)) this.clear();
     if (press.modified || press.typing) return null;
@@ -92,7 +92,7 @@ export class Keys {
     this.held.delete(code);
   }
 
-  /** The page lost the focus: releases that come now are not seen. */
+  /** The page lost the focus: releases from now on are not seen. */
   clear(): void {
     this.held.clear();
   }

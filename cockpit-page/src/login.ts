@@ -1,16 +1,16 @@
-// Who asks: a session that is there, or a token that is asked for once.
+// Log-in: an existing session, or a token that is requested once.
 
 import { get, post, errorText } from "./api.js";
 import { h, setText } from "./dom.js";
 import { t } from "./language/index.js";
 import type { Session } from "./model.js";
 
-/** The code to pair with that an address has after its `#`; null for any other address. Pure. */
+/** The pairing code after the `#` of an address; null for any other address. Pure. */
 export const pairingCode = (hash: string): string | null => /^#pair=([\w-]{16,64})$/.exec(hash)?.[1] ?? null;
 
-/** Resolves when the user is logged in. What is needed until then is shown in `place`. */
+/** Resolves when the user is logged in. Until then `place` shows the form. */
 export async function session(place: HTMLElement): Promise<Session> {
-  // It works once: it is not kept in the address, nor in the browser's history.
+  // The code works once: keep it out of the address and the browser's history.
   let code = pairingCode(location.hash);
   if (code !== null) history.replaceState(null, "", location.pathname);
   for (;;) {

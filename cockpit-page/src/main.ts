@@ -1,4 +1,4 @@
-// The page: who asks, all drones, and those that are opened.
+// The page: log-in, all drones, and the open ones.
 
 import "uplot/dist/uPlot.min.css";
 import "./style/base.css";
@@ -38,9 +38,9 @@ import { followTheme } from "./settings.js";
 import type { Own } from "./tile.js";
 
 const DRAW_MS = 45;
-/** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
+/** The list of drones arrives twice a second; when older than this it is grey [ms]. */
 const OLD_LIST_MS = 2000;
-/** Lower windows, as those of a page that is enlarged to 400 %, keep only the safety controls of the bar in sight. */
+/** In lower windows, as of a page enlarged to 400 %, only the safety controls of the bar stay in sight. */
 const LOW_PX = 500;
 
 const isFlown = (pane: Pane): pane is Pane & Flown => pane.pilot !== null;
@@ -56,25 +56,25 @@ class Page {
   private readonly all = h("button", { type: "button", class: "small all-drones", onclick: () => this.leave() }, t.overview.all);
   private readonly deckhouse: HTMLElement;
   private readonly bar: HTMLElement;
-  /** Nobody has chosen yet what to see: the only drone is opened by itself. */
+  /** Nobody has chosen a view yet: a single drone is opened automatically. */
   private undecided = namesOf(location.hash).length === 0 && location.hash !== OVERVIEW;
-  /** Overviews in a row with one and the same only drone. */
+  /** Consecutive overviews with the same single drone. */
   private lonely = 0;
   private readonly lostAge = h("span", { "aria-hidden": "true" });
   private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, t.page.lost, this.lostAge);
-  /** What concerns all drones: in a line that is there anyhow, of what is shown. */
+  /** Messages about all drones, in a line of the visible view that exists anyway. */
   private readonly said = h("div", { class: "page-said" }, this.lost);
   private readonly countdown = new Countdown();
   private readonly safety: Safety | null;
   private readonly clock = new ServerClock();
-  /** Of the whole list: heard in the overview, once each. */
+  /** Of the whole list: sounded in the overview, once each. */
   private readonly listed = new AlarmBook();
   private readonly sound = new AlarmSound(() => [
     { name: "", raised: this.listed.raised, loudest: this.inOverview ? this.listed.loudest : null, repeats: false },
     ...[...this.panes.values()].map((pane) => pane.alarmSource),
   ]);
   private listed_ms = performance.now();
-  /** How much of each pane is on the screen [pixels²]. */
+  /** The visible area of each pane [pixels²]. */
   private readonly seen = new Map<string, number>();
   private readonly sight = new IntersectionObserver((entries) => this.look(entries), { threshold: [0, 0.05, 0.25, 0.5, 0.75, 1] });
   private readonly help: Help;
@@ -111,7 +111,7 @@ class Page {
     });
     this.route();
     window.addEventListener("popstate", () => this.route());
-    // The address says what is shown, so a link within the page must not change it.
+    // The address selects the view, so a link within the page must not change it.
     document.querySelector<HTMLElement>(".skip")?.addEventListener("click", (event) => {
       event.preventDefault();
       (this.inOverview ? this.overview.element : this.main).focus();
@@ -120,7 +120,7 @@ class Page {
       message: (data) => this.see(JSON.parse(data as string) as { now_s: number; drones: DroneRow[] }),
       state: (open, code) => this.linked(open, code),
     });
-    // All of them at once, and no faster than states arrive: painting is what costs most.
+    // All at once, and no faster than states arrive: painting is the largest cost.
     let drawn_ms = 0;
     const draw = (now_ms: number): void => {
       requestAnimationFrame(draw);
@@ -150,7 +150,7 @@ class Page {
     this.openOnly(rows);
   }
 
-  /** Open the only drone, unless others come right after it; the way back leads to the overview. */
+  /** Open the single drone, unless others follow at once; Back leads to the overview. */
   private openOnly(rows: readonly DroneRow[]): void {
     const only = rows[0];
     if (!this.undecided || !only) return;
@@ -164,12 +164,12 @@ class Page {
   /** The list of drones is grey when it is old. */
   private age(now_ms: number): void {
     const old_ms = now_ms - this.listed_ms;
-    setHidden(this.lost, old_ms <= OLD_LIST_MS || !this.inOverview); // an opened drone says it itself
+    setHidden(this.lost, old_ms <= OLD_LIST_MS || !this.inOverview); // an open drone shows it itself
     for (const part of [this.fleet.element, this.overview.element, this.overview.side]) setAttribute(part, "data-old", String(old_ms > OLD_LIST_MS));
     if (old_ms > OLD_LIST_MS) setText(this.lostAge, `${(old_ms / 1000).toFixed(0)} s`);
   }
 
-  /** How much of the window the bar has; where a window is low it leaves no more there than what stops and lands. */
+  /** The share of the window for the bar; in a low window only the buttons that stop and land remain. */
   private measure(): void {
     const safety = this.safety?.element;
     const away_px = window.innerHeight < LOW_PX && safety?.parentElement === this.bar ? Math.max(0, safety.offsetTop - 4) : 0;
@@ -178,7 +178,7 @@ class Page {
     style.setProperty("--bar", `${this.bar.offsetHeight - away_px}px`);
   }
 
-  /** One drone alone has the whole window for its picture, unless the person wants the panels beside it. */
+  /** A single drone gets the whole window for its picture, unless the person wants the panels beside it. */
   private frame(): void {
     const alone = this.panes.size === 1;
     const panels = memory.get("panels") === "true";
@@ -195,12 +195,12 @@ class Page {
     return this.deckhouse.dataset["view"] === "overview";
   }
 
-  /** What a recording that is begun now records. */
+  /** The drones that a recording started now would record. */
   private get recorded(): string[] {
     return this.inOverview ? this.rows.filter((row) => !isRecording(row)).map((row) => row.name) : [...this.panes.keys()];
   }
 
-  /** What this page itself has to do with a drone. */
+  /** This page's own relation to a drone. */
   private own(name: string): Own {
     const pane = this.panes.get(name);
     return pane?.isAsked ? "asked" : pane?.pilot?.mine ? "held" : "";
@@ -221,14 +221,14 @@ class Page {
     this.route();
   }
 
-  /** Show what the address says: those drones, or all. */
+  /** Show the view in the address: some drones, or all. */
   private route(): void {
     const names = namesOf(location.hash);
     if (names.length === 0) this.showAll();
     else names.forEach((name, place) => (place === 0 || !this.panes.has(name)) && this.open(name, place === 0));
   }
 
-  /** What this page flies stays as it is meanwhile, and no key flies what isn't seen. */
+  /** Flights of this page continue meanwhile, and no key flies an invisible drone. */
   private showAll(): void {
     for (const [name, pane] of [...this.panes]) if (!pane.pilot?.mine) this.drop(name, pane);
     this.view(true);
@@ -244,14 +244,14 @@ class Page {
     this.frame();
   }
 
-  /** `alone`: instead of those that are open; else beside them, or closed if it is open. */
+  /** `alone`: in place of the open ones; else beside them, or closed if it is open. */
   private open(name: string, alone: boolean): void {
     this.undecided = false;
     if (!alone && this.panes.has(name)) {
       this.close(name);
       return;
     }
-    // What this page flies stays open: to look at something else is no reason to close it.
+    // A drone flown from this page stays open: looking at another is no reason to close it.
     if (alone) for (const [other, pane] of [...this.panes]) if (other !== name && !pane.pilot?.mine) this.drop(other, pane);
     if (!this.panes.has(name)) {
       const pane = new Pane(name, this.who.role === "pilot", {
@@ -296,7 +296,7 @@ class Page {
     this.panes.delete(name);
   }
 
-  /** Keys and the emergency stop are for what is seen: one that is scrolled away is not chosen any more. */
+  /** Keys and the emergency stop act on visible drones: one that is scrolled away is deselected. */
   private look(entries: readonly IntersectionObserverEntry[]): void {
     for (const entry of entries) {
       const name = (entry.target as HTMLElement).dataset["drone"] ?? "";

@@ -1,4 +1,4 @@
-// The map from above: north is up. It shows a scene, and what is done on it is its tool's affair.
+// The map from above, with north up. It shows a scene and leaves interaction to its tool.
 
 import { colour, fit, h, setText } from "./dom.js";
 import { t } from "./language/index.js";
@@ -12,8 +12,8 @@ import type { Scene } from "./world.js";
 const PERIOD_MS = 80;
 const CLICK_PX = 5;
 const REACH_PX = 12;
-const EASE = 0.15; // of the way to the wanted view, each time that it is drawn
-const STILL = 0.01; // of the view's extent: less than this to the wanted view is no movement
+const EASE = 0.15; // share of the way to the desired view, per drawing
+const STILL = 0.01; // share of the view's extent: a smaller distance counts as no movement
 const ZOOM = 1.4;
 const INKS = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "target"];
 
@@ -32,19 +32,19 @@ export class MapView {
   private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, t.map.fit);
   private tool: MapTool | null = null;
   private view: View | null = null;
-  /** What is on the screen: what a press means is what is seen, though the page may have been laid out anew since. */
+  /** The scene on the screen: a press refers to what is visible, even if the layout has changed since. */
   private drawn: Shown | null = null;
   private room = "";
   private fitted = true;
   private drag: { x: number; y: number; shown: Shown; moved: boolean; taken: boolean } | null = null;
-  /** Of the keyboard, while the map has the focus; east and north [m]. */
+  /** The keyboard's cursor, while the map has the focus; east and north [m]. */
   private cursor: [number, number] | null = null;
   private ink: Ink = {};
   private drawn_ms = 0;
   private why = "";
 
   /**
-   * `standard` is its tool while no other is used; null for a map that is only looked at. `below` is shown under the map.
+   * `standard` is the tool while no other is used; null for a map without interaction. `below` is shown under the map.
    */
   constructor(
     private readonly scene: () => Scene,
@@ -54,7 +54,7 @@ export class MapView {
     const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? t.map.zoomIn : t.map.zoomOut, onclick: () => this.zoom(factor) }, sign);
     const buttons = h("div", { class: "map-buttons" }, zoom("+", ZOOM), zoom("−", 1 / ZOOM), this.follow);
     this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, this.corner, buttons), ...below, this.note, this.spoken);
-    // A press leaves the focus where it is: what has it may fly, and only who comes by Tab wants the map's own keys.
+    // A press leaves the focus where it is: the focused element may fly, and only a person who comes by Tab wants the map's keys.
     this.canvas.addEventListener("mousedown", (event) => event.preventDefault());
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
     this.canvas.addEventListener("pointermove", (event) => this.move(event));
@@ -67,7 +67,7 @@ export class MapView {
     this.hint();
   }
 
-  /** Presses and keys are for this tool from now on; null: for the standard one. */
+  /** Presses and keys now go to this tool; null: to the standard one. */
   use(tool: MapTool | null): void {
     if (tool === this.tool) return;
     this.used?.dropped?.();
@@ -76,17 +76,17 @@ export class MapView {
     this.hint();
   }
 
-  /** The tool that is used now; null where the map is only looked at. */
+  /** The tool in use; null for a map without interaction. */
   get used(): MapTool | null {
     return this.tool ?? this.standard;
   }
 
-  /** Colours have changed. */
+  /** The colours have changed. */
   repaint(): void {
     this.ink = Object.fromEntries(INKS.map((name) => [name, colour(name)]));
   }
 
-  /** Why nothing is flown from here now, shown in place of the tool's hint; empty: it can be. */
+  /** The reason why nothing can be flown from here now, shown in place of the tool's hint; empty: it can. */
   allow(why: string): void {
     this.why = why;
     this.canvas.classList.toggle("clickable", why === "");
@@ -135,7 +135,7 @@ export class MapView {
     if (!wanted) return;
     const { view } = this;
     const known = room.flat().join();
-    const jumps = !view || known !== this.room; // a room that has become known is not approached, it is shown
+    const jumps = !view || known !== this.room; // show a newly known room at once, without easing
     this.room = known;
     const mix = (from: number, to: number): number => from + (to - from) * EASE;
     this.view = jumps ? wanted : { east: mix(view.east, wanted.east), north: mix(view.north, wanted.north), scale: mix(view.scale, wanted.scale) };
@@ -167,7 +167,7 @@ export class MapView {
 
   // Pointers and keys, for the tool
 
-  /** A pixel of the canvas as it is now, as one of the picture on it: it is stretched until it is drawn anew. */
+  /** Convert a pixel of the canvas to one of the picture on it, which is stretched until the next drawing. */
   private pixel(event: PointerEvent): [number, number] {
     const { size, drawn } = this;
     return drawn ? [(event.offsetX * drawn.size.width) / size.width, (event.offsetY * drawn.size.height) / size.height] : [event.offsetX, event.offsetY];
@@ -186,7 +186,7 @@ export class MapView {
     this.canvas.setPointerCapture(event.pointerId);
     const [x, y] = this.pixel(event);
     const taken = this.used?.press(this.spot(shown, x, y)) ?? false;
-    if (taken) this.free(); // the view stays while something is dragged
+    if (taken) this.free(); // keep the view while dragging
     this.drag = { x, y, shown, moved: false, taken };
   }
 
@@ -210,7 +210,7 @@ export class MapView {
     const { drag } = this;
     this.drag = null;
     if (!drag || (drag.moved && !drag.taken)) return;
-    // A click means what was seen when it was pressed, though the view may have eased on since.
+    // A click refers to the scene at the time of the press, although the view may have moved since.
     const shown = drag.moved ? (this.drawn ?? drag.shown) : drag.shown;
     this.used?.lift(this.spot(shown, ...this.pixel(event)), !drag.moved);
   }

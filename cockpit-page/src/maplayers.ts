@@ -1,4 +1,4 @@
-// What the map shows, from below to above: grid, paths, waypoints, drones, names.
+// The layers of the map, from bottom to top: grid, paths, waypoints, drones, names.
 
 import { figure } from "./format.js";
 import { t } from "./language/index.js";
@@ -43,7 +43,7 @@ export function caption({ pen, ink, size }: Omit<Chart, "view" | "at">, text: st
   pen.fillText(text, size.width / 2, size.height / 2);
 }
 
-/** Where the keyboard's cursor is. */
+/** The keyboard's cursor. */
 export function crosshair({ pen, ink, at }: Chart, place: readonly number[]): void {
   const [x, y] = at(place);
   pen.beginPath();
@@ -74,7 +74,7 @@ export function flag({ pen, ink, at }: Pick<Chart, "pen" | "ink" | "at">, place:
 
 function grid({ pen, view, size, ink }: Chart): void {
   const { factor, name } = unit("length");
-  const step = gridStep(view.scale / factor); // in the unit that people read
+  const step = gridStep(view.scale / factor); // in the displayed unit
   const [west, north] = toMetres(view, size, 0, 0);
   const [east, south] = toMetres(view, size, size.width, size.height);
   pen.lineWidth = 1;
@@ -85,7 +85,7 @@ function grid({ pen, view, size, ink }: Chart): void {
   pen.beginPath();
   const decimals = step < 1 ? 1 : 0;
   const scale = t.map.grid(`${figure(step, decimals)} ${name}`);
-  const free = size.width - 8 - pen.measureText(scale).width - 14; // no number under the caption
+  const free = size.width - 8 - pen.measureText(scale).width - 14; // keep numbers clear of the caption
   for (let x = Math.ceil((west * factor) / step) * step; x <= east * factor; x += step) {
     const px = Math.round(toPixels(view, size, x / factor, 0)[0]) + 0.5;
     pen.moveTo(px, 0);

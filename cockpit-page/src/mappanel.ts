@@ -1,4 +1,4 @@
-// The map of one drone with its tools: flying to a place, and the zones.
+// The map of one drone with its tools: flying to a place, routes, and zones.
 
 import { h, setAttribute, setHidden } from "./dom.js";
 import { t } from "./language/index.js";
@@ -13,20 +13,20 @@ import { ZoneTool } from "./zonetool.js";
 
 export interface MapHost {
   scene(): Scene;
-  /** Where the drone is; null while that is not known. */
+  /** The drone's position; null while unknown. */
   own(): Vector | null;
   stands(): boolean;
   goTo(x: number, y: number, z: number): void;
-  /** Along a route that was checked, and what is done with it on the way. */
+  /** Fly along a checked route, and control that flight. */
   flyRoute(id: string): void;
   steerRoute(deed: RouteDeed): void;
-  /** Write a parameter; returns why it was refused, or nothing. */
+  /** Write a parameter; returns the reason of a refusal, empty if written. */
   write(name: string, value: string | number): Promise<string>;
 }
 
 export class MapPanel {
   readonly element: HTMLElement;
-  /** Other tools may be used on it: `map.use(tool)`. */
+  /** Other tools can be used on it: `map.use(tool)`. */
   readonly map: MapView;
   readonly surroundings: Surroundings;
   readonly route: RoutePanel;
@@ -72,7 +72,7 @@ export class MapPanel {
     if (only) this.map.use(null);
   }
 
-  /** Why it can't be flown to a place now, and why no zone can be written; empty: it can. */
+  /** The reasons why it can't be flown to a place now, and why no zone can be written; empty: it can. */
   allow(fly: string, write: string): void {
     this.why = { fly, write };
     this.waypoint.allow(fly === "");
@@ -93,7 +93,7 @@ export class MapPanel {
     this.surroundings.close();
   }
 
-  /** The parts of the tool that is used. */
+  /** Show the fields of the tool in use. */
   private arrange(): void {
     const used = this.map.used;
     setHidden(this.edit, this.recording);

@@ -1,44 +1,44 @@
-// What a tool of the map is: it draws over the map, and gets presses and keys with places in metres. One is in use at a time.
+// A tool of the map: it draws over the map, and gets presses and keys with places in metres. One is in use at a time.
 
 import type { Body } from "./world.js";
 
-/** From metres, world axes, to pixels of the map; a height is ignored. */
+/** From metres in world axes to pixels of the map; heights are ignored. */
 export type Project = (place: readonly number[]) => [number, number];
 
 /** The page's colours by name. */
 export type Ink = Readonly<Record<string, string>>;
 
-/** A place of the map under a pointer, or under the cursor of the keyboard. */
+/** A place on the map under a pointer or the keyboard's cursor. */
 export interface Spot {
   /** East and north [m]. */
   place: [number, number];
-  /** The same on the map [pixels]. */
+  /** The place on the map [pixels]. */
   pixel: [number, number];
-  /** What is no farther than this counts as under it [m]. */
+  /** Anything within this distance counts as under it [m]. */
   reach_m: number;
-  /** The drone or target that is under it, the nearest first; null for none. */
+  /** The drone or target under it, the nearest first; null: none. */
   under: Body | null;
 }
 
 export interface MapTool {
-  /** What a press does now, in a few words: shown below the map. */
+  /** The effect of a press now, in a few words: shown below the map. */
   readonly hint: string;
   draw(pen: CanvasRenderingContext2D, project: Project, ink: Ink): void;
-  /** A pointer goes down. True: what moves it from now on is the tool's, and the map keeps its view. */
+  /** A pointer is pressed. True: its movements belong to the tool from now on, and the map keeps its view. */
   press(spot: Spot): boolean;
-  /** A pointer that the tool has taken moves. */
+  /** A pointer taken by the tool moves. */
   move(spot: Spot): void;
-  /** A pointer goes up: one that the tool has taken, or one that was pressed and lifted at the same place (`click`). */
+  /** A pointer is released: one taken by the tool, or one pressed and released at the same place (`click`). */
   lift(spot: Spot, click: boolean): void;
-  /** A key, while the map has the focus; the cursor is at `spot`. True: it meant something, and the map ignores it. */
+  /** A key, while the map has the focus; the cursor is at `spot`. True: the tool used it, and the map ignores it. */
   key(event: KeyboardEvent, spot: Spot): boolean;
   /** The cursor of the keyboard has moved. */
   cursor?(spot: Spot): void;
-  /** Another tool, or none, is used from now on. */
+  /** Another tool, or none, is in use from now on. */
   dropped?(): void;
 }
 
-/** Keys that the map takes while it has the focus; all others fly, as everywhere. */
+/** Keys that the map uses while it has the focus; all others fly, as everywhere. */
 export const MAP_KEYS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight", "Enter", "NumpadEnter", "Equal", "NumpadAdd", "Minus", "NumpadSubtract", "Digit0", "Delete", "Backspace"]);
 
 const ARROWS: Readonly<Record<string, readonly [number, number]>> = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
@@ -46,7 +46,7 @@ const ARROWS: Readonly<Record<string, readonly [number, number]>> = { ArrowUp: [
 /** How far an arrow key moves the cursor, east and north, in steps; null for another key. */
 export const arrow = (code: string): readonly [number, number] | null => ARROWS[code] ?? null;
 
-/** What is nearest to a place within a reach [m]; null for nothing. */
+/** The nearest thing to a place within a distance [m]; null: none. */
 export function nearest<T extends { position: readonly number[] }>(place: readonly [number, number], reach_m: number, all: readonly T[]): T | null {
   let best: T | null = null;
   let least = reach_m;

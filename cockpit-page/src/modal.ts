@@ -1,5 +1,5 @@
-// A modal dialog: the rest of the page rests, the focus stays within and returns, Escape closes it. What must be in reach
-// whatever is open moves into it meanwhile.
+// A modal dialog: the rest of the page is inert, the focus stays within and returns, Escape closes it. Elements that must
+// always be within reach move into it meanwhile.
 
 import { h } from "./dom.js";
 import { t } from "./language/index.js";
@@ -29,7 +29,7 @@ export class Modal {
     return this.element.open;
   }
 
-  /** Any other is closed. */
+  /** Closes any other. */
   open(): void {
     if (this.element.open) return;
     for (const other of document.querySelectorAll<HTMLDialogElement>("dialog:modal")) other.close();

@@ -1,4 +1,4 @@
-// What the cockpit's server sends and receives: docs/cockpit.md. SI units and radians; what is not known is null.
+// The messages to and from the cockpit's server: docs/cockpit.md. SI units and radians; unknown values are null.
 
 import type { FollowMessage, FollowMode, Mark } from "./follow.js";
 import type { Encoding } from "./h264.js";
@@ -18,9 +18,9 @@ export interface Links {
   reason: string;
 }
 
-/** Something that is wrong with a drone now. */
+/** A present problem of a drone. */
 export interface Alarm {
-  /** What it is about, the same while it lasts: `battery`, `vehicle_link`, `video_age.front`, … */
+  /** Its subject, constant while it lasts: `battery`, `vehicle_link`, `video_age.front`, … */
   id: string;
   /** It may rise while it lasts. */
   severity: "warning" | "critical";
@@ -47,7 +47,7 @@ export interface DroneRow {
   position: Vector | null;
   altitude: number | null;
   yaw: number | null;
-  /** Played by this cockpit. */
+  /** Replayed by this cockpit. */
   replay: boolean;
 }
 
@@ -90,7 +90,7 @@ export interface Place {
 
 export interface State {
   type: "state";
-  /** When it was made, on the cockpit's clock. */
+  /** Time of making, on the cockpit's clock. */
   now_s: number;
   links: Links;
   feedback: { age_s: number | null; failsafe: string } | null;
@@ -99,7 +99,7 @@ export interface State {
   velocity: Vector | null;
   speed: number | null;
   position: Vector | null;
-  /** Where it took off. */
+  /** The place of take-off. */
   start: Vector | null;
   battery: number | null;
   flight: string;
@@ -128,7 +128,7 @@ export interface Parameter {
   default: Value | null;
   choices: Value[];
   read_only: boolean;
-  /** Writing it does something once, as a flip: it keeps no value. */
+  /** Writing it acts once, such as a flip: it keeps no value. */
   momentary: boolean;
   description: string;
 }
@@ -139,37 +139,37 @@ export interface Authority {
   holder: string | null;
   priority: number | null;
   mine: boolean;
-  /** How this page lost the control that it had; null if it did not. */
+  /** How this page lost control; null if it did not. */
   why: string | null;
-  /** This page has given it to who asked for it. */
+  /** This page handed it over on request. */
   given: boolean;
-  /** The name under which this page flies, as others see it; empty until the cockpit has said it. */
+  /** The name under which this page flies, as others see it; empty until the cockpit has sent it. */
   app: string;
-  /** Where this page waits; null while it does not. */
+  /** This page's place in the queue; null while it is not waiting. */
   line: QueuePosition | null;
-  /** The pages of this cockpit that wait for control, by the names under which others see them; this one, too. */
+  /** The pages of this cockpit that wait for control, by the names that others see; including this one. */
   waiting: readonly string[];
 }
 
 export interface QueuePosition {
   /** 1 is next. */
   position: number | null;
-  /** Expected when it was sent. */
+  /** Expected at the time of sending. */
   wait_s: number | null;
-  /** The one who has control was asked first, */
+  /** The holder was asked first, */
   asked: boolean;
-  /** and keeps it for this reason, which may be empty. */
+  /** and keeps control for this reason, which may be empty. */
   declined: string | null;
 }
 
-/** Somebody asks for the control that this page has. */
+/** A request for the control that this page has. */
 export interface Question {
   id: number;
   by: string;
   priority: number;
-  /** For how long it is wanted. */
+  /** How long control is wanted. */
   for_s: number | null;
-  /** Left of the time to answer when it was sent; then a higher priority has it. */
+  /** Time left to answer when it was sent; then a higher priority gets control. */
   left_s: number;
   /** By this page. */
   declined: boolean;
@@ -222,7 +222,7 @@ export interface RunningRecording {
   reason: string;
   seconds: number;
   bytes: number;
-  /** By drone and channel: what was received and left out, and what never came. */
+  /** By drone and channel: samples received and left out, and samples never received. */
   dropped: Record<string, Record<string, number>>;
   missed: Record<string, Record<string, number>>;
 }
@@ -234,7 +234,7 @@ export interface PastRecording {
   drones: string[];
   seconds: number | null;
   problem: string | null;
-  /** The beginning of what people wrote about it. */
+  /** The beginning of its note. */
   note: string;
   marks: number;
 }
@@ -266,10 +266,10 @@ export interface FrameHead {
   seq: number;
   captured_ns: string;
   age_s: number;
-  /** The cockpit's time when it was sent. */
+  /** The cockpit's time of sending. */
   now_s: number;
   width: number;
   height: number;
-  /** Of a picture that is no JPEG. */
+  /** For a picture other than JPEG. */
   h264?: Encoding;
 }

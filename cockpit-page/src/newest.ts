@@ -1,5 +1,5 @@
-// Newest frame wins: while one is being decoded, only the newest of those that come is kept. Every frame is
-// acknowledged once it was drawn or left out; the server sends the next one only then. No DOM here.
+// Newest frame wins: while one is being decoded, only the newest arrival is kept. Every frame is acknowledged after it was
+// drawn or skipped, and only then does the server send the next one. No DOM here.
 
 import type { FrameHead } from "./model.js";
 
@@ -18,7 +18,7 @@ export function unpack(data: ArrayBuffer): { head: FrameHead; jpeg: Uint8Array<A
 }
 
 export class NewestFrame<Picture extends { close(): void }> {
-  /** Frames that were not drawn because a newer one was there. */
+  /** Frames skipped because a newer one had arrived. */
   skipped = 0;
   private waiting: Received | null = null;
   private busy = false;
@@ -39,7 +39,7 @@ export class NewestFrame<Picture extends { close(): void }> {
     if (!this.busy) void this.work();
   }
 
-  /** Shows nothing any more, also what is being decoded. */
+  /** Show nothing any more, not even the frame being decoded. */
   end(): void {
     this.ended = true;
     this.waiting = null;
@@ -55,7 +55,7 @@ export class NewestFrame<Picture extends { close(): void }> {
         if (!this.ended) this.show(frame, picture);
         picture.close();
       } catch {
-        this.skipped += 1; // no picture: the next one may be
+        this.skipped += 1; // not a picture: the next one may be
       }
       if (!this.ended) this.acknowledge(frame.head.ack);
     }

@@ -1,4 +1,4 @@
-// All drones: a tile for each, or a line in a table when they are many, and one map of them all.
+// All drones: a tile for each, or a row in a table if there are many, and one map of them all.
 
 import { Battery } from "./battery.js";
 import { h, memory, setAttribute, setHidden, setText, setTone } from "./dom.js";
@@ -95,23 +95,23 @@ export class DroneTable {
   }
 }
 
-/** So many have a tile each; more are a table, unless the user chose otherwise. */
+/** Up to this many have a tile each; more are a table, unless the user chose otherwise. */
 export const MOST_TILES = 12;
 const SEARCH_FROM = 7;
-/** Positions come twice a second: to draw the map more often than this shows nothing more, and costs. */
+/** Positions arrive twice a second: drawing the map more often is wasted. */
 const MAP_MS = 240;
 const AGE_MS = 240;
 const MARGIN = "80px";
-/** Zones may be changed by anybody: they are read again so often. */
+/** Anyone may change zones: they are read again this often. */
 const AROUND_MS = 10_000;
 
 type Kind = "tiles" | "table";
 
 export class OverviewView {
   readonly element: HTMLElement;
-  /** The map, and what is beside the drones. */
+  /** The map and the other elements beside the drones. */
   readonly side: HTMLElement;
-  /** The place of what is said of all drones: it is always there, so that nothing moves when something is. */
+  /** The place for messages about all drones: always present, so that nothing moves when one appears. */
   readonly said: HTMLElement;
   private readonly video = new SmallVideo();
   private readonly tiles = new Map<string, Tile>();
@@ -119,7 +119,7 @@ export class OverviewView {
   private readonly table: DroneTable;
   private readonly map = new MapView(() => this.scene());
   private readonly trails = new Map<string, Trail>();
-  /** What stands around them, and where they may fly: of as many as have a tile, read while they are seen. */
+  /** Scenery and limits of as many drones as have a tile, read while they are visible. */
   private readonly surroundings = new Map<string, Surroundings>();
   private readonly none = h("p", { class: "empty nobody" }, t.overview.none, h("span", {}, t.overview.start), h("code", {}, "skyloop sim"));
   private readonly unfound = h("p", { class: "empty" }, t.overview.unfound);
@@ -148,7 +148,7 @@ export class OverviewView {
     window.addEventListener("resize", () => this.visible && this.tiles.forEach((tile) => tile.look()));
   }
 
-  /** Whether it is what the page shows; if not, it asks for no pictures and draws nothing. */
+  /** Whether it is the visible view; if not, it requests no pictures and draws nothing. */
   set shown(shown: boolean) {
     this.visible = shown;
     setHidden(this.element, !shown);
@@ -197,7 +197,7 @@ export class OverviewView {
     for (const tile of this.tiles.values()) tile.age(now_ms);
   }
 
-  /** Colours have changed. */
+  /** The colours have changed. */
   repaint(): void {
     this.map.repaint();
   }

@@ -1,5 +1,5 @@
-// What a gamepad's sticks and buttons do: seen as they move, and changed. While it is open the gamepad commands nothing at
-// all, not even the emergency stop: its keys and its button on the screen do.
+// The functions of a gamepad's sticks and buttons: shown as they move, and changed. While it is open the gamepad commands
+// nothing at all, not even the emergency stop: use its keys and its button on the screen.
 
 import { h, memory, setAttribute, setHidden, setText, svg } from "./dom.js";
 import { type Pad, plugged, pressedOf, sources } from "./gamepad.js";
@@ -13,19 +13,19 @@ const ROUND_MS = 40;
 const [WIDE, HIGH] = [72, 44];
 const UNKNOWN: PadMap = { ...STANDARD_MAP, buttons: { stop: [], takeoff: [], hover: [], land: [], take: [], release: [] } };
 
-/** For the dialog, and for who flies. */
+/** For the dialog, and for the part that flies. */
 export const padMaps = new PadMaps(memory);
 
 const mapOf = (pad: Pad): PadMap => padMaps.get(pad.id) ?? (pad.mapping === "standard" ? STANDARD_MAP : UNKNOWN);
 const buttonNames = (pad: Pad, buttons: readonly number[]): string[] => buttons.map((button) => (pad.mapping === "standard" && t.pad.buttons[button]) || t.pad.button(button + 1));
-/** Of both directions of an axis, or of the one of `sign`. */
+/** For both directions of an axis, or for that of `sign`. */
 function axisName(pad: Pad, axis: number, sign: Source["sign"] | 0): string {
   const stick = pad.mapping === "standard" ? t.pad.standard[axis] : undefined;
   const arrows = stick === undefined ? "−±+" : axis % 2 === 0 ? "←↔→" : "↑↕↓";
   return `${stick ?? t.pad.axis(axis + 1)} ${arrows[sign + 1]}`;
 }
 
-/** What a gamepad does, for the list of keys: of the one that is there, or as they all come. */
+/** A gamepad's functions for the list of keys: of the connected one, or the defaults. */
 export function padRows(pad: Pad | null): { keys: string[]; does: string }[] {
   const shown = pad ?? { id: "", mapping: "standard", connected: false, axes: [], buttons: [] };
   const map = mapOf(shown);
@@ -124,7 +124,7 @@ export class PadDialog {
     }
   }
 
-  /** What was asked for may have come. */
+  /** Check whether the requested input has arrived. */
   private assign(pad: Pad): void {
     const { waiting } = this;
     if (waiting === null) return;
@@ -207,7 +207,7 @@ class DeedRow {
 }
 
 const TRAVEL = 13;
-/** Where each button of the standard layout is: x, y and radius, or width for those that are bars. */
+/** The position of each button of the standard layout: x, y and radius, or width for bars. */
 const BUTTONS: readonly { x: number; y: number; radius?: number; width?: number }[] = [
   { x: 244, y: 92, radius: 9 }, { x: 264, y: 73, radius: 9 }, { x: 224, y: 73, radius: 9 }, { x: 244, y: 54, radius: 9 },
   { x: 46, y: 22, width: 54 }, { x: 220, y: 22, width: 54 }, { x: 52, y: 6, width: 42 }, { x: 226, y: 6, width: 42 },

@@ -1,4 +1,4 @@
-// What a gamepad's sticks and buttons do, remembered by its id. Pure but for the store.
+// The functions of a gamepad's sticks and buttons, remembered by its id. Pure except for the store.
 
 import type { Sticks } from "./model.js";
 import type { Values } from "./settings.js";
@@ -12,23 +12,23 @@ export interface Source {
   sign: 1 | -1;
 }
 
-/** Nothing within `deadZone`; `expo` from 0, a straight line, to 1, a cube: fine about the centre. */
+/** Nothing within `deadZone`; `expo` from 0, a straight line, to 1, a cube: fine near the centre. */
 export interface Curve {
   deadZone: number;
   expo: number;
 }
 
 export interface PadMap {
-  /** Null: as the mode of the sticks says, on a gamepad of the standard layout. */
+  /** Null: by the stick mode, on a gamepad with the standard layout. */
   sources: Readonly<Record<Axis, Source | null>> | null;
   curves: Readonly<Record<Axis, Curve>>;
-  /** All of a deed's buttons are pressed; none: not on this gamepad. */
+  /** All of an action's buttons pressed together; none: not on this gamepad. */
   buttons: Readonly<Record<PadDeed, readonly number[]>>;
 }
 
 export const AXES: readonly Axis[] = ["forward", "left", "up", "yaw_rate"];
 export const PAD_DEEDS: readonly PadDeed[] = ["stop", "takeoff", "hover", "land", "take", "release"];
-/** Without a dead zone a worn stick would never rest. */
+/** Without a dead zone a worn stick would never be at rest. */
 export const DEAD_ZONES = { minimum: 0.05, maximum: 0.5 } as const;
 const MOST = 64; // axes and buttons of a gamepad
 const MOVED = 0.6;
@@ -48,7 +48,7 @@ export function sourcesOf(mode: Values["mode"]): Record<Axis, Source> {
   return sources;
 }
 
-/** From −1 to 1, as are what goes in and comes out. */
+/** Input and output from −1 to 1. */
 export function shaped(value: number, { deadZone, expo }: Curve): number {
   if (!Number.isFinite(value)) return 0;
   const size = Math.min(1, Math.abs(value));
@@ -65,14 +65,14 @@ export function sticksOf(axes: readonly number[], sources: Readonly<Record<Axis,
   return { forward: of("forward"), left: of("left"), up: of("up"), yaw_rate: of("yaw_rate") };
 }
 
-/** With this axis for that direction; what had it before takes the one that is free now. */
+/** With this axis for that direction; the direction that had it gets the axis that becomes free. */
 export function withSource(sources: Readonly<Record<Axis, Source | null>>, name: Axis, source: Source): Record<Axis, Source | null> {
   const changed = { ...sources, [name]: source };
   for (const other of AXES) if (other !== name && sources[other]?.axis === source.axis) changed[other] = sources[name];
   return changed;
 }
 
-/** With these buttons for that deed, taken from others; null where one belongs to the emergency stop, which keeps its own. */
+/** With these buttons for that action, taken from others; null if one belongs to the emergency stop, which keeps its own. */
 export function withButtons(buttons: PadMap["buttons"], deed: PadDeed, pressed: readonly number[]): PadMap["buttons"] | null {
   if (deed !== "stop" && pressed.some((button) => buttons.stop.includes(button))) return null;
   const changed = { ...buttons };
@@ -80,7 +80,7 @@ export function withButtons(buttons: PadMap["buttons"], deed: PadDeed, pressed: 
   return { ...changed, [deed]: pressed };
 }
 
-/** The axis that has moved furthest from where it was, if that is far: which is the one that somebody moves on purpose. */
+/** The axis that moved furthest from its start, if far enough to be on purpose. */
 export function movedAxis(rest: readonly number[], axes: readonly number[]): Source | null {
   let [most, found] = [MOVED, null as Source | null];
   axes.forEach((value, axis) => {
@@ -90,15 +90,15 @@ export function movedAxis(rest: readonly number[], axes: readonly number[]): Sou
   return found;
 }
 
-/** Collects the buttons that are pressed together, until they are all released. */
+/** Collects the buttons pressed together, until all are released. */
 export class Chord {
   private readonly held = new Set<number>();
   private free = false;
 
-  /** Called with those that are pressed now; returns them all when none is any longer. */
+  /** Called with the buttons pressed now; returns them all once none is left. */
   update(pressed: readonly number[]): number[] | null {
     if (!this.free) {
-      this.free = pressed.length === 0; // what was held before counts for nothing
+      this.free = pressed.length === 0; // buttons held before don't count
       return null;
     }
     for (const button of pressed) this.held.add(button);
@@ -106,7 +106,7 @@ export class Chord {
   }
 }
 
-/** What was stored, or null if it is not a map: whoever can write there decides nothing strange. */
+/** The stored map, or null if it is invalid: other writers of the storage can't inject anything strange. */
 export function parsed(text: string | null): PadMap | null {
   try {
     const { sources, curves, buttons } = JSON.parse(text ?? "") as PadMap;
@@ -126,13 +126,13 @@ interface Store {
   set(name: string, value: string): void;
 }
 
-/** The maps that this browser remembers. */
+/** The maps remembered by this browser. */
 export class PadMaps {
   private readonly known = new Map<string, PadMap | null>();
 
   constructor(private readonly store: Store) {}
 
-  /** Null: as it comes. */
+  /** Null: the default. */
   get(id: string): PadMap | null {
     if (!this.known.has(id)) this.known.set(id, parsed(this.store.get(`gamepad ${id}`)));
     return this.known.get(id) ?? null;

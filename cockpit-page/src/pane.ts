@@ -1,4 +1,4 @@
-// One drone, opened: everything that is seen of it and done with it.
+// One open drone: everything shown and done about it.
 
 import { AlarmBanner, AlarmBook } from "./alarms.js";
 import type { AlarmSource } from "./alarmsound.js";
@@ -44,18 +44,18 @@ export interface PaneHost {
   help(): void;
   /** Into its flight mode, or out of it. */
   fly(pane: Pane): void;
-  /** What it is has become known: it could be flown. */
+  /** Its kind has become known: it could be flown. */
   known(pane: Pane): void;
   fillScreen(): void;
-  /** With the panels beside the picture, or without them: remembered. */
+  /** With or without the panels beside the picture: remembered. */
   panels(shown: boolean): void;
-  /** What its emergency stop is, or what became of it, may have changed. */
+  /** Its emergency stop, or the outcome of one, may have changed. */
   aimed(name: string): void;
   readonly countdown: Countdown;
 }
 
 const NOTICE_MS = 9000;
-/** So long the first connection may take before it is an alarm that there is none. */
+/** A first connection that takes longer raises an alarm. */
 const CONNECT_MS = 1500;
 const FLIGHT_TONES: Readonly<Record<string, Tone>> = { landed: "quiet", unknown: "quiet", emergency: "bad", landing: "busy", taking_off: "busy", hovering: "ok", flying: "ok" };
 const now_s = (): number => performance.now() / 1000;
@@ -63,11 +63,11 @@ const now_s = (): number => performance.now() / 1000;
 export class Pane {
   readonly element: HTMLElement;
   readonly pilot: Pilot | null;
-  /** Its line of alarms and messages, in which the page says what concerns all drones, too. */
+  /** Its line of alarms and messages, in which the page also shows messages about all drones. */
   readonly said = h("div", { class: "said" });
   private vehicle: Vehicle | null = null;
   private state: State | null = null;
-  /** Where it was when it was first seen in the air, in this flight. */
+  /** Its position when it was first seen in the air, in this flight. */
   private connected = false;
   private absent = "";
   private dirty = false;
@@ -85,7 +85,7 @@ export class Pane {
   private readonly opened_ms = performance.now();
   private wasConnected = false;
   private readonly fresh: Freshness;
-  /** Nothing is replayed any more: what is seen is the last of it. */
+  /** The replay has ended: the view shows its last state. */
   private readonly ended = h("p", { class: "banner ended-replay", role: "status", "data-tone": "quiet", hidden: true }, h("span", {}, t.pane.replayEnded), h("button", { type: "button", class: "small", onclick: () => this.host.close(this.name) }, t.modal.close));
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly hud = new FlightHud();
@@ -93,7 +93,7 @@ export class Pane {
   private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
   private readonly full = h("button", { type: "button", class: "full", "aria-label": t.pane.fullScreen, onclick: () => this.host.fillScreen() }, corners());
   private readonly panels = h("button", { type: "button", class: "small panels", "aria-pressed": "false", onclick: () => this.host.panels(this.panels.getAttribute("aria-pressed") !== "true") }, t.pane.panels);
-  /** Over the smaller one of picture and map, where one of them has nearly all of the pane: it changes them. */
+  /** On the smaller one of picture and map, when the other fills nearly the whole pane: swaps them. */
   private readonly swap = h("button", { type: "button", class: "swap", onclick: () => this.enlarge(this.element.dataset["large"] === "map" ? "picture" : "map") }, h("span", { "aria-hidden": "true" }, "⤢"));
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
@@ -109,7 +109,7 @@ export class Pane {
   private readonly parameters: Parameters;
   private readonly preflight: Preflight;
   private readonly controls: CameraControls;
-  /** Of a replay: its bar, where it is, and the flight as far as the cockpit knows it. */
+  /** Of a replay: its bar, its position, and the flight as far as the cockpit knows it. */
   private bar: ReplayBar | null = null;
   private playback: Playback | null = null;
   private timeline: Timeline | null = null;
@@ -169,24 +169,24 @@ export class Pane {
     this.element.remove();
   }
 
-  /** Somebody asks for the control that this page has of it. */
+  /** Another application asks for the control that this page has. */
   get isAsked(): boolean {
     return this.strip.question.isOpen;
   }
 
-  /** It is what was recorded: nothing flies. */
+  /** It is a recording: nothing flies. */
   get isRecording(): boolean {
     return this.vehicle !== null && isRecording(this.vehicle);
   }
 
-  /** What an emergency stop here stops; null where nothing flies, or who looks may not. */
+  /** What an emergency stop here stops; null if nothing flies, or for an observer. */
   get target(): Target | null {
     const { pilot } = this;
     if (pilot === null || this.isRecording || this.vehicle?.can_fly === false) return null;
     return { name: this.name, result: pilot.result("stop"), stop: () => pilot.act("stop") };
   }
 
-  /** What is to be heard of it. What was recorded is no alarm now. */
+  /** Its audible alarms. A recording has no present alarms. */
   get alarmSource(): AlarmSource {
     const { raised, loudest } = this.alarmBook;
     return { name: this.name, raised, loudest: this.isRecording ? null : loudest, repeats: true };
@@ -201,14 +201,14 @@ export class Pane {
     setAttribute(this.element, "data-selected", String(selected));
   }
 
-  /** How it lies in the window: alone with its picture first, or with its panels. */
+  /** Its layout in the window: alone with its picture first, or with its panels. */
   frame(alone: boolean, panels: boolean): void {
     setHidden(this.panels, !alone);
     setAttribute(this.panels, "aria-pressed", String(panels));
     setAttribute(this.element, "data-picture", String(alone && !panels));
   }
 
-  /** Where the picture is first: it, or the map, is the large one. */
+  /** With the picture first: it, or the map, is the large one. */
   private enlarge(what: string): void {
     memory.set("large", what);
     setAttribute(this.element, "data-large", what);
@@ -240,7 +240,7 @@ export class Pane {
     else if (deed !== "takeoff" || this.mayTakeOff()) this.pilot.act(deed);
   }
 
-  /** False: the pilot is asked once more, as something speaks against it. */
+  /** False: the pilot must confirm, because of a finding. */
   private mayTakeOff(): boolean {
     const question = this.state?.flight === "landed" ? this.preflight.ask(performance.now()) : "";
     if (question) this.notify(question, "bad");
@@ -248,7 +248,7 @@ export class Pane {
   }
 
   tick(now_ms: number): void {
-    // Of a replay that has ended nothing new can come: its own banner says so.
+    // Nothing new can arrive from a replay that has ended: its own banner says so.
     if (this.ended.hidden && this.fresh.update(now_ms, this.pilot?.age_ms(now_ms))) this.dirty = true;
     if (this.dirty) this.update();
     this.strip.count(this.pilot);
@@ -261,7 +261,7 @@ export class Pane {
     if (now_ms - this.noticed_ms > NOTICE_MS) setText(this.notice, "");
   }
 
-  /** Colours have changed. */
+  /** The colours have changed. */
   repaint(): void {
     this.map.repaint();
     this.plots.repaint();
@@ -284,7 +284,7 @@ export class Pane {
       changed: () => this.update(),
       refused: (command, why) => {
         if (command === "set" && [this.writes, this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
-        if (command === "fly" && this.fresh.isOld) return; // the whole pane shows that
+        if (command === "fly" && this.fresh.isOld) return; // the whole pane already shows that
         if (this.stage.followRefused(command, why)) return;
         this.notify(command ? t.commands.refused(named(t.commands.names, command), why) : why, "warn");
       },
@@ -336,7 +336,7 @@ export class Pane {
       this.state = message;
       this.absent = "";
       this.fresh.received(message, this.isRecording);
-      this.alarmBook.update(this.found(), performance.now()); // also while nobody sees the page, and nothing is drawn
+      this.alarmBook.update(this.found(), performance.now()); // even if the page is hidden and nothing is drawn
       this.remember(message);
       this.events.add(message.events);
       if (message.events.some((event) => event.kind === "parameter_changed")) this.map.surroundings.reload();
@@ -344,7 +344,7 @@ export class Pane {
     this.dirty = true; // shown with the next tick
   }
 
-  /** The time axis of plots and trail: a replay's own, which stands still and jumps as it does. */
+  /** The time axis of plots and trail: a replay's own, which pauses and jumps with it. */
   private get moment_s(): number {
     return this.playback?.position_s ?? now_s();
   }
@@ -352,7 +352,7 @@ export class Pane {
   private remember(state: State): void {
     const before_it = this.playback;
     this.playback = this.bar ? playbackOf(state.values) : null;
-    // Zones and limits are as they were recorded up to there.
+    // Zones and limits are those recorded up to that position.
     if (this.playback && momentOf(this.playback) !== (before_it && momentOf(before_it))) this.map.surroundings.reload();
     if (this.playback && this.playback.jumps !== before_it?.jumps) this.rebuild();
     else if (this.playback && this.playback.position_s === before_it?.position_s) return;
@@ -361,7 +361,7 @@ export class Pane {
     if (place) this.trail.add(this.moment_s, place);
   }
 
-  /** After a jump no line leads across: plots and trail show the flight before, as far as it is known. */
+  /** No line leads across a jump: plots and trail show the flight before, as far as known. */
   private rebuild(): void {
     this.history.clear();
     this.trail.clear();
@@ -388,7 +388,7 @@ export class Pane {
     this.dirty = false;
     const { state, vehicle, pilot, isRecording: recording } = this;
     const { isOld } = this.fresh;
-    // What came before the link broke is not known any more; what is merely old is shown in grey.
+    // Values from before a broken link are unknown; merely old ones are shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
     const over = recording && (live === null || live.links.vehicle === "closed");
     const title = vehicle ? titleOf(vehicle) : this.name;
@@ -423,7 +423,7 @@ export class Pane {
     this.host.aimed(this.name);
   }
 
-  /** What is wrong now: as the drone says, and between the cockpit and this page. */
+  /** The present problems: reported by the drone, and between the cockpit and this page. */
   private found(): Alarm[] {
     const { state } = this;
     if (this.isRecording && (!this.connected || state?.links.application === "lost" || state?.links.vehicle === "closed")) return []; // it is over
@@ -447,7 +447,7 @@ export class Pane {
       await post(`/api/replays/${encodeURIComponent(this.name)}/stop`);
       this.host.close(this.name);
     } catch (error) {
-      if (this.absent) return this.host.close(this.name); // somebody else has ended it
+      if (this.absent) return this.host.close(this.name); // ended elsewhere
       this.notify(errorText(error), "warn");
     }
   }

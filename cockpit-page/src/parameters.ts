@@ -1,4 +1,4 @@
-// Parameters: read when they are shown, written with the drone's own answer beside them.
+// Parameters: read when shown, written with the drone's own answer beside them.
 
 import { errorText, get } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
@@ -12,7 +12,7 @@ export function valueText(value: Value | null): string {
   return String(value);
 }
 
-/** What was written, as the parameter's type; or what is wrong, in words. Ranges are the drone's own affair. */
+/** The text typed, as the parameter's type; or its problem, in words. The drone checks ranges. */
 export function parse(parameter: Pick<Parameter, "type">, text: string): { value: Value } | { problem: string } {
   const written = text.trim();
   if (parameter.type === "text") return { value: text };
@@ -28,10 +28,10 @@ export function parse(parameter: Pick<Parameter, "type">, text: string): { value
   return { value };
 }
 
-/** Presses that come sooner after the one before are one press: a finger that taps twice, or a key that is held [ms]. */
+/** Presses closer together than this are one press: a double tap, or a key that repeats [ms]. */
 export const ONE_PRESS_MS = 700;
 
-/** Tells the presses of a button that does something once each time. */
+/** Separates the presses of a button that acts once each time. */
 export class Presses {
   private newest_ms = Number.NEGATIVE_INFINITY;
 
@@ -50,7 +50,7 @@ export function rangeText(parameter: Pick<Parameter, "minimum" | "maximum" | "ch
   return maximum === null ? "" : `≤ ${plain(maximum)}`;
 }
 
-/** Only some of them: what is said where there are none, and the name of the list. */
+/** Only some of them, with the text for none, and the name of the list. */
 export interface Choice {
   has(name: string): boolean;
   none: string;
@@ -108,7 +108,7 @@ export class Parameters {
     }
   }
 
-  /** The drone's answer to what was written here. */
+  /** The drone's answer to a value written here. */
   done(name: string, value: Value): void {
     const row = this.rows.get(name);
     this.writing = null;
@@ -119,7 +119,7 @@ export class Parameters {
     this.enable(row);
   }
 
-  /** Returns whether the refusal was of something written here. */
+  /** Returns whether the refusal concerned a value written here. */
   refused(why: string): boolean {
     const row = this.writing === null ? undefined : this.rows.get(this.writing);
     this.writing = null;
@@ -154,7 +154,7 @@ export class Parameters {
   }
 
   private submit(row: Row): void {
-    if (row.parameter.momentary && !row.presses.isNew(performance.now())) return; // as a second flip would follow the first
+    if (row.parameter.momentary && !row.presses.isNew(performance.now())) return; // or a second flip would follow the first
     const parsed = parse(row.parameter, row.editor.value);
     row.editor.removeAttribute("aria-invalid");
     if ("problem" in parsed) {
@@ -178,7 +178,7 @@ export class Parameters {
     setDisabled(row.button, !may || (!row.parameter.momentary && row.editor.value === valueText(row.parameter.value)));
   }
 
-  /** Show those that were asked for. */
+  /** Show those that pass the filter. */
   filter(): void {
     const needle = this.words.value.trim().toLowerCase();
     let some = false;
@@ -212,19 +212,19 @@ export class Writes {
 
   constructor(private readonly send: (name: string, value: string | number) => void) {}
 
-  /** Returns why it was refused; empty if it was written. */
+  /** Returns the reason of a refusal; empty if it was written. */
   write(name: string, value: string | number): Promise<string> {
     const answer = this.last.then(() => this.one(name, value));
     this.last = answer;
     return answer;
   }
 
-  /** The drone's answer. Whether it was to something written here. */
+  /** The drone's answer. Returns whether it concerned a value written here. */
   done(name: string): boolean {
     return this.end(this.under?.name === name, "");
   }
 
-  /** A refusal names no parameter: it is of what is under way. */
+  /** A refusal names no parameter: it concerns the write under way. */
   refused(why: string): boolean {
     return this.end(this.under !== null, why);
   }

@@ -1,8 +1,8 @@
-// One drone's controls, as this page has them: commands go out, and their outcome comes back.
+// This page's controls of one drone: sends commands, and handles their outcome.
 //
-// While this page holds the authority it pings the cockpit several times a second; sticks that
-// are off the centre are sent twenty times a second. Sticks that come back to the centre, a page that loses the focus and a
-// gamepad that goes away make the vehicle hover; a connection that breaks makes the cockpit do that.
+// While this page holds the authority it pings the cockpit several times a second, and sends sticks that are off the
+// centre 20 times a second. The vehicle hovers when sticks return to the centre, the page loses the focus, or a gamepad
+// disconnects; if the connection breaks, the cockpit makes it hover.
 
 import type { ServerClock } from "./clock.js";
 import { CommandSender, type CommandSocket, type Result } from "./commands.js";
@@ -15,16 +15,16 @@ import { isCentred } from "./sticks.js";
 
 export const STEER_MS = 50;
 const ALIVE_MS = 150;
-const WATCH_MS = 300; // so that what is older than a second is known to be
+const WATCH_MS = 300; // often enough to notice data older than a second
 
 export interface PilotListener {
-  /** Who has control or asks for it, or the connection, has changed. */
+  /** The holder of control, its applicants, or the connection has changed. */
   changed(): void;
   refused(command: string, why: string): void;
   done(command: string, name?: string, value?: Value): void;
-  /** A flight along a route goes on. */
+  /** Progress of a flight along a route. */
   route?(progress: RouteProgress | null): void;
-  /** What becomes of a target that was marked; null: the connection is gone, and the target with it. */
+  /** The state of a marked target; null: the connection is gone, and the target with it. */
   follow?(message: FollowMessage | null): void;
 }
 
@@ -32,20 +32,20 @@ const NOBODY: Authority = { type: "authority", state: "none", holder: null, prio
 
 export class Pilot {
   authority: Authority = NOBODY;
-  /** Who asks for the control that this page has; who would get it first is the first. */
+  /** The applications that ask for this page's control; the next in line comes first. */
   questions: readonly Question[] = [];
   connected = false;
-  /** On the way to a place that was chosen on this page. */
+  /** On the way to a place chosen on this page. */
   going = false;
-  /** After a target that was marked on this page. */
+  /** Following a target marked on this page. */
   following = false;
-  /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
+  /** How this page lost control; kept until the person takes control or dismisses it. */
   ended = "";
-  private flight = 0; // the number of what took the place of what this page had under way
-  private replaced: { going: boolean; following: boolean } | null = null; // which flies on if that is refused; null once the cockpit has it
+  private flight = 0; // number of the command that replaced this page's previous flight
+  private replaced: { going: boolean; following: boolean } | null = null; // that flight, which continues if the command is refused; null once the cockpit has the command
   private steering = false;
-  private stopping = false; // the emergency stop is not shown by the vehicle yet, or no round of the sticks has seen it
-  private stopped = false; // it is answered: the next round ends it
+  private stopping = false; // the vehicle does not show the emergency stop yet, or no round of the sticks has seen it
+  private stopped = false; // answered: the next round ends it
   private readonly commands: CommandSender;
   private received_ms = 0; // when the authority was received
   private questioned_ms = 0; // and the questions
@@ -64,7 +64,7 @@ export class Pilot {
     );
   }
 
-  /** There and back to the cockpit [s]; null while not known. */
+  /** Round trip to the cockpit [s]; null while unknown. */
   get round_trip_s(): number | null {
     return this.commands.round_trip_s;
   }
@@ -74,17 +74,17 @@ export class Pilot {
     return this.connected && this.commands.age_ms() !== null;
   }
 
-  /** What is sent now is known to arrive in time, as far as can be known. */
+  /** A command sent now should arrive in time. */
   get isLive(): boolean {
     return this.commands.isLive;
   }
 
-  /** How old the cockpit's newest answer is [ms]; null while there was none. */
+  /** Age of the cockpit's newest answer [ms]; null if there was none. */
   age_ms(now_ms: number): number | null {
     return this.commands.age_ms(now_ms);
   }
 
-  /** What became of the newest command of this kind. */
+  /** The outcome of the newest command of this kind. */
   result(what: string): Result | null {
     return this.commands.result(what);
   }
@@ -94,33 +94,33 @@ export class Pilot {
     return this.connected && this.authority.mine;
   }
 
-  /** Sticks count: it is this page's, nothing that is known of it is old, and its motors are not being stopped. */
+  /** Sticks count: this page has control, its data is fresh, and the motors are not being stopped. */
   get isFlyable(): boolean {
     return this.mine && this.isLive && !this.stopping;
   }
 
-  /** Waits in line, or was pre-empted and waits to have it back. */
+  /** Whether it waits in line, or to get control back after a pre-emption. */
   get waits(): boolean {
     return this.connected && (this.authority.state === "queued" || this.authority.state === "preempted");
   }
 
-  /** How long it is expected to wait, now; null if that is not known, or it does not wait. */
+  /** The expected wait from now; null if unknown, or not waiting. */
   get wait_s(): number | null {
     const wait_s = this.waits ? (this.authority.line?.wait_s ?? null) : null;
     return wait_s === null ? null : Math.max(0, wait_s - (this.now_ms() - this.received_ms) / 1000);
   }
 
-  /** What is left of the time to answer, now. */
+  /** The time left to answer. */
   left_s(question: Question): number {
     return Math.max(0, question.left_s - (this.now_ms() - this.questioned_ms) / 1000);
   }
 
-  /** `ask`: who has control is asked first. */
+  /** `ask`: ask the holder first. */
   take(priority: number, ask: boolean): void {
     this.send({ do: "take", priority, ask });
   }
 
-  /** To who asks: hand it over now, or keep it, for a reason that may be empty. */
+  /** Answer an applicant: hand control over now, or keep it, for a reason that may be empty. */
   answer(id: number, grant: boolean, reason: string): void {
     this.send({ do: "answer", id, grant, reason });
   }
@@ -129,7 +129,7 @@ export class Pilot {
     this.replace({ do: "release" });
   }
 
-  /** Take-off, landing, hover, the way back, emergency stop and its end. */
+  /** Take-off, landing, hover, return, emergency stop and its reset. */
   act(deed: "takeoff" | "hover" | "land" | "return" | "stop" | "reset"): void {
     const sent = this.replace({ do: deed });
     this.going = sent && deed === "return";
@@ -140,7 +140,7 @@ export class Pilot {
     this.going = this.replace({ do: "goto", x, y, z });
   }
 
-  /** Along a route that was checked. */
+  /** Fly along a checked route. */
   flyRoute(id: string): void {
     this.going = this.replace({ do: "route", id });
   }
@@ -154,12 +154,12 @@ export class Pilot {
     this.send({ do: "follow_select", camera });
   }
 
-  /** Track it; nothing flies. */
+  /** Track it without flying. */
   markTarget(mark: Mark): void {
     this.send({ do: "follow", ...mark });
   }
 
-  /** Fly after what is tracked, or go on in another way. */
+  /** Follow the tracked target, or change the mode. */
   flyAfter(mode: FollowMode, distance_m: number | null): void {
     this.following = this.replace({ do: "follow_mode", mode, ...(distance_m === null ? {} : { distance_m }) });
   }
@@ -178,9 +178,9 @@ export class Pilot {
     this.listener.changed();
   }
 
-  /** Called every STEER_MS with the sticks as they are, as velocities. `touches`: how often hands were seen to move anything. */
+  /** Called every STEER_MS with the sticks as velocities. `touches`: counts movements by hands. */
   steer(sticks: Sticks, touches = 0): void {
-    // A vehicle may show a stop within one round: a stick that is held all the while must be centred first all the same.
+    // A vehicle may show a stop within one round: a stick held throughout must still be centred first.
     if (this.stopped) this.stopping = this.stopped = false;
     if (this.mine && !isCentred(sticks)) {
       if (this.commands.steer({ do: "fly", ...sticks, touches } satisfies Command)) [this.steering, this.going, this.following] = [true, false, false];
@@ -191,11 +191,11 @@ export class Pilot {
     this.commands.tick(this.mine ? ALIVE_MS : WATCH_MS);
   }
 
-  /** Hover if this page has it under way: when it loses the focus, or what it is flown with. */
+  /** Hover if this page has it under way: when the page loses the focus, or its input device. */
   rest(): void {
     const moving = this.steering || this.going || this.following;
     this.end();
-    // Also where no answers come: what is sent may arrive all the same, long before the cockpit counts this page as gone.
+    // Even without answers: the message may still arrive long before the cockpit counts this page as gone.
     if (moving && this.mine) this.commands.attempt({ do: "hover", automatic: true } satisfies Command);
   }
 
@@ -207,7 +207,7 @@ export class Pilot {
     return this.commands.send(command);
   }
 
-  /** Send what takes the place of what this page has under way: if it can't be sent, that ends all the same. */
+  /** Send a command that replaces this page's flight, which ends even if the command can't be sent. */
   private replace(command: Command): boolean {
     const { going, following } = this;
     const can = this.commands.canSend(command);
@@ -220,7 +220,7 @@ export class Pilot {
     return sent;
   }
 
-  /** Whether an answer is about what this page flies now, and not about what that took the place of; 0: it does not say. */
+  /** Whether an answer concerns this page's present flight, not a flight that it replaced; 0: the answer does not say. */
   private isNewest(n?: number): boolean {
     return !n || !this.flight || n === this.flight;
   }
@@ -244,7 +244,7 @@ export class Pilot {
 
   private refused(command: string, why: string, n: number): void {
     if (command === "stop") this.stopped = true;
-    if (["goto", "route", "return", "follow_mode"].includes(command) && this.isNewest(n)) this.end(); // sticks fly on until they are let go
+    if (["goto", "route", "return", "follow_mode"].includes(command) && this.isNewest(n)) this.end(); // sticks continue to fly until released
     if (n === this.flight && this.replaced) {
       this.going ||= this.replaced.going;
       this.following ||= this.replaced.following;

@@ -1,4 +1,4 @@
-// Rolling plots of any number that is fed back or logged.
+// Rolling plots of any number in the feedback or the logs.
 
 import uPlot from "uplot";
 import { colour, h, memory, setText } from "./dom.js";
@@ -10,10 +10,10 @@ const COLOURS = 8;
 const FIRST = ["altitude", "velocity.forward", "velocity.left"];
 const SPANS_S = [10, 30, 60, 120];
 const PERIOD_MS = 120;
-/** Numbers of programs and drivers, which may be small and mean something. */
+/** Numbers of programs and drivers, which may be small and still significant. */
 const OF_ANY_SIZE = /^(log|native)\./;
 
-/** Names by what stands before their first dot, in the order of a picker. */
+/** Names by the part before their first dot, in the order of a picker. */
 export function grouped(names: Iterable<string>): Map<string, string[]> {
   const groups = new Map<string, string[]>();
   for (const name of [...names].sort()) {
@@ -54,7 +54,7 @@ export class Plots {
   draw(now_ms: number): void {
     if (this.paused || now_ms - this.drawn_ms < PERIOD_MS || !this.box.clientWidth) return;
     this.drawn_ms = now_ms;
-    if (document.activeElement !== this.picker) this.offer(); // not under somebody's hand
+    if (document.activeElement !== this.picker) this.offer(); // not while a person uses it
     const now_s = this.now_s();
     this.plot?.batch((plot: uPlot) => {
       const [times, ...series] = this.history.since(now_s - this.span_s - 1, this.chosen);
@@ -67,7 +67,7 @@ export class Plots {
     });
   }
 
-  /** Colours have changed. */
+  /** The colours have changed. */
   repaint(): void {
     this.rebuild();
   }
@@ -155,7 +155,7 @@ export class Plots {
   }
 }
 
-/** Some room above and below; a range for what never changes. */
+/** Some room above and below; a range for constant values. */
 function padded(least: number | null, most: number | null): [number, number] {
   if (least === null || most === null) return [-1, 1];
   const room = Math.max((most - least) * 0.1, Math.abs(most) * 0.02, 0.05);

@@ -1,4 +1,4 @@
-// Pre-flight: the checklist that the cockpit makes of a drone, and the question before a take-off that it speaks against.
+// Pre-flight: the cockpit's checklist for a drone, and the question before a take-off despite a finding.
 
 import { errorText, get } from "./api.js";
 import { h, setText, setTone } from "./dom.js";
@@ -12,22 +12,22 @@ export interface Finding {
   remedy: string;
 }
 
-/** Findings that are older say nothing about now. */
+/** Older findings say nothing about now. */
 const OLD_MS = 45_000;
 const AGAIN_MS = 15_000;
-/** So long a second take-off counts as the answer to the question. */
+/** A second take-off within this time answers the question. */
 const ANSWER_MS = 8000;
-/** A press that comes sooner is no answer: nobody can have read the question. */
+/** A sooner press is no answer: it leaves no time to read the question. */
 const READ_MS = 600;
 const MARKS = { ok: "✓", warn: "!", fail: "✗" } as const;
 const TONES = { ok: "ok", warn: "warn", fail: "bad" } as const;
 
-/** Asks once more before a take-off that something speaks against. The pilot decides. Pure. */
+/** Asks for confirmation of a take-off despite findings. The pilot decides. Pure. */
 export class TakeOffQuestion {
   private asked_ms = Number.NEGATIVE_INFINITY;
   private asked = "";
 
-  /** What to ask, in words; empty: take off. */
+  /** The question, in words; empty: take off. */
   ask(findings: readonly Finding[], age_ms: number, now_ms: number): string {
     const against = age_ms > OLD_MS ? [] : findings.filter(({ level }) => level === "fail");
     const words = against.map(({ check, detail, why }) => `${check}: ${detail}${why ? ` – ${why}` : ""}`).join("; ");
@@ -58,12 +58,12 @@ export class Preflight {
     this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.sum, again), this.list);
   }
 
-  /** Check now and then while it is about to be flown from here. */
+  /** Check periodically while it is about to be flown from here. */
   watch(about: boolean, now_ms: number): void {
     if (about && now_ms - this.tried_ms > AGAIN_MS) void this.load();
   }
 
-  /** What to ask before a take-off; empty: take off. */
+  /** The question before a take-off; empty: take off. */
   ask(now_ms: number): string {
     return this.question.ask(this.findings, now_ms - this.read_ms, now_ms);
   }

@@ -1,7 +1,7 @@
-// A request for the control that this page has: who asks, for how long, until when, and what the person answers.
+// A request for this page's control: from whom, for how long, until when, and the person's answer.
 //
-// It does not take the focus, which may be on a button that flies: a key goes there. Nor can it be answered in its
-// first moment: a press that was meant for something else is no answer.
+// It does not take the focus, which may be on a button that flies: a key moves the focus there. Nor can it be answered
+// in its first moment: that press was meant for something else.
 
 import { h, setAttribute, setDisabled, setHidden, setText, unique } from "./dom.js";
 import { lasting } from "./format.js";
@@ -12,14 +12,14 @@ import type { Pilot } from "./pilot.js";
 export const UNREAD_MS = 600;
 const MOST_REASON = 200;
 
-/** Who gets it in the end whatever is answered. */
+/** Who finally gets control, whatever the answer. */
 export const wins = (question: Question, own: number | null): boolean => own !== null && question.priority < own;
 
-/** Those that still matter: declined ones only as long as the higher priority is to come. */
+/** The relevant ones: declined ones only as long as the higher priority is still to come. */
 export const pending = (questions: readonly Question[], own: number | null): Question[] =>
   questions.filter((one) => !one.declined || wins(one, own));
 
-/** What it means, in sentences. `own`: the priority that this page has control with; `more`: how many others ask. */
+/** Its meaning, in sentences. `own`: the priority with which this page has control; `more`: how many others ask. */
 export function explained(question: Question, own: number | null, more: number): string {
   const others = more > 0 ? [t.question.more(more)] : [];
   if (question.declined) return [t.question.keepForNow, ...others].join(" ");
@@ -53,14 +53,14 @@ export class QuestionPanel {
   }
 
   focus(): void {
-    if (this.isOpen) this.element.focus({ preventScroll: true }); // it is on the screen wherever that is scrolled to
+    if (this.isOpen) this.element.focus({ preventScroll: true }); // it is visible at any scroll position
   }
 
-  /** `now_ms`: on the clock that the moment for reading is measured by. */
+  /** `now_ms`: on the clock that measures the time to read. */
   update(pilot: Pilot | null, now_ms: number): void {
     const own = pilot?.authority.priority ?? null;
     const asked = pilot?.mine ? pending(pilot.questions, own) : [];
-    // The one that is read stays until it is over, whatever other requests come meanwhile.
+    // The visible question stays until it is over, whatever other requests arrive.
     const question = asked.find((one) => one.id === this.shown?.id) ?? asked[0] ?? null;
     if (question?.id !== this.shown?.id) {
       this.since_ms = now_ms;
@@ -90,7 +90,7 @@ export class QuestionPanel {
   }
 
   private close(): void {
-    // What had the focus here would leave it nowhere, and a text field would go on keeping the keys.
+    // Otherwise the focus would go nowhere, and a text field would keep the keys.
     if (this.element.contains(document.activeElement)) this.element.closest<HTMLElement>(".pane")?.focus({ preventScroll: true });
     setHidden(this.element, true);
     setText(this.voice, "");

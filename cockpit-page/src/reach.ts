@@ -1,8 +1,8 @@
-// What must be seen and pressed whatever is open, as the emergency stop. A modal dialog and a full screen leave the rest of
-// the page out of reach, so while one of them is there, these elements move into it.
+// Elements that must always be visible and pressable, such as the emergency stop. A modal dialog and a full screen put the
+// rest of the page out of reach, so while one of them is open, these elements move into it.
 
 const kept: HTMLElement[] = [];
-/** Where each of them belongs, while it is elsewhere. */
+/** The original place of each, while it is elsewhere. */
 const homes = new Map<HTMLElement, Comment>();
 /** The newest has them. */
 const hosts: HTMLElement[] = [];
@@ -11,7 +11,7 @@ export function keepInReach(element: HTMLElement | null): void {
   if (element) kept.push(element);
 }
 
-/** Until `takeBack`, or until another one has them. */
+/** Until `takeBack`, or until another one takes them. */
 export function lend(host: HTMLElement): void {
   hosts.push(host);
   arrange();

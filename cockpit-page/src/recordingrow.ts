@@ -1,5 +1,5 @@
-// One recording of the past: what it is, and what can be done with it. It stays the same element while the list is read
-// anew, so that nothing is lost of what somebody types in it.
+// One past recording: its description, and its actions. It stays the same element while the list is refreshed, so that text
+// being typed in it is not lost.
 
 import { errorText, get, post } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText } from "./dom.js";
@@ -9,7 +9,7 @@ import type { PastRecording } from "./model.js";
 
 export interface RowHost {
   readonly pilots: boolean;
-  /** Do it, show what went wrong, and read the list anew; `doing`: what to say meanwhile, after so many seconds. */
+  /** Do it, show errors, and refresh the list; `doing`: the text meanwhile, by the seconds passed. */
   act(work: () => Promise<unknown>, doing?: (seconds: number) => string): Promise<boolean>;
   replayed(drone: string): void;
   /** It is in the trash, under this name. */
@@ -104,11 +104,11 @@ export class RecordingRow {
   private noting(): HTMLElement {
     const area = h("textarea", { disabled: true, maxlength: TEXT, rows: 3, placeholder: t.recordings.note, "aria-label": t.recordings.note });
     const save = h("button", { type: "submit", class: "small", disabled: true }, t.recordings.save);
-    // The list has only its beginning.
+    // The list contains only its beginning.
     get<{ text: string }>(`${this.path}/notes`).then(
       ({ text }) => {
         area.value = text;
-        area.disabled = save.disabled = false; // not before: it would replace what somebody types
+        area.disabled = save.disabled = false; // not earlier: it would replace text being typed
       },
       (error: unknown) => setText(this.note, errorText(error)),
     );

@@ -1,4 +1,4 @@
-// Recordings: those that run, and those of the past, found and put in order.
+// Recordings: the running ones, and the past ones, filtered and sorted.
 
 import { get, post, errorText } from "./api.js";
 import { h, memory, setDisabled, setHidden, setText } from "./dom.js";
@@ -8,10 +8,10 @@ import type { PastRecording, Recordings, RunningRecording } from "./model.js";
 import { RecordingRow } from "./recordingrow.js";
 
 const PERIOD_MS = 1000;
-const IDLE_PERIODS = 5; // while nothing is recorded it is asked less often
-const FEW = 3; // are seen at a glance
+const IDLE_PERIODS = 5; // poll less often while nothing is recorded
+const FEW = 3; // few enough to see at a glance
 
-/** Samples that a recording lacks: received and left out, or never received. */
+/** Samples missing from a recording: received and left out, or never received. */
 export function lacking(recording: Pick<RunningRecording, "dropped" | "missed">): number {
   const sums = [recording.dropped, recording.missed].flatMap((drones) => Object.values(drones ?? {}).flatMap((one) => Object.values(one)));
   return sums.reduce((sum, one) => sum + one, 0);
@@ -19,13 +19,13 @@ export function lacking(recording: Pick<RunningRecording, "dropped" | "missed">)
 
 export type Order = "newest" | "name" | "longest" | "largest";
 const ORDERS: Readonly<Record<Order, (one: PastRecording, other: PastRecording) => number>> = {
-  newest: () => 0, // as they come
+  newest: () => 0, // already in this order
   name: (one, other) => one.name.localeCompare(other.name, undefined, { numeric: true }),
   longest: (one, other) => (other.seconds ?? 0) - (one.seconds ?? 0),
   largest: (one, other) => other.size - one.size,
 };
 
-/** Those with every word in their name, drones or note, in an order. */
+/** Those with every word in their name, drones or note, sorted. */
 export function chosen(past: readonly PastRecording[], words: string, order: Order): PastRecording[] {
   const wanted = words.toLowerCase().split(/\s+/).filter(Boolean);
   const text = (one: PastRecording): string => [one.name, ...one.drones, one.note].join(" ").toLowerCase();
@@ -86,7 +86,7 @@ export class RecordingList {
     this.list();
   }
 
-  /** Elements stay where they are, unless others are to be shown: somebody may be typing in one. */
+  /** Elements stay in place unless others are to be shown: a person may be typing in one. */
   private list(): void {
     const names = new Set(this.known.map((one) => one.name));
     for (const name of [...this.rows.keys()]) if (!names.has(name)) this.rows.delete(name);
@@ -141,7 +141,7 @@ export class RecordingList {
     await this.act(() => post("/api/recordings", { drones: this.drones() }));
   }
 
-  /** `done`: what to say afterwards; `doing`: meanwhile, after so many seconds. */
+  /** `done`: the text afterwards; `doing`: the text meanwhile, by the seconds passed. */
   private async act(work: () => Promise<unknown>, done = "", doing: (seconds: number) => string = () => "…"): Promise<boolean> {
     const began_ms = performance.now();
     let said = "";
@@ -155,7 +155,7 @@ export class RecordingList {
       error = caught;
     }
     clearInterval(saying);
-    // What the work itself has written stays.
+    // A message of the work itself stays.
     if (error !== null) setText(this.note, errorText(error));
     else if (this.note.textContent === said) setText(this.note, done);
     await this.load();

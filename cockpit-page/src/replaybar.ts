@@ -1,5 +1,5 @@
-// The bar of a replay, below its pictures: where it is, pause, speed, marks. It shows what the replay says of itself, so
-// that all pages agree; only under the hand that drags it, it shows where that is.
+// The bar of a replay, below its pictures: position, pause, speed, marks. It shows the position that the replay reports, so
+// that all pages agree; only while it is dragged it shows the hand's position.
 
 import { errorText, get, post } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText, svg, unique } from "./dom.js";
@@ -9,11 +9,11 @@ import { clamped, fine, type Mark, nearest, next, type Playback, type Replayed, 
 const NEAR_PX = 7;
 const NEAR_TOUCH_PX = 16;
 const APART_S = 0.3;
-const KEPT_MS = 900; // what was asked for is shown for so long, until the replay says so itself
+const KEPT_MS = 900; // how long a requested position is shown before the replay confirms it
 const NOTES_MS = 5000;
 const KEYS = "ArrowLeft ArrowRight ArrowUp ArrowDown Home End PageUp PageDown Space Comma Period";
 
-/** Drawn: not every system's fonts have these signs. */
+/** Drawn, because not every system's fonts have these symbols. */
 const ICONS: Readonly<Record<"play" | "pause" | "again" | "earlier" | "later", string>> = {
   play: "M5 3l12 7-12 7z",
   pause: "M5 3h3.6v14H5zM11.4 3H15v14h-3.6z",
@@ -24,7 +24,7 @@ const ICONS: Readonly<Record<"play" | "pause" | "again" | "earlier" | "later", s
 const icon = (name: keyof typeof ICONS): SVGElement => svg("svg", { viewBox: "0 0 20 20", class: "replay-icon", "aria-hidden": "true" }, svg("path", { d: ICONS[name] }));
 
 export interface ReplayHost {
-  /** The recording's flight is known now, or not any more. */
+  /** The recording's flight is known now, or no longer. */
   known(timeline: Timeline | null): void;
   notify(text: string): void;
 }
@@ -38,7 +38,7 @@ export class ReplayBar {
   private asked: { position_s: number; until_ms: number } | null = null;
   private dragging = false;
   private gone = false;
-  private wanted: object | null = null; // to be sent after what is on its way
+  private wanted: object | null = null; // to be sent after the request under way
   private sending = false;
   private notes_ms = 0;
   private marking_s = 0;
@@ -217,8 +217,8 @@ export class ReplayBar {
     this.paint(performance.now());
   }
 
-  /** One request at a time; of those meanwhile, what was wanted last. */
-  /** The replay is gone: nothing can be moved any more, or it is back. */
+  /** One request at a time; of those meanwhile, only the last is sent. */
+  /** The replay is gone: nothing can be moved any more; or it is back. */
   end(gone: boolean): void {
     this.gone = gone;
     this.element.inert = gone;
@@ -253,7 +253,7 @@ export class ReplayBar {
       this.know(await get<Replayed>(`/api/replays/${encodeURIComponent(this.name)}`));
       this.host.known(this.replayed?.timeline ?? null);
     } catch {
-      // started elsewhere: it can be moved, and nothing is known of its file
+      // started elsewhere: it can be moved, but its file is unknown
     }
   }
 
@@ -266,7 +266,7 @@ export class ReplayBar {
     return `/api/recordings/${encodeURIComponent(this.replayed?.recording ?? "")}`;
   }
 
-  /** Marks that other pages have made. */
+  /** Marks made by other pages. */
   private async refresh(now_ms: number): Promise<void> {
     this.notes_ms = now_ms;
     try {
@@ -281,7 +281,7 @@ export class ReplayBar {
     if (this.replayed) this.know({ ...this.replayed, notes });
   }
 
-  /** This page's kind of mark, where the replay is. */
+  /** Add this page's mark at the replay's position. */
   private here(): Mark | null {
     return this.replayed?.notes.marks.find((mark) => Math.abs(mark.at_s - this.shown_s) < APART_S / 2) ?? null;
   }

@@ -1,8 +1,8 @@
-// A replay's time: where it is, what is marked there, and what is known of the flight before. Pure.
+// A replay's time: its position, its marks, and the flight before it. Pure.
 
 import type { State } from "./model.js";
 
-/** Where a replay is, as its state has it. */
+/** A replay's position, from its state. */
 export interface Playback {
   position_s: number;
   duration_s: number;
@@ -29,7 +29,7 @@ export interface Timeline {
   values: Record<string, (number | null)[]>;
 }
 
-/** What the cockpit knows of the recording that a replay plays. */
+/** The cockpit's data on the recording of a replay. */
 export interface Replayed {
   recording: string;
   notes: { text: string; marks: Mark[] };
@@ -40,7 +40,7 @@ export const SPEEDS: readonly number[] = [0.25, 0.5, 1, 2, 4, 8];
 
 const NAME = "native.replay.";
 
-/** Null for what is no replay, or one of an older proxy. */
+/** Null for other drones, or a replay by an older proxy. */
 export function playbackOf(values: State["values"]): Playback | null {
   const value = (name: string): number | null => values[NAME + name] ?? null;
   const [position_s, duration_s, speed] = [value("position_s"), value("duration_s"), value("speed")];
@@ -48,12 +48,12 @@ export function playbackOf(values: State["values"]): Playback | null {
   return { position_s, duration_s, speed, paused: value("paused") === 1, jumps: value("jumps") ?? 0 };
 }
 
-/** Changes where what was recorded of the surroundings may: with each jump, and each second of the recording. */
+/** Changes where the recorded surroundings may: with each jump, and each second of the recording. */
 export const momentOf = ({ jumps, position_s }: Playback): string => `${jumps} ${Math.floor(position_s)}`;
 
 export const clamped = (position_s: number, duration_s: number): number => Math.min(duration_s, Math.max(0, position_s));
 
-/** Everything that the bar shows, by time. */
+/** Everything shown on the bar, by time. */
 export function ticksOf({ notes, timeline }: Replayed): Tick[] {
   const events = timeline.events.map(({ at_s, severity, text }): Tick => ({ at_s, text, kind: severity === "info" ? "event" : "alarm" }));
   const marks = timeline.marks.map((mark): Tick => ({ ...mark, kind: "mark" }));
@@ -61,20 +61,20 @@ export function ticksOf({ notes, timeline }: Replayed): Tick[] {
   return [...events, ...marks, ...own].sort((one, other) => one.at_s - other.at_s);
 }
 
-/** The tick that a finger means, if one is that near; a mark rather than an event. */
+/** The tick meant by a finger, if one is near enough; marks come before events. */
 export function nearest(ticks: readonly Tick[], at_s: number, within_s: number): Tick | null {
   const weight = (tick: Tick): number => Math.abs(tick.at_s - at_s) + (tick.kind === "event" ? within_s / 2 : 0);
   const near = ticks.filter((tick) => Math.abs(tick.at_s - at_s) <= within_s);
   return near.reduce<Tick | null>((best, tick) => (best === null || weight(tick) < weight(best) ? tick : best), null);
 }
 
-/** The next mark or event on one side; null if there is none. `apart_s`: what is nearer is where one is already. */
+/** The next mark or event on one side; null: none. `apart_s`: nearer ones count as the present position. */
 export function next(ticks: readonly Tick[], at_s: number, side: 1 | -1, apart_s: number): Tick | null {
   const beyond = ticks.filter((tick) => (tick.at_s - at_s) * side > apart_s);
   return (side > 0 ? beyond[0] : beyond.at(-1)) ?? null;
 }
 
-/** By how much a key moves the position [s]; Infinity for the ends; null for a key that does not. */
+/** By how much a key moves the position [s]; Infinity for the ends; null for other keys. */
 export function step(key: string, shift: boolean): number | null {
   const steps: Readonly<Record<string, number>> = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1, PageDown: -10, PageUp: 10, Home: -Infinity, End: Infinity };
   const found = steps[key];

@@ -1,4 +1,4 @@
-// A route as it is in its file, and what is edited of it. Pure.
+// A route as in its file, and its editing. Pure.
 
 export interface RouteAction {
   do: "look" | "wait" | "photo";
@@ -29,14 +29,14 @@ export interface Route {
 }
 
 export interface Finding {
-  /** From 1 on; null: of the whole route. */
+  /** From 1; null: the whole route. */
   waypoint: number | null;
   severity: "error" | "warning";
   reason: string;
 }
 
 export interface RouteCheck {
-  /** By which it is flown. */
+  /** The id to fly it by. */
   id: string;
   ok: boolean;
   findings: Finding[];
@@ -45,7 +45,7 @@ export interface RouteCheck {
   battery_left: number | null;
 }
 
-/** Where a flight along a route is. */
+/** The progress of a flight along a route. */
 export interface RouteProgress {
   type: "route";
   state: "ready" | "flying" | "acting" | "paused" | "done" | "stopped";
@@ -58,14 +58,14 @@ export interface RouteProgress {
 
 export const emptyRoute = (): Route => ({ version: 1, name: "", speed: 0.5, end: "hover", waypoints: [] });
 
-/** With everything that a file may leave out. */
+/** With all optional fields of a file. */
 export const whole = (route: Partial<Route>): Route => ({ ...emptyRoute(), ...route });
 
 export const waitOf = (one: RouteWaypoint): number => (one.actions ?? []).reduce((sum, action) => sum + (action.do === "wait" ? (action.seconds ?? 0) : 0), 0);
 
 export const hasPhoto = (one: RouteWaypoint): boolean => (one.actions ?? []).some((action) => action.do === "photo");
 
-/** With this wait and with or without a photo; turns to look somewhere stay, and come first. */
+/** With this wait and with or without a photo; turns are kept, and come first. */
 export function withActions(one: RouteWaypoint, wait_s: number, photo: boolean): RouteWaypoint {
   const photos = (one.actions ?? []).filter((action) => action.do === "photo");
   const looks = (one.actions ?? []).filter((action) => action.do === "look");
@@ -75,7 +75,7 @@ export function withActions(one: RouteWaypoint, wait_s: number, photo: boolean):
   return actions.length > 0 ? { ...rest, actions } : rest;
 }
 
-/** Where it looks: a heading [rad], or a point (x, y) [m]. */
+/** The direction to look: a heading [rad], or a point (x, y) [m]. */
 export interface Direction {
   yaw?: number;
   at?: [number, number];
@@ -83,12 +83,12 @@ export interface Direction {
 
 const DEGREES = 180 / Math.PI;
 
-/** A direction as it is typed: degrees, or a point as "x, y"; empty for none. */
+/** A direction as typed: degrees, or a point as "x, y"; empty for none. */
 export function directionText({ yaw, at }: Direction): string {
   return at ? at.join(", ") : yaw === undefined ? "" : String(Math.round(yaw * DEGREES));
 }
 
-/** What was typed; null if it can't be understood. */
+/** The direction typed; null if invalid. */
 export function parseDirection(text: string): Direction | null {
   const numbers = text.trim().split(/\s*[,;]\s*|\s+/).filter(Boolean).map(Number);
   if (numbers.length > 2 || !numbers.every(Number.isFinite)) return null;
@@ -97,7 +97,7 @@ export function parseDirection(text: string): Direction | null {
   return second === undefined ? { yaw: first / DEGREES } : { at: [first, second] };
 }
 
-/** The heading that it arrives with. */
+/** The heading on arrival. */
 export const headingOf = ({ yaw, look_at }: RouteWaypoint): Direction => ({ ...(yaw === undefined ? {} : { yaw }), ...(look_at ? { at: look_at } : {}) });
 
 export function withHeading(one: RouteWaypoint, { yaw, at }: Direction): RouteWaypoint {
@@ -105,7 +105,7 @@ export function withHeading(one: RouteWaypoint, { yaw, at }: Direction): RouteWa
   return { ...rest, ...(at ? { look_at: at } : yaw === undefined ? {} : { yaw }) };
 }
 
-/** Where it turns when it is there: its first action of that kind; others stay. */
+/** The turn after arrival: the first action of that kind; others are kept. */
 export const turnOf = (one: RouteWaypoint): Direction => (one.actions ?? []).find((action) => action.do === "look") ?? {};
 
 export function withTurn(one: RouteWaypoint, { yaw, at }: Direction): RouteWaypoint {
@@ -116,14 +116,14 @@ export function withTurn(one: RouteWaypoint, { yaw, at }: Direction): RouteWaypo
   return turn.length + rest.length ? { ...place, actions: [...turn, ...rest] } : place;
 }
 
-/** With a waypoint moved to another place of the order. */
+/** With a waypoint moved to another position in the order. */
 export function moved<T>(all: readonly T[], from: number, to: number): T[] {
   if (to < 0 || to >= all.length) return [...all];
   const rest = all.filter((_, number) => number !== from);
   return [...rest.slice(0, to), all[from] as T, ...rest.slice(to)];
 }
 
-/** What speaks against a waypoint, or against the leg to it; the worst first. */
+/** Problems of a waypoint or of the leg to it; the worst first. */
 export function toneOf(check: RouteCheck | null, number: number): "accent" | "warn" | "bad" {
   const own = (check?.findings ?? []).filter((one) => one.waypoint === number);
   return own.some((one) => one.severity === "error") ? "bad" : own.length > 0 ? "warn" : "accent";

@@ -13,7 +13,7 @@ import { lengthText } from "./units.js";
 export type RouteDeed = "route_pause" | "route_resume" | "route_skip" | "route_stop";
 
 export interface RouteHost {
-  /** Where the drone is; null while that is not known. */
+  /** The drone's position; null while unknown. */
   own(): Vector | null;
   fly(id: string): void;
   act(deed: RouteDeed): void;
@@ -62,14 +62,14 @@ export class RoutePanel implements MapTool {
     this.edit(emptyRoute());
   }
 
-  /** Why nothing can be flown now, in words; empty: it can. */
+  /** The reason why nothing can be flown now; empty: it can. */
   allow(why: string): void {
     if (why === this.can) return;
     this.can = why;
     this.show();
   }
 
-  /** What became of the flight. */
+  /** The outcome of the flight. */
   update(progress: RouteProgress): void {
     this.flying = progress;
     const words = progress.kind.replace("route.", "").replaceAll("_", " ");
@@ -78,7 +78,7 @@ export class RoutePanel implements MapTool {
     this.show();
   }
 
-  /** The connection by which it was flown is gone. */
+  /** The connection that flew it is gone. */
   forget(): void {
     if (!this.flying) return;
     this.flying = null;
@@ -86,7 +86,7 @@ export class RoutePanel implements MapTool {
     this.show();
   }
 
-  /** Where it leads, for other views; empty unless it is flown or edited. */
+  /** Its path, for other views; empty unless it is flown or edited. */
   get places(): Vector[] {
     return this.body.hidden && this.flying === null ? [] : this.route.waypoints.map(({ x, y, z }) => [x, y, z]);
   }
@@ -172,7 +172,7 @@ export class RoutePanel implements MapTool {
     this.edit({ ...this.route, waypoints: this.route.waypoints.filter((_, number) => number !== index) });
   }
 
-  /** Changes from the map and the table's fields; the table keeps its fields, and the focus. */
+  /** Apply changes from the map and the table's fields; the table keeps its fields, and the focus. */
   private change(index: number, changes: Partial<RouteWaypoint>): void {
     const one = { ...(this.route.waypoints[index] as RouteWaypoint), ...changes };
     this.put(index, one);
@@ -234,7 +234,7 @@ export class RoutePanel implements MapTool {
       field("wait", waitOf(one) || "", t.route.waitIn, 1, (value) => withActions(latest(), value ?? 0, hasPhoto(latest()))),
       h("td", {}, photo),
     ];
-    cells.forEach((cell, place) => setAttribute(cell, "data-head", HEADS[place] as string)); // where the table is narrow, each waypoint is a card
+    cells.forEach((cell, place) => setAttribute(cell, "data-head", HEADS[place] as string)); // in a narrow table, each waypoint is a card
     return h(
       "tr",
       {},
@@ -256,7 +256,7 @@ export class RoutePanel implements MapTool {
 
   // Checking
 
-  /** What was found is of another route: it is checked again when nothing has changed for a moment. */
+  /** The findings are of another route: check again once nothing has changed for a moment. */
   private later(): void {
     this.check = null;
     this.asked += 1;
@@ -337,7 +337,7 @@ export class RoutePanel implements MapTool {
     await this.doing(async () => {
       if (file.size > 65536) throw new Error(t.route.tooLarge(file.name));
       const read: unknown = JSON.parse(await file.text());
-      const checked = await post<RouteCheck>(`/api/drones/${encodeURIComponent(this.drone)}/route/check`, read as object); // says what is wrong with it
+      const checked = await post<RouteCheck>(`/api/drones/${encodeURIComponent(this.drone)}/route/check`, read as object); // reports its problems
       this.edit(whole(read as Partial<Route>));
       this.check = checked;
     });

@@ -9,27 +9,27 @@ import { lengthText } from "./units.js";
 export interface Described {
   tone: Tone;
   state: string;
-  /** Who has control. */
+  /** The holder of control. */
   holder: string;
-  /** What is wrong with it, the most severe first; empty if nothing is. */
+  /** Its problems, the most severe first; empty: none. */
   alarm: string;
   alarmTone: Tone;
-  /** Charge, 0 to 1; null while it is not known. */
+  /** Charge, 0 to 1; null while unknown. */
   battery: number | null;
   /** The links to the proxy and to the vehicle. */
   hops: readonly [Tone, Tone];
   links: string;
-  /** It is a recording that is over: that nothing moves is no fault. */
+  /** It is a recording that is over: standing still is no fault. */
   over: boolean;
   lost: boolean;
 }
 
 const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 
-/** In the unit that the person chose. */
+/** In the person's unit. */
 export const height = (altitude_m: number | null): string => lengthText(altitude_m, 1);
 
-/** What it is called: its name, or of a replay, whose proxy has a number, the recording's. */
+/** Its name; for a replay, whose proxy has a number, the recording's. */
 export function titleOf({ name, uri }: { name: string; uri: string }): string {
   const file = uri.startsWith("replay:") ? uri.split("?")[0]?.split("/").at(-1)?.replace(/\.mcap$/, "") : "";
   return file ? t.replay.of(decodeURIComponent(file)) : name;
@@ -39,7 +39,7 @@ export function describe(row: DroneRow): Described {
   const recorded = isRecording(row);
   const [application, vehicle] = [row.links.application, row.links.vehicle];
   const lost = application === "lost";
-  const over = recorded && (lost || vehicle === "closed"); // as every recording is some time
+  const over = recorded && (lost || vehicle === "closed"); // every recording ends
   const critical = row.alarms.some((alarm) => alarm.severity === "critical");
   const flight = row.airborne && row.altitude !== null ? `${named(t.states, row.state)} · ${height(row.altitude)}` : vehicle === "connecting" && !lost && row.state === "unknown" ? t.waking : named(t.states, row.state);
   return {
@@ -57,10 +57,10 @@ export function describe(row: DroneRow): Described {
 }
 
 const natural = new Intl.Collator("en", { numeric: true });
-/** By name, as people count: drone2 before drone10. */
+/** By name, in numeric order: drone2 before drone10. */
 export const byName = (a: { name: string }, b: { name: string }): number => natural.compare(a.name, b.name);
 
-/** Whether all words that were typed are somewhere in what is shown of it. */
+/** Whether every typed word appears in its row. */
 export function found(row: DroneRow, search: string): boolean {
   const { state, holder, alarm } = describe(row);
   const text = [row.name, row.vehicle, state, holder, alarm].join(" ").toLowerCase();
@@ -69,7 +69,7 @@ export function found(row: DroneRow, search: string): boolean {
 
 export type Column = "name" | "state" | "altitude" | "battery" | "holder" | "alarm";
 
-/** The rows in the order of a column; equal ones by name, and what is not known last, whichever way. */
+/** The rows sorted by a column; ties by name, and unknown values last in both directions. */
 export function sorted(rows: readonly DroneRow[], column: Column, down: boolean): DroneRow[] {
   const value = (row: DroneRow): string | number | null => {
     if (column === "name") return row.name;

@@ -1,4 +1,4 @@
-// What is always there: the motors of the drone that is seen, land all, stop all; and what became of that.
+// The controls that are always present: motors off for the visible drone, land all, stop all; and their outcome.
 
 import type { ServerClock } from "./clock.js";
 import { type Answer, CommandSender, type CommandSocket, type Result } from "./commands.js";
@@ -43,7 +43,7 @@ export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap
 
 export class Safety {
   readonly element: HTMLElement;
-  /** What became of it; below the bar. */
+  /** The outcome; below the bar. */
   readonly message = h("p", { class: "banner safety-message", role: "status", hidden: true });
   private readonly name = h("span", { class: "stop-name" });
   private readonly fate = h("span", { class: "fate" });
@@ -78,21 +78,21 @@ export class Safety {
     setInterval(() => this.commands.tick(WATCH_MS), STEER_MS);
   }
 
-  /** Which drone is stopped by its own button, by keys and by the gamepad; null: none that flies is seen. */
+  /** The drone stopped by its own button, by keys and by the gamepad; null: no drone to fly is visible. */
   aim(target: Target | null): void {
-    if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // that was meant for another one
+    if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // the hold was meant for another drone
     this.target = target;
     this.show();
   }
 
-  /** Of the last overview: those that fly. */
+  /** From the last overview: those that fly. */
   know(rows: readonly DroneRow[]): void {
     this.flying = rows.filter((row) => row.can_fly && !isRecording(row)).length;
     setAttribute(this.element, "data-flying", String(this.flying));
     this.show();
   }
 
-  /** Keys or the gamepad are held, or no longer. */
+  /** Keys or the gamepad are held, or released. */
   hold(which: "one" | "all" | null): void {
     if (which === null) {
       if (this.countdown.holds(this.keyed)) this.countdown.release();
@@ -116,7 +116,7 @@ export class Safety {
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
-    // Whoever holds it before this page knows a drone is not kept from it: the cockpit knows them, and says if there are none.
+    // A person may hold it before this page knows any drone: the cockpit knows them, and reports if there are none.
     const which = count === 0 ? t.safety.every : count === 1 ? t.safety.theOnly : t.safety.allOf(count);
     return { what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
   }
@@ -152,7 +152,7 @@ export class Safety {
   private shown_ms = 0;
 
   private show(): void {
-    if (!this.all) return; // while it is made
+    if (!this.all) return; // still being constructed
     const { target } = this;
     setHidden(this.own, target === null);
     setText(this.name, target?.name ?? "");
@@ -171,5 +171,5 @@ export function showFate(button: HTMLElement, place: HTMLElement, result: Result
   setAttribute(place, "title", result?.why ?? "");
 }
 
-/** Nothing flies there: it is what was recorded. */
+/** Nothing flies there: it is a recording. */
 export const isRecording = ({ uri }: { uri: string }): boolean => uri.startsWith("replay:") || uri.startsWith("video:");

@@ -1,4 +1,4 @@
-// The 3-D view. Loaded when it is first shown. World axes: x east, y north, z up [m].
+// The 3-D view. Loaded on first use. World axes: x east, y north, z up [m].
 
 import {
   AmbientLight,
@@ -34,7 +34,7 @@ import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
 const PERIOD_MS = 50;
-const POINTS = 4096; // of the path, at most
+const POINTS = 4096; // maximum of the path
 
 const TURNS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"]);
 const NEARER: Readonly<Record<string, number>> = { Equal: 0.85, NumpadAdd: 0.85, Minus: 1.18, NumpadSubtract: 1.18 };
@@ -56,7 +56,7 @@ export class SceneView {
   private world: World | null = null;
   private around: Group | null = null;
 
-  /** Throws where there is no WebGL. */
+  /** Throws without WebGL. */
   constructor(private readonly current: () => Scene) {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(-4, -5, 4);
@@ -74,7 +74,7 @@ export class SceneView {
     this.repaint();
   }
 
-  /** Colours have changed. */
+  /** The colours have changed. */
   repaint(): void {
     this.scene.remove(this.grid);
     this.grid = new GridHelper(20, 20, colour("line"), colour("line"));
@@ -166,13 +166,13 @@ export class SceneView {
     }
     this.around = world && scenery(world);
     if (this.around) this.scene.add(this.around);
-    const own = this.bodies.get("own"); // its cameras may be others
+    const own = this.bodies.get("own"); // its cameras may have changed
     if (own) this.scene.remove(own);
     this.bodies.delete("own");
     this.grid.visible = !world?.room;
   }
 
-  /** With what its cameras see. */
+  /** Including the cameras' views. */
   private equipped(body: Group): Group {
     for (const camera of this.world?.cameras ?? []) {
       const view = frustum(camera);
@@ -216,7 +216,7 @@ export class SceneView {
     this.drop.computeLineDistances();
   }
 
-  /** The eye goes with the drone; turning and zooming stay as they were chosen. */
+  /** The eye moves with the drone; the chosen rotation and zoom are kept. */
   private follow(place: Vector3): void {
     const step = place.sub(this.controls.target).multiplyScalar(0.12);
     this.controls.target.add(step);
@@ -228,7 +228,7 @@ function solid(geometry: BufferGeometry, ink: string): Group {
   return new Group().add(new Mesh(geometry, new MeshLambertMaterial({ color: new Color(ink) })));
 }
 
-/** Larger than life, to be seen; its nose is the cone. */
+/** Larger than life, to be visible; its nose is the cone. */
 function quadrotor(ink: string, opacity: number): Group {
   const material = new MeshLambertMaterial({ color: new Color(ink), transparent: opacity < 1, opacity });
   const group = new Group();

@@ -1,4 +1,4 @@
-// What stands around a drone, for the 3-D view: the room, solids, gates, markers, the safety box, no-fly zones. World axes.
+// A drone's surroundings for the 3-D view: room, solids, gates, markers, safety box, no-fly zones. World axes.
 
 import {
   BackSide,
@@ -22,10 +22,10 @@ import { colour } from "./dom.js";
 import type { Vector } from "./model.js";
 import type { CameraView, World } from "./surroundings.js";
 
-const OPEN_M = 20; // a safety box is drawn to here where it has no wall
-const SEEN_M = 1.2; // of a camera's field of view
+const OPEN_M = 20; // extent drawn for a missing wall of the safety box
+const SEEN_M = 1.2; // drawn length of a camera's field of view
 
-/** Everything that stands still. */
+/** Everything that is fixed. */
 export function scenery(world: World): Group {
   const group = new Group();
   if (world.room) group.add(...room(world.room.low, world.room.high, world.room.enclosed));
@@ -72,7 +72,7 @@ export function frustum({ position, rays }: CameraView): LineSegments | null {
   return new LineSegments(shape, new LineBasicMaterial({ color: new Color(colour("accent")), transparent: true, opacity: 0.6 }));
 }
 
-/** Give back what a group holds on the graphics card. */
+/** Release a group's resources on the graphics card. */
 export function discard(group: Group): void {
   group.traverse((one) => {
     if (!(one instanceof Mesh) && !(one instanceof LineSegments)) return;
@@ -105,7 +105,7 @@ function between(low: Vector, high: Vector, ink: string): (Mesh | LineSegments)[
   return [upright(new BoxGeometry(...size), glass(ink), middle, 0), edges(new BoxGeometry(...size), ink, middle, 0)];
 }
 
-/** Floor and walls, seen from within and through from outside. */
+/** Floor and walls, visible from inside and transparent from outside. */
 function room(low: Vector, high: Vector, enclosed: boolean): (Mesh | LineSegments)[] {
   const [x, y, z] = high.map((value, axis) => value - (low[axis] as number)) as Vector;
   const middle: Vector = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2];
@@ -138,7 +138,7 @@ function frame({ position, size, yaw, frame: bar }: World["gates"][number]): Gro
   return group;
 }
 
-/** Where a drone begins, on the ground. */
+/** A drone's start, on the ground. */
 export function ring([x, y, z]: Vector, ink: string): Mesh {
   const mesh = new Mesh(new RingGeometry(0.2, 0.25, 40), new MeshBasicMaterial({ color: new Color(colour(ink)), side: DoubleSide }));
   mesh.position.set(x, y, z + 0.005);

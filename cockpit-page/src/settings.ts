@@ -1,16 +1,16 @@
-// What the person chose for this browser: remembered in it, and the same in all of its tabs. Its colours follow the system, unless
-// the person chose those, too.
+// The person's settings for this browser: remembered in it, and the same in all its tabs. The colours follow the system,
+// unless the person chose them.
 
 import { memory } from "./dom.js";
 
 const CHOICES = {
   theme: ["system", "dark", "light"],
-  /** Of what is shown; everything that is sent, and every parameter, is in SI units. */
+  /** For display only; everything sent, and every parameter, is in SI units. */
   units: ["metric", "imperial"],
   sound: ["on", "off"],
-  /** What the two sticks of a gamepad and on a touch screen do: see `STICK_MODES`. */
+  /** The functions of the two sticks of a gamepad and on a touch screen: see `STICK_MODES`. */
   mode: ["1", "2", "3", "4"],
-  /** What a photo shows: what the page shows, or the camera's picture alone. */
+  /** The content of a photo: as shown on the page, or the camera's picture alone. */
   photo: ["shown", "plain"],
   language: ["en", "pseudo"],
 } as const;
@@ -42,14 +42,14 @@ export class Settings {
     this.change(name, value);
   }
 
-  /** Called after each change, here or in another tab. Returns what ends it. */
+  /** Called after each change, here or in another tab. Returns a function that unsubscribes. */
   on(name: Name, listener: () => void): () => void {
     const listeners = this.listeners.get(name) ?? new Set();
     this.listeners.set(name, listeners.add(listener));
     return () => listeners.delete(listener);
   }
 
-  /** Another tab may have changed them. What is stored and not allowed, or not at all, is the standard. */
+  /** Another tab may have changed them. Missing and invalid values are replaced by the defaults. */
   reread(): void {
     for (const name of Object.keys(CHOICES) as Name[]) {
       const stored = this.store.get(name);
@@ -66,7 +66,7 @@ export class Settings {
 
 export const settings = new Settings(memory);
 
-/** Keeps the page's colours as they are set; `changed` after each change, for what is painted. */
+/** Applies the page's colours; `changed` is called after each change, for painted parts. */
 export function followTheme(changed: () => void): void {
   const system = window.matchMedia("(prefers-color-scheme: light)");
   const apply = (): void => {

@@ -1,4 +1,4 @@
-// What the person chooses for this browser.
+// The person's settings for this browser.
 
 import { h, setHidden, setText, unique } from "./dom.js";
 import { whyJpeg } from "./h264.js";
@@ -39,7 +39,7 @@ export class SettingsDialog {
   }
 }
 
-/** What each stick does, in words. */
+/** The functions of each stick, in words. */
 export function modeText(mode: Values["mode"]): string {
   const { left, right } = STICK_MODES[mode];
   const words = ({ x, y }: (typeof STICK_MODES)["1"]["left"]): string => t.settings.and(t.settings.stick[y], t.settings.stick[x]);

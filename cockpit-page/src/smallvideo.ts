@@ -1,5 +1,5 @@
-// Small pictures of many drones, over one socket: the newest of each camera that is in sight, all drawn together, so
-// that the browser paints once for all of them.
+// Small pictures of many drones, over one socket: the newest of each visible camera, all drawn together, so that the
+// browser paints once for all of them.
 
 import { ServerClock } from "./clock.js";
 import { type Encoding, StreamDecoder, whyJpeg } from "./h264.js";
@@ -14,7 +14,7 @@ export interface SmallHead {
   width: number;
   height: number;
   bytes: number;
-  /** Of a picture that is no JPEG. */
+  /** For a picture other than JPEG. */
   h264?: Encoding;
 }
 
@@ -22,7 +22,7 @@ type Drawn = ImageBitmap | VideoFrame;
 
 export interface Sink {
   draw(head: SmallHead, picture: Drawn, received_ms: number): void;
-  /** So many bytes came for it. */
+  /** The bytes received for it. */
   count(bytes: number): void;
 }
 
@@ -35,7 +35,7 @@ interface Shown {
 
 const keyOf = ({ drone, camera }: { drone: string; camera: string }): string => `${drone}/${camera}`;
 
-/** Splits a message: length of the head (4 bytes, big-endian), head as JSON, the picture of each frame of it: a JPEG file, or H.264. */
+/** Splits a message: length of the head (4 bytes, big-endian), head as JSON, the picture of each of its frames: a JPEG file, or H.264. */
 export function unpackAll(data: ArrayBuffer): { ack: number; now_s: number; frames: { head: SmallHead; data: Uint8Array<ArrayBuffer> }[] } {
   const length = new DataView(data).getUint32(0);
   if (4 + length > data.byteLength) throw new RangeError("the head of the frames is cut off");
@@ -61,7 +61,7 @@ export class SmallVideo {
   private wanted = false;
 
   constructor() {
-    // A page that nobody sees asks for no pictures.
+    // A hidden page requests no pictures.
     document.addEventListener("visibilitychange", () => this.connect());
     void whyJpeg().then((why) => {
       this.h264 = why === "";
@@ -69,14 +69,14 @@ export class SmallVideo {
     });
   }
 
-  /** Whether they are shown at all now. */
+  /** Whether any are shown now. */
   run(wanted: boolean): void {
     if (wanted === this.wanted) return;
     this.wanted = wanted;
     this.connect();
   }
 
-  /** Show a camera about so many pixels wide, from now on. */
+  /** Show a camera from now on, at about this width [pixels]. */
   show(drone: string, camera: string, width: number, sink: Sink): void {
     const one = { drone, camera, width, sink };
     this.shown.set(keyOf(one), one);
@@ -115,7 +115,7 @@ export class SmallVideo {
     const came_ms = performance.now();
     const { ack, now_s, frames } = unpackAll(data);
     this.clock.received(came_ms, now_s);
-    // A page that was stopped gets what waited for it: that is older than it was when it was sent.
+    // A suspended page receives queued messages: they are older than when they were sent.
     const received_ms = came_ms - (this.clock.age_s(now_s, came_ms) ?? 0) * 1000;
     const decoded = await Promise.all(frames.map((frame) => this.decode(frame.head, frame.data).catch(() => null)));
     if (socket === this.socket) {

@@ -1,17 +1,17 @@
-// A WebSocket that comes back by itself, with a growing pause up to one second: a page is back soon after its cockpit is.
+// A WebSocket that reconnects, with pauses growing to one second: the page is back soon after its cockpit.
 
 export const FIRST_PAUSE_MS = 200;
 export const LONGEST_PAUSE_MS = 1000;
-/** After it was refused: nothing changes soon. */
+/** After a refusal: nothing will change soon. */
 export const REFUSED_PAUSE_MS = 2000;
 
 export interface Handlers {
   message: (data: string | ArrayBuffer) => void;
-  /** Whether it is open, when that changes; with the server's words when it was closed with a reason. */
+  /** Whether it is open, on changes; with the server's message when it was closed with a reason. */
   state?: (open: boolean, code: number, reason: string) => void;
 }
 
-/** As much of a WebSocket as is used. */
+/** The part of a WebSocket used here. */
 export interface Wire {
   binaryType: string;
   readyState: number;
@@ -36,7 +36,7 @@ const browser: Surroundings = {
 };
 
 const OPEN = 1;
-/** Close codes of the server after which trying again at once makes no sense: not logged in, not allowed. */
+/** Close codes of the server after which an immediate retry is useless: not logged in, not allowed. */
 const REFUSED = new Set([4401, 4403]);
 
 export class LastingSocket {
@@ -57,7 +57,7 @@ export class LastingSocket {
     return !this.closed && this.wire.readyState === OPEN;
   }
 
-  /** False if it could not be sent; then it never will be: what is old must not be flown. */
+  /** False if it could not be sent; it is never sent later, because an old command must not be flown. */
   send(message: object): boolean {
     if (!this.isOpen) return false;
     this.wire.send(JSON.stringify(message));

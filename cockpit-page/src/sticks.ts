@@ -1,20 +1,20 @@
 // From keys, gamepad and thumbs to one set of sticks. Pure.
 //
-// Body axes as in Skyloop: forward, left, up, counter-clockwise; each from −1 to 1 until it is scaled.
+// Body axes as in Skyloop: forward, left, up, counter-clockwise; each from −1 to 1 until scaled.
 
 import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
 
 export const CENTRED: Readonly<Sticks> = { forward: 0, left: 0, up: 0, yaw_rate: 0 };
 export const DEAD_BAND = 0.12;
-/** So long keys take from nothing to all [s]: a tap is a nudge. */
+/** Time for keys to go from nothing to full [s]: a tap is a nudge. */
 export const RAMP_S = 0.3;
 
 const AXES = ["forward", "left", "up", "yaw_rate"] as const;
 
 export type Axis = keyof Sticks;
 
-/** What each direction of two sticks flies, in the modes of remote controls: up and right are positive. */
+/** The direction flown by each axis of two sticks, in the modes of remote controls: up and right are positive. */
 export const STICK_MODES: Readonly<Record<"1" | "2" | "3" | "4", Readonly<Record<"left" | "right", { x: "left" | "yaw_rate"; y: "forward" | "up" }>>>> = {
   "1": { left: { x: "yaw_rate", y: "forward" }, right: { x: "left", y: "up" } },
   "2": { left: { x: "yaw_rate", y: "up" }, right: { x: "left", y: "forward" } },
@@ -22,7 +22,7 @@ export const STICK_MODES: Readonly<Record<"1" | "2" | "3" | "4", Readonly<Record
   "4": { left: { x: "left", y: "up" }, right: { x: "yaw_rate", y: "forward" } },
 };
 
-/** Nothing within the band, all of the range beyond it: the output has no step at its edge. */
+/** Nothing within the band, the full range beyond it: the output has no step at its edge. */
 export function deadBand(value: number, band: number = DEAD_BAND): number {
   if (!Number.isFinite(value)) return 0;
   const size = Math.min(1, Math.abs(value));
@@ -31,7 +31,7 @@ export function deadBand(value: number, band: number = DEAD_BAND): number {
 
 export const isCentred = (sticks: Sticks): boolean => AXES.every((axis) => sticks[axis] === 0);
 
-/** Of several inputs the one that is pushed furthest, axis by axis. */
+/** Of several inputs, the one pushed furthest, axis by axis. */
 export function merge(...inputs: Sticks[]): Sticks {
   const merged = { ...CENTRED };
   for (const input of inputs) {
@@ -74,11 +74,11 @@ export function scale(sticks: Sticks, pace: Pace): Sticks {
   };
 }
 
-/** What is pushed while it does not count, for another drone, before control, or on a page that is not seen, counts only after it was centred. */
+/** A stick pushed while it does not count (for another drone, before control, on a hidden page) must be centred before it counts. */
 export class Latch {
   private open = false;
 
-  /** Ask for the centre again. */
+  /** Require the centre again. */
   reset(): void {
     this.open = false;
   }
@@ -89,17 +89,17 @@ export class Latch {
   }
 }
 
-/** What a person's hands do to one drone. Each drone has its own, which are read each round, whether it is flown or not. */
+/** The hands on one drone. Each drone has its own, read each round, whether it is flown or not. */
 export class Hands {
   private readonly latches = { keys: new Latch(), pad: new Latch(), thumbs: new Latch() };
   private ramped: Sticks = { ...CENTRED };
 
-  /** Ask for the centre of everything again. */
+  /** Require everything to be centred again. */
   rest(): void {
     for (const latch of Object.values(this.latches)) latch.reset();
   }
 
-  /** `counts`: this drone is the selected one, under control, and the page is seen. */
+  /** `counts`: this drone is the selected one, under control, and the page is visible. */
   read(keys: Sticks, pad: Sticks, thumbs: Sticks, counts: boolean, seconds: number): Sticks {
     const { latches } = this;
     this.ramped = ramp(this.ramped, latches.keys.pass(keys, counts), seconds);

@@ -13,13 +13,13 @@ import { showFate } from "./safety.js";
 
 const USUAL_PRIORITY = 8; // before the controllers' usual 16
 
-/** A button with its key beside it, and on it the outcome of its command. */
+/** A button with its key beside it, and the outcome of its command on it. */
 function keyed(name: string, key: string, kind: string, act: () => void): HTMLButtonElement {
   const keys = key ? h("kbd", { "aria-hidden": "true" }, key) : null;
   return h("button", { type: "button", class: kind, onclick: act, ...(key ? { "aria-keyshortcuts": key } : {}) }, h("span", {}, name), keys, h("span", { class: "fate", role: "status" }));
 }
 
-/** Where this page waits, in words; empty while it does not. */
+/** This page's place in the queue, in words; empty while it is not waiting. */
 export function lineText({ state, holder, line }: Authority): string {
   if (state === "none" || state === "held" || line === null) return "";
   const who = holder ?? t.strip.theHolder;
@@ -89,13 +89,13 @@ export class Strip {
     this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.now, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.back, this.reset), this.why, this.stop);
   }
 
-  /** What was chosen, within its range. */
+  /** The chosen priority, within its range. */
   get wanted(): number {
     const value = Math.round(Number(this.priority.value));
     return Number.isFinite(value) && this.priority.value !== "" ? Math.max(0, Math.min(31, value)) : USUAL_PRIORITY;
   }
 
-  /** Whether who has control is to be asked first. */
+  /** Whether to ask the holder first. */
   get asks(): boolean {
     return this.ask.getAttribute("aria-pressed") === "true";
   }
@@ -118,7 +118,7 @@ export class Strip {
     setHidden(this.waiting, !this.line.textContent);
     const known = pilot !== null && pilot.isReady && flies && !old && state?.links.application !== "lost";
     setText(this.now, known ? nowText(pilot.authority, pilot.questions, this.asks, this.wanted) : "");
-    setHidden(this.now, pilot === null || !flies); // else it has its place also while nothing is known
+    setHidden(this.now, pilot === null || !flies); // otherwise its place is kept even while nothing is known
     this.question.update(pilot, performance.now());
     this.count(pilot);
     setDisabled(this.take, !can);
@@ -137,7 +137,7 @@ export class Strip {
     for (const [what, button] of this.buttons) showFate(button, button.lastElementChild as HTMLElement, pilot?.result(what) ?? null);
   }
 
-  /** What runs out, as of now. */
+  /** Update the remaining times. */
   count(pilot: Pilot | null): void {
     this.question.count(pilot, performance.now());
     if (this.waiting.hidden || pilot === null) return;

@@ -1,4 +1,4 @@
-// What stands around a drone, and where it may fly: read once per connection, and again when a parameter was written.
+// A drone's scenery and limits: read once per connection, and again after a parameter was written.
 
 import { get } from "./api.js";
 import type { Vector } from "./model.js";
@@ -13,7 +13,7 @@ export type Zone = { name?: string } & ({ kind: "box"; low: Vector; high: Vector
 
 type Ends = [number | null, number | null, number | null];
 
-/** The safety box; a wall that is null is none. */
+/** The safety box; a null wall is absent. */
 export interface SafetyBox {
   low: Ends;
   high: Ends;
@@ -22,13 +22,13 @@ export interface SafetyBox {
 export interface CameraView {
   name: string;
   position: Vector | null;
-  /** Through the corners of its pictures, in body axes; null where its lens or mounting is not known. */
+  /** Through the corners of its pictures, in body axes; null if its lens or mounting is unknown. */
   rays: Vector[] | null;
 }
 
 export interface World {
   name: string;
-  /** Who knows it: the drone, or the file that the cockpit was given; null: nobody. */
+  /** The source: the drone, or the cockpit's file; null: none. */
   source: "vehicle" | "file" | null;
   room: { low: Vector; high: Vector; enclosed: boolean } | null;
   solids: (Thing & { size: Vector })[];
@@ -56,7 +56,7 @@ export class Surroundings {
     private readonly changed: () => void,
   ) {}
 
-  /** Read it soon: of several calls at about the same time only one counts. */
+  /** Read it soon: several calls at about the same time count as one. */
   reload(after_ms = AGAIN_MS): void {
     if (this.waiting !== null) clearTimeout(this.waiting);
     this.waiting = setTimeout(() => void this.load(), after_ms);
@@ -67,7 +67,7 @@ export class Surroundings {
     if (this.waiting !== null) clearTimeout(this.waiting);
   }
 
-  /** Why the drone may not fly straight to a place; empty if nothing is known to speak against it. */
+  /** The reason why the drone may not fly straight to a place; empty if none is known. */
   async problem(place: Vector): Promise<string> {
     try {
       return (await get<{ problem: string }>(`${this.path}/way?to=${place.join(",")}`)).problem;

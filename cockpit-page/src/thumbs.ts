@@ -11,9 +11,9 @@ const CENTRE: readonly [number, number] = [0, 0];
 interface Stick {
   pad: HTMLElement;
   call(label: string): void;
-  /** From −1 to 1, right and up positive: where the finger is that holds it, else its centre. */
+  /** From −1 to 1, right and up positive: the position of the finger that holds it, else the centre. */
   read(): readonly [number, number];
-  /** What holds it has to let go first. */
+  /** The finger must let go first. */
   release(): void;
 }
 
@@ -22,7 +22,7 @@ function stick(touched: () => void): Stick {
   const name = h("span", {});
   const pad = h("div", { class: "thumb", role: "img" }, knob, name);
   let [finger, at]: [number | null, readonly [number, number]] = [null, CENTRE];
-  // The browser is asked each time: an event that says that it was let go may be lost, as with what is not shown any more.
+  // Ask the browser each time: the event of a release may be lost, as for a hidden element.
   const isHeld = (): boolean => finger !== null && pad.hasPointerCapture(finger);
   const put = (x: number, y: number): void => {
     at = [x, y];
@@ -60,7 +60,7 @@ function stick(touched: () => void): Stick {
   };
 }
 
-/** What both sticks do now, by the mode that the person chose. Pure. */
+/** The commands of both sticks now, by the person's stick mode. Pure. */
 export function thumbed(mode: keyof typeof STICK_MODES, place: "left" | "right", x: number, y: number): Partial<Sticks> {
   const axes = STICK_MODES[mode][place];
   return { [axes.x]: deadBand(-x) + 0, [axes.y]: deadBand(y) }; // to the left is positive
@@ -68,13 +68,13 @@ export function thumbed(mode: keyof typeof STICK_MODES, place: "left" | "right",
 
 export class Thumbs {
   readonly element: HTMLElement;
-  /** Counts what fingers have moved. */
+  /** Counts movements of fingers. */
   touches = 0;
   private readonly sides = (["left", "right"] as const).map((place) => ({ place, stick: stick(() => (this.touches += 1)) }));
 
   constructor() {
     const label = (): void => {
-      this.release(); // what a thumb held has another meaning now
+      this.release(); // a held stick has another meaning now
       for (const { place, stick } of this.sides) {
         const { x, y } = STICK_MODES[settings.get("mode")][place];
         stick.call(t.thumbs.label(t.thumbs.axes[y], t.thumbs.axes[x]));
@@ -85,16 +85,16 @@ export class Thumbs {
     this.forget = settings.on("mode", label);
   }
 
-  /** As fingers hold them now. */
+  /** As held by fingers now. */
   get sticks(): Sticks {
     return Object.assign({ ...CENTRED }, ...this.sides.map(({ place, stick }) => thumbed(settings.get("mode"), place, ...stick.read()))) as Sticks;
   }
 
-  /** What is held counts no more until it is let go. */
+  /** Held sticks no longer count until they are released. */
   release(): void {
     for (const { stick } of this.sides) stick.release();
   }
 
-  /** To be called when it is not shown any more. */
+  /** Call this when it is no longer shown. */
   readonly forget: () => void;
 }

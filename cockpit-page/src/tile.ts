@@ -1,4 +1,4 @@
-// One drone of the overview, small: what it sees, how it is, who has it. A click opens it.
+// One drone of the overview, small: its picture, state and holder. A click opens it.
 
 import { Battery } from "./battery.js";
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
@@ -10,12 +10,12 @@ import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
 
 const STALE_S = 1;
 const RATE_S = 2;
-/** A picture is a little smaller than its place: that is hardly seen, and costs less. */
+/** A picture slightly smaller than its place: hardly visible, and cheaper. */
 const SHARE = 0.9;
-/** When a tile's width differs by more than this share, another size of picture is asked for. */
+/** When a tile's width changes by more than this share, it requests another size of picture. */
 const OTHER = 0.15;
 
-/** What this page itself has to do with a drone that is not opened. */
+/** This page's own relation to a drone that is not open. */
 export type Own = "" | "held" | "asked";
 export const OWN_WORDS: Readonly<Record<Own, string>> = { "": "", held: t.overview.held, asked: t.overview.asked };
 
@@ -81,7 +81,7 @@ export class Tile implements Sink {
     }
   }
 
-  /** Whether it is on the screen; what is not gets no pictures. */
+  /** Whether it is on the screen; others get no pictures. */
   sight(seen: boolean): void {
     if (seen === this.seen) return;
     this.seen = seen;
@@ -89,7 +89,7 @@ export class Tile implements Sink {
     else this.rest();
   }
 
-  /** Ask for pictures of the size that it has now. */
+  /** Request pictures of its present size. */
   look(): void {
     const width_px = Math.round(this.canvas.clientWidth * Math.min(2, window.devicePixelRatio || 1) * SHARE);
     if (!this.seen || this.camera === "" || width_px === 0 || Math.abs(width_px - this.asked_px) <= OTHER * this.asked_px) return;
@@ -112,7 +112,7 @@ export class Tile implements Sink {
     this.bytes += bytes;
   }
 
-  /** How its pictures come, for who points at it: every second or so. */
+  /** How its pictures arrive, shown on hover: about once a second. */
   private showRate(now_ms: number): void {
     const seconds = (now_ms - this.rated.at_ms) / 1000;
     if (seconds < RATE_S || this.head === null) return;
@@ -126,7 +126,7 @@ export class Tile implements Sink {
     setAttribute(this.element, "data-form", h264 ? `h264 ${h264.kind}` : "jpeg");
   }
 
-  /** Show when its picture is old, or none came. */
+  /** Show when its picture is old or missing. */
   age(now_ms: number): void {
     this.showRate(now_ms);
     const age_s = this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;

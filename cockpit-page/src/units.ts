@@ -1,4 +1,4 @@
-// Lengths and speeds as the person wants to read them. Everything else of the page is in SI units.
+// Lengths and speeds in the person's units. Everything else on the page is in SI units.
 
 import { figure, type Known } from "./format.js";
 import { settings, type Values } from "./settings.js";
@@ -18,12 +18,12 @@ const UNITS: Readonly<Record<Values["units"], Readonly<Record<"length" | "speed"
 
 export const unit = (of: "length" | "speed"): Unit => UNITS[settings.get("units")][of];
 
-/** A length [m] or speed [m/s] in the person's unit; what is not known stays so. */
+/** A length [m] or speed [m/s] in the person's unit; unknown values stay unknown. */
 export const inUnit = (of: "length" | "speed", value: Known): Known => (value === null || value === undefined ? value : value * unit(of).factor);
 
 const textOf = (of: "length" | "speed", value: Known, decimals: number): string => (value === null || value === undefined ? "–" : `${figure(inUnit(of, value), decimals)} ${unit(of).name}`);
 
-/** A length [m] with the person's unit; a dash for what is not known. */
+/** A length [m] with the person's unit; a dash if unknown. */
 export const lengthText = (metres: Known, decimals: number): string => textOf("length", metres, decimals);
 
 /** A speed [m/s], as above. */

@@ -1,4 +1,4 @@
-// One camera: shows the newest frame, its age, and draws what was published about it.
+// One camera: shows the newest frame and its age, and draws the shapes published about it.
 
 import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
@@ -18,11 +18,11 @@ const LATE_S = 0.25;
 const STALE_S = 1;
 const RATE_MS = 2000;
 const TELL_MS = 90;
-/** When a picture's width differs by more than this share from what was asked for, another size is. */
+/** When a picture's width differs by more than this share from the requested one, another size is requested. */
 const OTHER = 0.15;
-const TOLD_LATE_MS = 3000; // so long after a drawing that came too late the page says so
-const FADED = 0.45; // of what was drawn on an earlier picture
-const NEAR = "300px"; // pictures come before they are scrolled into sight
+const TOLD_LATE_MS = 3000; // how long the page reports a drawing that came too late
+const FADED = 0.45; // opacity of drawings on an earlier picture
+const NEAR = "300px"; // pictures arrive before they are scrolled into sight
 
 interface Shown extends FrameHead {
   captured: bigint;
@@ -32,23 +32,23 @@ interface Shown extends FrameHead {
 export class VideoView {
   readonly element: HTMLElement;
   overlay = true;
-  /** Why no new pictures come from what was recorded, which is no fault; empty while they do. */
+  /** Why no new pictures of a recording arrive, which is no fault; empty while they do. */
   still = "";
   readonly canvas: HTMLCanvasElement;
-  /** Null for who only watches. */
+  /** Null for an observer. */
   readonly follow: FollowTool | null;
   private readonly tools: VideoTools;
   private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly age = h("span");
   private readonly ageChip = h("p", { class: "chip age", "data-tone": "quiet" }, h("i", { class: "dot" }), this.age);
   private readonly rate = h("p", { class: "chip rate" });
-  /** Why the picture is smaller, or coarser, than it could be. */
+  /** Why the picture is smaller or coarser than it could be. */
   private readonly smaller = h("p", { class: "chip smaller", role: "status" });
   private readonly nothing = h("p", { class: "nothing" }, t.video.waiting);
-  /** What was drawn on these pictures, and came too late to be shown, or much later than they did. */
+  /** Drawings on these pictures that came too late to be shown, or much later than the pictures. */
   private readonly late = h("p", { class: "chip drawn-late", role: "status" });
   private readonly drawings = new Map<string, Drawing>();
-  /** How late each of them came, and when. */
+  /** The delay of each of them, and its time. */
   private readonly delays = new Map<string, { late: bigint; came_ms: number }>();
   private socket: LastingSocket | null = null;
   private frames: NewestFrame<ImageBitmap> | null = null;
@@ -57,7 +57,7 @@ export class VideoView {
   private encoding: Encoding | null = null;
   private readonly pace = new Pace();
   private updated_ms: number | null = null;
-  /** Why pictures are JPEGs; null while nobody asked the browser. */
+  /** Why pictures are JPEGs; null until the browser was asked. */
   private why: WhyJpeg | "failed" | null = null;
   private asked_px: number | null = null;
   private readonly clock = new ServerClock();
@@ -75,7 +75,7 @@ export class VideoView {
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.smaller, this.late, this.nothing);
     this.follow = host && new FollowTool(this, host);
     this.tools = new VideoTools(this, this.follow?.button ?? null);
-    // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
+    // Invisible pictures are not requested: a hidden page, or a place that is scrolled away.
     document.addEventListener("visibilitychange", this.hide);
     this.sight.observe(this.element);
     void whyJpeg().then((why) => {
@@ -95,12 +95,12 @@ export class VideoView {
     this.stream?.close();
   }
 
-  /** Age of what is on the screen now [s]: its age when it was sent, and the time since it came. */
+  /** Age of the picture on the screen [s]: its age when sent, plus the time since it arrived. */
   age_s(now_ms: number): number | null {
     return this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
   }
 
-  /** The frame that is on the screen. */
+  /** The frame on the screen. */
   get frame(): FrameHead | null {
     return this.shown;
   }
@@ -140,7 +140,7 @@ export class VideoView {
     setText(this.late, this.overlay ? this.lateText(now_ms) : "");
   }
 
-  /** Whose drawings come late now, and whether they are shown. */
+  /** The sources whose drawings come late now, and whether they are shown. */
   private lateText(now_ms: number): string {
     const late = [...this.delays].filter(([, { late, came_ms }]) => late > 0n && now_ms - came_ms < TOLD_LATE_MS);
     return late.map(([source, { late }]) => t.video.late(source, (Number(late) / 1e9).toFixed(1), late <= LATEST_NS)).join(" · ");
@@ -154,7 +154,7 @@ export class VideoView {
     this.paint(pen, this.sheet, density, this.overlay ? undefined : SOURCE);
   }
 
-  /** Draw what was published about the picture that is shown, as far as the box lets it; `only`: by this source. */
+  /** Draw the shapes published about the visible picture, as far as the box allows; `only`: by this source. */
   paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number, only?: string): void {
     if (!this.shown) return;
     for (const drawing of this.drawings.values()) {
@@ -166,7 +166,7 @@ export class VideoView {
     pen.globalAlpha = 1;
   }
 
-  /** Pictures are asked for while somebody sees them: on the page, in a window apart, or in a clip later. */
+  /** Pictures are requested while they are seen: on the page, in a separate window, or later in a clip. */
   wantedChanged(): void {
     if ((this.socket !== null) !== this.isSeen) this.reopen();
   }
@@ -215,7 +215,7 @@ export class VideoView {
 
   private receive({ head, jpeg: data }: Omit<Received, "received_ms">, came_ms: number): void {
     this.clock.received(came_ms, head.now_s);
-    // A page that was stopped gets what waited for it: that is older than it was when it was sent.
+    // A suspended page receives queued messages: they are older than when they were sent.
     const received_ms = came_ms - (this.clock.age_s(head.now_s, came_ms) ?? 0) * 1000;
     this.arrivals.push({ at_ms: came_ms, bytes: data.byteLength });
     if (head.h264) void this.decode({ head, jpeg: data, received_ms }, head.h264);
@@ -246,7 +246,7 @@ export class VideoView {
     }
   }
 
-  /** Ask for H.264 where it can be decoded, of the size that the picture has on the screen. */
+  /** Request H.264 where it can be decoded, in the size of the picture on the screen. */
   private ask(): void {
     if (this.why === null || !this.socket?.isOpen) return;
     if (this.why === "") {
@@ -255,7 +255,7 @@ export class VideoView {
     } else if (this.why === "failed") this.socket.send({ h264: false });
   }
 
-  /** Width of its place [device pixels]; 0: not known, or it is wanted in full. */
+  /** Width of its place [device pixels]; 0: unknown, or wanted in full. */
   private width_px(): number {
     return this.tools.wanted ? 0 : Math.round(this.canvas.clientWidth * (window.devicePixelRatio || 1));
   }
@@ -273,7 +273,7 @@ export class VideoView {
   }
 }
 
-/** The cameras of a drone: each can be shown and hidden, the first one is. */
+/** The cameras of a drone: each can be shown and hidden; the first one is shown. */
 export class Stage {
   readonly element: HTMLElement;
   private readonly choices = h("div", { class: "choices", role: "group", "aria-label": t.video.cameras });
@@ -316,12 +316,12 @@ export class Stage {
     for (const view of this.views.values()) view.close();
   }
 
-  /** Why no new pictures of a recording come; empty when they do: that is no fault. */
+  /** Why no new pictures of a recording arrive, which is no fault; empty while they do. */
   still(still: string): void {
     for (const view of this.views.values()) view.still = still;
   }
 
-  /** Mark something in the first camera that is shown, or stop that. False: none is shown. */
+  /** Mark a target in the first visible camera, or stop that. False: none is visible. */
   toggleFollow(): boolean {
     const tools = [...this.views.values()].flatMap((view) => view.follow ?? []);
     const tool = tools.find((one) => one.isOn) ?? tools[0];
@@ -329,23 +329,23 @@ export class Stage {
     return tool !== undefined;
   }
 
-  /** Why nothing can be flown after a target now; empty: it can. */
+  /** The reason why no target can be followed now; empty: it can. */
   allowFollow(why: string): void {
     this.canFollow = why;
     for (const view of this.views.values()) view.follow?.allow(why);
   }
 
-  /** What the cockpit says of the target of this page. */
+  /** The cockpit's report on this page's target. */
   followed(message: FollowMessage): void {
     this.views.get(message.camera)?.follow?.update(message);
   }
 
-  /** A command was refused: true if that is shown at its tool. */
+  /** A command was refused: true if its tool shows that. */
   followRefused(command: string, why: string): boolean {
     return [...this.views.values()].some((view) => view.follow?.refused(command, why));
   }
 
-  /** The connection by which targets are followed is gone. */
+  /** The connection that followed targets is gone. */
   forgetTarget(): void {
     for (const view of this.views.values()) view.follow?.forget();
   }

@@ -1,4 +1,4 @@
-// What can be done with the pictures of one camera: full screen, picture-in-picture, a photo, a clip.
+// Tools for the pictures of one camera: full screen, picture-in-picture, photo, clip.
 
 import { h, setAttribute, setHidden, setText, svg } from "./dom.js";
 import { clock, duration } from "./format.js";
@@ -6,7 +6,7 @@ import { t } from "./language/index.js";
 import { lend, takeBack } from "./reach.js";
 import { settings } from "./settings.js";
 
-/** A clip is kept in the browser's memory until it is saved: it ends by itself [s]. */
+/** A clip is kept in the browser's memory until saved: it stops after this time [s]. */
 const LONGEST_S = 300;
 const ROUND_MS = 250;
 const SAID_MS = 5000;
@@ -19,23 +19,23 @@ const ICONS = {
   full: "M3 8V3h5M12 3h5v5M17 12v5h-5M8 17H3v-5",
 } as const;
 
-/** As much of a view as they need. */
+/** The part of a view used here. */
 export interface Pictures {
   readonly element: HTMLElement;
   readonly canvas: HTMLCanvasElement;
   readonly drone: string;
   readonly camera: { readonly name: string };
   readonly overlay: boolean;
-  /** Why no new pictures come from what was recorded; empty while they do. */
+  /** Why no new pictures of a recording arrive; empty while they do. */
   readonly still: string;
   age_s(now_ms: number): number | null;
-  /** Draw what was published about the picture that is shown. */
+  /** Draw the shapes published about the visible picture. */
   paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number): void;
-  /** Whether pictures are wanted while nobody sees the page may have changed. */
+  /** Whether pictures are wanted while the page is hidden may have changed. */
   wantedChanged(): void;
 }
 
-/** `alpha-front-2026-11-23T06-17-31.250Z`: of the capture, to the millisecond; nothing that a file system dislikes. Pure. */
+/** `alpha-front-2026-11-23T06-17-31.250Z`: the time of capture, to the millisecond; valid on every file system. Pure. */
 export function fileName(drone: string, camera: string, captured: Date): string {
   return [drone, camera, captured.toISOString().replaceAll(":", "-")].join("-").replaceAll(/[^\w.-]+/g, "_");
 }
@@ -46,7 +46,7 @@ export class VideoTools {
   private readonly mark = h("p", { class: "chip clip-mark", hidden: true }, h("i", { class: "record-dot live" }), h("span", {}));
   private readonly reach = h("div", { class: "full-reach" });
   private readonly buttons: Record<keyof typeof ICONS, HTMLButtonElement>;
-  /** Picture and drawings together, for what is not this page. */
+  /** Picture and drawings together, for use outside this page. */
   private readonly mix = h("canvas", {});
   private readonly screen = h("video", { muted: true, playsinline: true });
   private clip: { recorder: MediaRecorder; since_ms: number; name: string } | null = null;
@@ -55,7 +55,7 @@ export class VideoTools {
   private saying: ReturnType<typeof setTimeout> | undefined;
   private readonly full = (): void => this.onFullScreen();
 
-  /** @param first A tool that comes before these. */
+  /** @param first A tool before these. */
   constructor(
     private readonly pictures: Pictures,
     first: HTMLButtonElement | null,
@@ -102,7 +102,7 @@ export class VideoTools {
     this.saying = setTimeout(() => setText(this.said, ""), SAID_MS);
   }
 
-  /** When the picture on the screen was taken, by this computer's clock. */
+  /** Capture time of the picture on the screen, by this computer's clock. */
   private captured(): Date | null {
     const age_s = this.pictures.age_s(performance.now());
     return age_s === null ? null : new Date(Date.now() - age_s * 1000);
@@ -186,7 +186,7 @@ export class VideoTools {
     await element.requestFullscreen().catch(() => this.say(t.video.noFull));
   }
 
-  /** The emergency stop is in reach there, too. */
+  /** The emergency stop stays within reach. */
   private onFullScreen(): void {
     if (document.fullscreenElement === this.pictures.element) lend(this.reach);
     else takeBack(this.reach);
@@ -206,7 +206,7 @@ export class VideoTools {
     this.pictures.wantedChanged();
   }
 
-  /** Also while there is no new picture: what is old is marked. */
+  /** Also while there is no new picture: an old one is marked. */
   private update(): void {
     const old = (this.pictures.age_s(performance.now()) ?? 0) > STALE_S && this.pictures.still === "";
     if (old) this.paint();

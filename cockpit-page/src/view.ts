@@ -1,7 +1,7 @@
 // From metres to pixels of a map seen from above: x east to the right, y north upwards. Pure.
 
 export interface View {
-  /** What is in the middle, east and north [m]. */
+  /** The centre, east and north [m]. */
   east: number;
   north: number;
   /** Pixels per metre. */
@@ -35,7 +35,7 @@ export function around(places: readonly (readonly [number, number, ...number[]])
   return { east: (west + east) / 2, north: (south + north) / 2, scale: Math.min(size.width / wide, size.height / high) };
 }
 
-/** How far apart two views are, as a share of the smaller one's extent. */
+/** The distance of two views, as a share of the smaller one's extent. */
 export function apart(one: View, other: View, size: Size): number {
   const way_m = Math.hypot(one.east - other.east, one.north - other.north);
   const scale = Math.max(one.scale, other.scale);
@@ -49,7 +49,7 @@ export function gridStep(scale: number, pixels = 45): number {
   return ([1, 2, 5, 10].find((factor) => factor * power >= least) ?? 10) * power;
 }
 
-/** About a point of the screen that keeps its place. */
+/** Zoom about a point of the screen that keeps its place. */
 export function zoomed(view: View, size: Size, factor: number, x: number, y: number): View {
   const [east, north] = toMetres(view, size, x, y);
   const scale = Math.max(0.5, Math.min(2000, view.scale * factor));

@@ -1,6 +1,6 @@
-// The map's tool when there is no other: a press chooses a place, and "Fly there" flies to it.
+// The map's standard tool: a press chooses a place, and "Fly there" flies to it.
 //
-// Choosing moves nothing: where it is, how far and how long is shown first, and what speaks against it.
+// Choosing moves nothing: it first shows the place, distance, time and problems.
 
 import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { lasting } from "./format.js";
@@ -10,7 +10,7 @@ import type { Ink, MapTool, Project, Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
 import { lengthText } from "./units.js";
 
-/** Greatest speeds of the drone [m/s]. */
+/** Maximum speeds of the drone [m/s]. */
 export interface Speeds {
   along: number;
   up: number;
@@ -18,7 +18,7 @@ export interface Speeds {
 
 export interface Leg {
   distance_m: number;
-  /** At the greatest speeds; null where they are not known. */
+  /** At maximum speed; null if unknown. */
   time_s: number | null;
 }
 
@@ -29,15 +29,15 @@ export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
 }
 
 const AGAIN_MS = 1000;
-const ABOVE_GROUND_M = 1; // height of a place that is chosen before the take-off
+const ABOVE_GROUND_M = 1; // height of a place chosen before take-off
 
 export interface WaypointHost {
-  /** Where the drone is; null while that is not known. */
+  /** The drone's position; null while unknown. */
   own(): Vector | null;
   /** It stands on the ground: a place at its height can't be flown to. */
   stands(): boolean;
   speeds(): Speeds | null;
-  /** Why it may not fly to a place, in words; empty if it may. */
+  /** The reason why it may not fly to a place; empty if it may. */
   problem(place: Vector): Promise<string>;
   goTo(x: number, y: number, z: number): void;
 }
@@ -119,7 +119,7 @@ export class WaypointTool implements MapTool {
     void this.ask();
   }
 
-  /** Ask whether it may fly there; until the answer nothing is known to speak against it, and the drone checks it too. */
+  /** Ask whether it may fly there; until the answer it is assumed to, as the drone checks it too. */
   private async ask(): Promise<void> {
     const place = this.chosen;
     this.asked_ms = performance.now();
@@ -128,12 +128,12 @@ export class WaypointTool implements MapTool {
     this.show();
     if (!place) return;
     const problem = await this.host.problem(place);
-    if (this.asked !== place) return; // another one is chosen by now
+    if (this.asked !== place) return; // another one has been chosen
     this.problem = problem;
     this.show();
   }
 
-  /** A field was written; what is left empty stays as it is. */
+  /** A field was edited; an empty one keeps its value. */
   private typed(): void {
     const own = this.host.own();
     const some = this.inputs.some((input) => input.value !== "");

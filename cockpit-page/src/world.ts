@@ -1,4 +1,4 @@
-// What map and 3-D view show: where everything is. World axes: x east, y north, z up [m].
+// The scene of map and 3-D view: the position of everything. World axes: x east, y north, z up [m].
 
 import type { Trail } from "./history.js";
 import type { DroneRow, Vector } from "./model.js";
@@ -11,30 +11,30 @@ export interface Body {
   roll: number;
   pitch: number;
   yaw: number | null;
-  /** Where it was, if that is shown. */
+  /** Its past positions, if shown. */
   trail?: Trail;
-  /** The name of its colour on the map, if it has one of its own. */
+  /** The name of its colour on the map, if it has its own. */
   ink?: string;
 }
 
 export interface Scene {
-  /** The drone that the map is about; null while its position is not known, and on a map of several. */
+  /** The drone of the map; null while its position is unknown, and on a map of several. */
   own: Body | null;
-  /** Where it really is, as the simulator or motion capture reports it. */
+  /** Its true position, as reported by the simulator or motion capture. */
   truth: Body | null;
   others: Body[];
   targets: Body[];
   waypoints: { position: Vector; own: boolean }[];
   trail: Trail;
-  /** What stands there, where that is known. */
+  /** The scenery, if known. */
   world?: World | null;
-  /** The route that is planned or flown. */
+  /** The route being planned or flown. */
   route?: readonly Vector[];
-  /** Where this flight began. */
+  /** The start of this flight. */
   start?: Vector | null;
 }
 
-/** What else flies, for the map of one of them: what was recorded is no part of what flies now, nor the other way round. */
+/** The other drones, for the map of one: recordings are not shown among live drones, nor the other way round. */
 export const othersOf = (own: { name: string; recorded: boolean }, rows: readonly DroneRow[]): Body[] =>
   rows.flatMap(({ name, uri, position, yaw }) =>
     name === own.name || own.recorded || isRecording({ uri }) || position === null ? [] : [{ name, position, roll: 0, pitch: 0, yaw }],

@@ -1,4 +1,4 @@
-// The map's lowest layers: the room and what stands in it, the safety box, no-fly zones, and what the cameras see.
+// The map's lowest layers: the room and its contents, the safety box, no-fly zones, and the cameras' views.
 
 import { short } from "./format.js";
 import { t } from "./language/index.js";
@@ -11,7 +11,7 @@ import { zoneName } from "./zones.js";
 
 export type Point = readonly [number, number];
 
-/** From body to world axes: Rz(yaw) Ry(pitch) Rx(roll), as ROS REP 103 has them [rad]. */
+/** From body to world axes: Rz(yaw) Ry(pitch) Rx(roll), as in ROS REP 103 [rad]. */
 export function turned([x, y, z]: readonly [number, number, number], roll: number, pitch: number, yaw: number): Vector {
   const [cr, sr, cp, sp, cy, sy] = [Math.cos(roll), Math.sin(roll), Math.cos(pitch), Math.sin(pitch), Math.cos(yaw), Math.sin(yaw)];
   return [
@@ -21,7 +21,7 @@ export function turned([x, y, z]: readonly [number, number, number], roll: numbe
   ];
 }
 
-/** The smallest convex outline of points of the plane, counter-clockwise. */
+/** The convex hull of points in the plane, counter-clockwise. */
 export function hull(points: readonly Point[]): Point[] {
   const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
   const turnsLeft = (a: Point, b: Point, c: Point): boolean => (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0;
@@ -36,14 +36,14 @@ export function hull(points: readonly Point[]): Point[] {
   return sorted.length < 3 ? sorted : [...half(sorted), ...half(sorted.reverse())];
 }
 
-/** Where a ray from a place ends: on the floor (z = 0), or after so many metres. */
+/** The end of a ray from a place: on the floor (z = 0), or after this many metres. */
 export function rayEnd(from: Vector, ray: Vector, length_m: number): Vector {
   const down = ray[2] < 0 && from[2] > 0 ? from[2] / -ray[2] : Number.POSITIVE_INFINITY;
   const far = Math.min(length_m, down);
   return [from[0] + ray[0] * far, from[1] + ray[1] * far, from[2] + ray[2] * far];
 }
 
-/** The corners of a rectangle about its centre, turned by a yaw [rad]. */
+/** The corners of a rectangle about its centre, rotated by a yaw [rad]. */
 export function corners(x: number, y: number, along: number, across: number, yaw: number): Point[] {
   const [c, s] = [Math.cos(yaw), Math.sin(yaw)];
   return ([[1, 1], [-1, 1], [-1, -1], [1, -1]] as const).map(([a, b]) => {
@@ -107,7 +107,7 @@ export function zoneOutline(chart: Pick<Chart, "pen" | "at">, zone: Zone): void 
 
 export const zoneCentre = (zone: Zone): Point => (zone.kind === "box" ? [(zone.low[0] + zone.high[0]) / 2, (zone.low[1] + zone.high[1]) / 2] : zone.centre);
 
-/** What a camera sees of the ground, or of the next metres, of a drone whose attitude is known. */
+/** The ground, or the next metres, seen by a camera of a drone whose attitude is known. */
 export function drawView(chart: Chart, body: Body, camera: CameraView): void {
   const { pen, ink } = chart;
   if (!camera.rays || body.yaw === null) return;
@@ -140,7 +140,7 @@ function drawGate(chart: Chart, { position, size, yaw, frame }: World["gates"][n
   pen.stroke();
 }
 
-/** A ring: where it started. */
+/** A ring at its start. */
 export function home({ pen, ink, at }: Chart, place: readonly number[], tone: string): void {
   const [x, y] = at(place);
   pen.strokeStyle = ink[tone] ?? "";
@@ -152,7 +152,7 @@ export function home({ pen, ink, at }: Chart, place: readonly number[], tone: st
   }
 }
 
-/** A wall that is none is left open: its corner is beyond the edge of the map. */
+/** A missing wall is left open: its corner is beyond the edge of the map. */
 function drawBox(chart: Chart, box: SafetyBox): void {
   const { pen, ink, at } = chart;
   const [west, south] = [box.low[0] ?? -1e4, box.low[1] ?? -1e4];

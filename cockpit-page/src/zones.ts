@@ -1,4 +1,4 @@
-// Safety box and no-fly zones as they are edited: their text, their fields, their corners. Pure.
+// Editing of the safety box and no-fly zones: their text, their fields, their corners. Pure.
 
 import { t } from "./language/index.js";
 import type { Vector } from "./model.js";
@@ -6,17 +6,17 @@ import type { SafetyBox, World, Zone } from "./surroundings.js";
 
 export const ZONES = "safety.zones";
 export const MAX_ZONES = 32;
-/** A wall of the safety box this far away is none [m]: docs/proxy.md. */
+/** A wall of the safety box this far away counts as absent [m]: docs/proxy.md. */
 export const FAR_M = 10_000;
 const LEAST_M = 0.05;
 
-/** What is edited: the safety box, or the zone of a number. */
+/** What is edited: the safety box, or the zone with a number. */
 export type Edited = "box" | number;
 
 export interface Field {
   label: string;
   value: number | null;
-  /** The same thing with another value; what makes no sense is refused by the drone, with its reason. */
+  /** The same with another value; the drone refuses nonsense, with its reason. */
   with: (value: number | null) => Bounds;
 }
 
@@ -34,10 +34,10 @@ export function zoneText(zone: Zone, rounded = cm): string {
   return `${zone.name ? `${zone.name}: ` : ""}${zone.kind} ${numbers.map(rounded).join(" ")}`;
 }
 
-/** What a zone is called: by its name, or as a refusal calls one that has none, to six digits. */
+/** A zone's name; without one as in refusals, by values to six digits. */
 export const zoneName = (zone: Zone): string => zone.name || zoneText(zone, (value) => Number(value.toPrecision(6)));
 
-/** The first name that none of them has. */
+/** The first unused name. */
 export function freeName(zones: readonly Zone[]): string {
   let number = 1;
   while (zones.some((zone) => zone.name === `Z${number}`)) number += 1;
@@ -46,7 +46,7 @@ export function freeName(zones: readonly Zone[]): string {
 
 export const zonesText = (zones: readonly Zone[]): string => zones.map((zone) => zoneText(zone)).join("; ");
 
-/** What has to be written, in this order, to get from one state to the other: a wall never passes the opposite one. */
+/** The writes, in this order, to get from one state to the other: a wall never passes the opposite one. */
 export function writes(from: Bounds, to: Bounds): { name: string; value: string | number }[] {
   const made: { name: string; value: string | number }[] = [];
   const text = zonesText(to.zones);
@@ -63,7 +63,7 @@ export function writes(from: Bounds, to: Bounds): { name: string; value: string 
   return made;
 }
 
-/** Corners and centre that can be dragged. */
+/** The corners and the centre, for dragging. */
 export function handles(bounds: Bounds, edited: Edited): { place: [number, number]; drag: (to: readonly [number, number]) => Bounds }[] {
   if (edited === "box") {
     const { box } = bounds;
@@ -110,7 +110,7 @@ export function round(centre: readonly [number, number], edge: readonly [number,
   return { kind: "cylinder", centre: [cm(centre[0]), cm(centre[1])], radius: Math.max(LEAST_M, cm(Math.hypot(edge[0] - centre[0], edge[1] - centre[1]))), low, high };
 }
 
-/** The zone that a place of the map lies in, the smallest first; null for none. */
+/** The zone that contains a place of the map, the smallest first; null: none. */
 export function zoneAt(zones: readonly Zone[], [x, y]: readonly [number, number]): number | null {
   const sizes = zones.map((zone) => {
     if (zone.kind === "cylinder") return Math.hypot(x - zone.centre[0], y - zone.centre[1]) <= zone.radius ? zone.radius * zone.radius * Math.PI : Number.POSITIVE_INFINITY;
@@ -121,10 +121,10 @@ export function zoneAt(zones: readonly Zone[], [x, y]: readonly [number, number]
   return Number.isFinite(least) ? sizes.indexOf(least) : null;
 }
 
-/** What the ends of each axis are called: x east, y north, z up. */
+/** The names of the ends of each axis: x east, y north, z up. */
 const WALLS = [[t.zones.west, t.zones.east], [t.zones.south, t.zones.north], [t.zones.bottom, t.zones.top]] as const;
 
-/** Every number of it. */
+/** All its numbers. */
 export function fields(bounds: Bounds, edited: Edited): Field[] {
   if (edited === "box") {
     const box = bounds.box ?? { low: [null, null, null], high: [null, null, null] };
@@ -153,7 +153,7 @@ export function fields(bounds: Bounds, edited: Edited): Field[] {
   ]);
 }
 
-/** The corners of the safety box that there are, by the ends of x and y that meet there. */
+/** The existing corners of the safety box, by the ends of x and y that meet there. */
 function pairs(box: SafetyBox): ["low" | "high", "low" | "high", number, number][] {
   const ends = ["low", "high"] as const;
   return ends.flatMap((ex) =>

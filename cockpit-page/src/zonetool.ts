@@ -1,6 +1,6 @@
-// The map's tool for the safety box and the no-fly zones: drawn and dragged on the map, or written in fields.
+// The map's tool for the safety box and no-fly zones: drawn and dragged on the map, or typed into fields.
 //
-// Each change is written to the drone at once, as parameters; one that is refused leaves what was, and shows why.
+// Each change is written to the drone at once, as parameters; a refused one leaves the old value, and shows why.
 
 import { h, setDisabled, setText, setTone } from "./dom.js";
 import { t } from "./language/index.js";
@@ -13,11 +13,11 @@ const DEFAULT_TOP_M = 3;
 
 export interface ZoneHost {
   bounds(): Bounds;
-  /** The ceiling of the drone [m], as the height of new zones; null where it is not known. */
+  /** The ceiling of the drone [m], as the height of new zones; null if unknown. */
   ceiling(): number | null;
-  /** Returns why it was refused; empty if it was written. */
+  /** Returns the reason of a refusal; empty if it was written. */
   write(name: string, value: string | number): Promise<string>;
-  /** What was written, or refused, is to be read again. */
+  /** The written or refused values are to be read again. */
   reload(): void;
 }
 
@@ -30,7 +30,7 @@ export class ZoneTool implements MapTool {
   private edited: Edited = "box";
   private adding: { kind: Zone["kind"]; from: readonly [number, number] | null } | null = null;
   private grabbed: ((to: readonly [number, number]) => Bounds) | null = null;
-  /** What is dragged, before it is written. */
+  /** The zone being dragged, before it is written. */
   private draft: Bounds | null = null;
   private can = false;
   private busy = false;
@@ -56,7 +56,7 @@ export class ZoneTool implements MapTool {
     this.show();
   }
 
-  /** What is in force was read again. */
+  /** The values in force were read again. */
   update(): void {
     if (!this.busy) this.draft = null;
     this.show();
@@ -102,7 +102,7 @@ export class ZoneTool implements MapTool {
 
   lift(spot: Spot, click: boolean): void {
     if (this.adding?.from && this.grabbed) {
-      // A press and lift at one place is its first corner: the next press is the other one.
+      // A press and release at one place is its first corner: the next press is the other one.
       const far = Math.hypot(spot.place[0] - this.adding.from[0], spot.place[1] - this.adding.from[1]);
       if (far > spot.reach_m / 2) this.finish(spot.place);
       return;
@@ -126,7 +126,7 @@ export class ZoneTool implements MapTool {
     return true;
   }
 
-  /** What is held goes with it. */
+  /** The dragged state is dropped. */
   cursor(spot: Spot): void {
     this.move(spot);
   }
@@ -196,7 +196,7 @@ export class ZoneTool implements MapTool {
     }
     this.busy = false;
     if (why) {
-      this.draft = null; // what is in force is shown again, also in the field that was written
+      this.draft = null; // show the values in force again, also in the edited field
       this.shown = "";
     }
     this.say(why ? t.zones.refused(why) : t.parameters.written, why ? "bad" : "ok");
@@ -219,7 +219,7 @@ export class ZoneTool implements MapTool {
     setText(this.answer, text);
   }
 
-  /** The list and the fields as they are; written only where something has changed, so that a field keeps its focus. */
+  /** The list and the fields; written only where something has changed, so that a field keeps its focus. */
   private show(): void {
     const bounds = this.draft ?? this.host.bounds();
     if (this.edited !== "box" && this.edited >= bounds.zones.length) this.edited = bounds.zones.length ? bounds.zones.length - 1 : "box";

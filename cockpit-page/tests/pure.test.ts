@@ -339,7 +339,7 @@ test("recordings are known by their address", () => {
 test("a question for control says what becomes of it", () => {
   assert.ok(wins(asks(), 8));
   assert.ok(!wins(asks({ priority: 8 }), 8));
-  assert.equal(explained(asks(), 8, 0), "Priority 4, yours 8. That is higher than yours: it has control when the time is over. Wanted for 2 min.");
+  assert.equal(explained(asks(), 8, 0), "Priority 4, yours 8. That is higher than yours: it gets control when the time is up. Wanted for 2 min.");
   assert.match(explained(asks({ priority: 16, for_s: null }), 8, 2), /you keep control unless.*unspecified time\. 2 more ask for it\.$/);
   assert.match(explained(asks({ declined: true }), 8, 0), /^You keep it for now; the higher priority/);
   const [kept, keptFromLower] = [asks({ declined: true }), asks({ id: 4, declined: true, priority: 16 })];

@@ -1,4 +1,4 @@
-"""``benchmarks.damaged_video``: what a short run finds of both streams, and how it counts."""
+"""``benchmarks.damaged_video``: the results of a short run on both streams, and its counting."""
 
 from __future__ import annotations
 

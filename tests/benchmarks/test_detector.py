@@ -22,7 +22,12 @@ COUNT = np.array([True, True, False])
 def test_each_true_box_is_found_once_and_one_that_does_not_count_is_neither_right_nor_wrong() -> None:
     found = np.array([[0, 0, 10, 9], [0, 0, 10, 10], [20, 6, 30, 16], [40, 0, 50, 10]], np.float64)
     result = match(found, np.array([0.6, 0.9, 0.8, 0.7]), TRUE, COUNT)
-    assert result.right.tolist() == [False, True, False, False]  # the surest took the box; 0.25 overlap is too little
+    assert result.right.tolist() == [
+        False,
+        True,
+        False,
+        False,
+    ]  # the most certain one took the box; an overlap of 0.25 is too little
     assert result.ignored.tolist() == [False, False, False, True]
     assert result.best.tolist() == [0.9, -1.0]
     assert recall([result], 0.5) == 0.5
@@ -53,11 +58,11 @@ def test_places_answer_for_the_things_about_them() -> None:
     assert middles[0].tolist() == [4, 4]
     assert strides[-1] == 32
     assert middles[-1].tolist() == [48, 16]
-    small = np.array([20, 12, 5, 14], np.float32)  # the middle of a place of the finest grid
+    small = np.array([20, 12, 5, 14], np.float32)  # the centre of a place of the finest grid
     answer, target = assign(small[None], np.array([1]), grid)
     mine = answer == 1
     assert mine.any()
-    assert (strides[mine] == 8).all()  # a small thing is of the finest grid alone
+    assert (strides[mine] == 8).all()  # a small thing belongs to the finest grid alone
     assert (abs(middles[mine] - small[:2]) < (6, 7)).all()
     assert (target[mine] == small).all()
     assert (answer[~mine] == NOTHING).all()

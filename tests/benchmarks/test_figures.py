@@ -1,4 +1,4 @@
-"""How the published figures are derived from measurements: from results that were made up."""
+"""The published figures' derivation from measurements, with invented results."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_the_stages_of_a_trip() -> None:
 
 
 def slower(folder: Path, factor: float, contender: str, share: float = 1.0) -> Path:
-    """A run as the one on the page, with some of its figures multiplied."""
+    """A run like the one on the page, with some of its figures multiplied."""
 
     def changed(cell: delays.Cell) -> delays.Cell:
         by = share * (factor if cell.contender == contender else 1.0)

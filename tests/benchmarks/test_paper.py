@@ -1,4 +1,4 @@
-"""The paper's test flight: one short flight as the command makes it, and what is worked out from its recording."""
+"""The paper's test flight: one short flight by the command, and the evaluation of its recording."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_everything_lies_in_the_folder(flown: Path) -> None:
         assert name in page
     with_recording = paper("--output", str(flown))
     assert with_recording.returncode == 2
-    assert "holds a recording already" in with_recording.stderr
+    assert "already holds a recording" in with_recording.stderr
 
 
 @pytest.mark.process
@@ -112,7 +112,7 @@ def test_a_drone_that_was_put_down_takes_off_again_and_ctrl_c_ends_in_good_order
 def test_another_recording_is_refused(tmp_path: Path) -> None:
     with skyloop.connect("sim://?cameras=none") as drone, skyloop.record(drone, tmp_path / "a.mcap"):
         drone.next_feedback()
-    with pytest.raises(FileFormatError, match="no recording of the paper's experiment"):
+    with pytest.raises(FileFormatError, match="not a recording of the paper's experiment"):
         evaluate(tmp_path / "a.mcap")
 
 

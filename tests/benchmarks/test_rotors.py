@@ -1,4 +1,4 @@
-"""``python -m benchmarks.rotors``: its figures are what it says, and docs/rotors.md has them."""
+"""``python -m benchmarks.rotors``: its figures, which docs/rotors.md contains."""
 
 from __future__ import annotations
 

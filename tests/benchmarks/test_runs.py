@@ -1,4 +1,4 @@
-"""Every benchmark runs, and writes JSON with the fields of its type. How fast things are is no matter of a test."""
+"""Every benchmark runs, and writes JSON with the fields of its type. No test checks speed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from skyloop.errors import UnsupportedError, UsageError
 
 
 class Run(NamedTuple):
-    """A short run: its options, and the type of what it writes."""
+    """A short run: its options, and the type of its output."""
 
     options: str
     kind: type[msgspec.Struct]
@@ -52,7 +52,7 @@ RUNS = {
 
 
 def summaries(results: Any) -> Iterator[Summary]:
-    """Every distribution of delays in these results."""
+    """Yield every distribution of delays in these results."""
     if isinstance(results, Summary):
         yield results
     elif isinstance(results, msgspec.Struct):
@@ -66,7 +66,7 @@ def summaries(results: Any) -> Iterator[Summary]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Few cases, and none with hosts of their own."""
+    """Run few cases, and none with separate hosts."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(scale, "UNIT_CASES", (scale.Case(1, 0, video=False),))
     monkeypatch.setattr(swarm, "problem", lambda: "not today")
@@ -106,7 +106,7 @@ def test_trackers_are_measured(
     tracking.main(["--quick", "--fixtures", str(tmp_path / "none"), "--output", str(tmp_path)])
     results = msgspec.json.decode((tmp_path / "tracking.json").read_bytes(), type=tracking.TrackingResults)
     assert [row.tracker for row in results.rows] == list(ours)
-    assert "only drawn images are used" in capsys.readouterr().out
+    assert "using only drawn images" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", list(RUNS))

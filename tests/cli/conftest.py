@@ -1,4 +1,4 @@
-"""The command line in this process or in one of its own, beside real proxies in a directory of sockets of their own."""
+"""The command line in this process or a separate one, beside real proxies in a separate directory of sockets."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture(scope="module", autouse=True)
 def sockets() -> Iterator[Path]:
-    """A directory of sockets for this module alone; with a short path, as those of sockets must be."""
+    """A separate directory of sockets for this module, with a short path, as sockets require."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
-        patch.setattr("skyloop.transport.local.names_of_others", dict)  # whoever else works on this machine
+        patch.setattr("skyloop.transport.local.names_of_others", dict)  # ignore other users of this machine
         yield Path(folder) / "run"
 
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., Process]]:
-    """Starts ``skyloop ARGUMENTS`` in a process of its own, which ends with the test."""
+    """Starts ``skyloop ARGUMENTS`` in a separate process, which ends with the test."""
     running: list[Process] = []
 
     def begin(*arguments: str) -> Process:
@@ -63,7 +63,7 @@ def start() -> Iterator[Callable[..., Process]]:
 
 @pytest.fixture(scope="module")
 def alpha(sockets: Path) -> Iterator[Process]:
-    """A proxy of that name, of a simulated drone in a hurry."""
+    """Start a proxy of that name, with a simulated drone at high speed."""
     process = Process("-m", "skyloop", "proxy", FAST_SIM, "--name", "alpha")
     try:
         process.until("ready")

@@ -1,4 +1,4 @@
-"""The command line as a whole: help, wrong words, exit codes, and what starting costs."""
+"""The command line as a whole: help, wrong words, exit codes, and the cost of starting."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_list_of_commands_says_of_each_what_it_does_by_task() -> None:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> None:
-    """The words are parsed; the command itself is not called."""
+    """Parse the words without calling the command."""
     import typer
 
     group = typer.main.get_command(cli.build([command]))
@@ -55,7 +55,7 @@ def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> 
     own.make_context(command, words)
 
 
-def test_the_version_is_told(run: Run) -> None:
+def test_the_version_is_printed(run: Run) -> None:
     assert run("--version") == (0, f"skyloop {skyloop.__version__}\n", "")
 
 
@@ -78,7 +78,7 @@ def test_without_a_word_help_is_shown(run: Run) -> None:
         (["sim", "--firmware", "foo"], "skyloop sim: --firmware: 'foo' is none of 'ardrone1'"),
         (["fly", "x.py", "--priority", "32"], "skyloop fly: --priority: "),
         (["cockpit", "alpha", "--port", "70000"], "skyloop cockpit: --port: "),
-        (["watch", "a", "b"], "skyloop watch: more words than are needed: b\nUsage: skyloop watch [OPTIONS] NAME\n"),
+        (["watch", "a", "b"], "skyloop watch: too many words: b\nUsage: skyloop watch [OPTIONS] NAME\n"),
         (["log", "inf"], "skyloop log: no command inf; did you mean 'info'?"),
     ],
 )
@@ -135,7 +135,7 @@ def test_help_makes_no_command() -> None:
 
 
 def test_a_command_imports_nothing_that_it_does_not_need() -> None:
-    """What a private proxy, or a list, would only pay for at its start."""
+    """A private proxy, or a list, would only pay for it at its start."""
     code = (
         "import sys; from skyloop.cli.app import build; build(['proxy', 'list', 'fly', 'param', 'sim', 'cockpit']);"
         "print(*[m for m in ('cv2', 'av', 'rich.live', 'rich.table', 'uvicorn', 'skyloop.client', 'skyloop.proxy',"

@@ -1,4 +1,4 @@
-"""``skyloop audit``, and the proxies that write what it shows."""
+"""``skyloop audit``, and the proxies that write its trail."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def flown(start: Start, *arguments: str) -> None:
-    """A proxy is started, flown, and ended."""
+    """Start a proxy, fly it, and end it."""
     proxy = start("proxy", FAST_SIM, "--name", "alpha", *arguments)
     proxy.until("ready")
     with skyloop.connect("alpha", name="alice", authority=skyloop.Authority(priority=7)) as drone:
@@ -31,7 +31,7 @@ def flown(start: Start, *arguments: str) -> None:
     proxy.wait()
 
 
-def test_nobody_has_flown_yet(run: Run) -> None:
+def test_the_audit_trail_is_empty_at_first(run: Run) -> None:
     assert run("audit").out.startswith("The audit trail has no flights yet")
     ended = run("audit", "alpha")
     assert ended.code == 2
@@ -57,19 +57,19 @@ def test_who_flew_when(start: Start, run: Run) -> None:
 
 
 @pytest.mark.process
-def test_a_file_of_ones_own(start: Start, run: Run, tmp_path: Path) -> None:
+def test_a_custom_audit_file(start: Start, run: Run, tmp_path: Path) -> None:
     path = tmp_path / "mine.jsonl"
     flown(start, "--audit", str(path))
     with path.open("a") as file:
         file.write('{"torn')
     ended = run("audit", "--file", str(path))
     assert "alice" in ended.out
-    assert "1 line can't be understood" in ended.err
+    assert "Skipped 1 line that can't be parsed" in ended.err
     assert run("audit", "bravo", "--file", str(path)).out.startswith("The audit trail has no flights yet")
     assert run("audit").out.startswith("The audit trail has no flights yet")
 
 
-def test_a_file_that_can_not_be_used(run: Run, tmp_path: Path) -> None:
+def test_an_unusable_file_is_refused(run: Run, tmp_path: Path) -> None:
     assert "can't be read" in run("audit", "--file", str(tmp_path / "none")).err
     ended = run("proxy", FAST_SIM, "--audit", str(tmp_path))
     assert ended.code == 2

@@ -16,7 +16,7 @@ from tests.support.commands import Run
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
-    """Pictures of the standard board, and at the end one of a wall."""
+    """Pictures of the standard board, followed by one of a wall."""
     folder, rng = tmp_path_factory.mktemp("pictures"), np.random.default_rng(1)
     names = []
     for number, (turn, middle) in enumerate(poses(9, 3, near=0.3, far=0.6, wide=0.35)):
@@ -45,7 +45,7 @@ def test_pictures_calibrate(run: Run, tmp_path: Path, pictures: list[str]) -> No
     found = load_calibration(output)
     assert found.fx == pytest.approx(PINHOLE.fx, rel=0.01)
     assert (found.views, found.camera) == (9, "front")
-    assert "wall.png: the board is not seen" in ended.err
+    assert "wall.png: the board is not visible" in ended.err
     assert f"fx {found.fx:.1f} ± {found.fx_deviation:.1f}" in ended.out
     assert "RMS over 9 views" in ended.out
     again = run("camera", "calibrate", *pictures, "-o", str(output))
@@ -69,11 +69,11 @@ def test_a_video_calibrates_by_views_that_differ(run: Run, tmp_path: Path, pictu
     assert "view 9:" not in ended.err
 
 
-def test_a_vehicle_that_shows_no_board_says_so(run: Run, tmp_path: Path) -> None:
+def test_a_vehicle_without_a_board_is_reported(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("cv2", reason="the simulator draws with OpenCV")
     output = str(tmp_path / "camera.json")
     ended = run("camera", "calibrate", "sim://?world=empty&cameras=front&fps=20", "-o", output, "--seconds", "1")
-    assert "looking for a board of 7 × 5 squares for 1 s at most; Ctrl-C ends that earlier" in ended.err
+    assert "looking for a board of 7 × 5 squares for at most 1 s; Ctrl-C ends that earlier" in ended.err
     assert ended.code == 2
     assert "1 s are over" in ended.err
     assert "0 views of the board are too few" in ended.err
@@ -88,7 +88,7 @@ def test_a_vehicle_that_shows_no_board_says_so(run: Run, tmp_path: Path) -> None
         ([__file__], "can't be read as a video"),
     ],
 )
-def test_sources_that_are_none(run: Run, tmp_path: Path, arguments: list[str], why: str) -> None:
+def test_invalid_sources_are_refused(run: Run, tmp_path: Path, arguments: list[str], why: str) -> None:
     ended = run("camera", "calibrate", *arguments, "-o", str(tmp_path / "camera.json"))
     assert ended.code == 2
     assert why in ended.err

@@ -41,7 +41,7 @@ def test_verdict(share: float | None, good: bool, word: str) -> None:
         assert word in report.verdict(0.9)
 
 
-def test_table_tells_what_is_known_and_what_is_not() -> None:
+def test_the_table_shows_known_and_unknown_figures() -> None:
     delay = Distribution(0.0002, 0.0011, 0.002, 0.0003, 500)
     report = DemoReport(
         first_picture_s=1.23,
@@ -65,8 +65,8 @@ def test_table_tells_what_is_known_and_what_is_not() -> None:
         "0.20 ms, p99 1.10 ms",
     ):
         assert word in text
-    assert "440 frames sent, 7 left out" in text
-    assert "not known" in text, "there was no ground truth"
+    assert "440 frames sent, 7 skipped" in text
+    assert "unknown" in text, "there was no ground truth"
     assert "bottom" not in text
     assert "never seen" in shown(DemoReport())
 
@@ -104,7 +104,7 @@ def test_headless_flight_without_a_marker_fails() -> None:
 
 
 @pytest.mark.process
-def test_ctrl_c_lands_and_tells_and_nothing_is_left() -> None:
+def test_ctrl_c_lands_reports_and_leaves_nothing_running() -> None:
     with Running("--seed", "7") as demo:
         page = demo.until(r"watch it at (http://127\.0\.0\.1:\d+/)", 30)[1]
         with urllib.request.urlopen(page, timeout=5) as answer:

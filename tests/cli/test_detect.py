@@ -17,7 +17,7 @@ from tests.support.processes import Process
 
 pytestmark = pytest.mark.process
 
-PATIENCE_S = 40.0  # a detector imports and loads much until its first result
+PATIENCE_S = 40.0  # a detector imports and loads much before its first result
 
 ONE_PERSON = """
 [room]

@@ -1,4 +1,4 @@
-"""What the doctor finds, on this machine and on worse ones."""
+"""The doctor's findings, on this machine and on worse ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.commands import Run
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The import time takes two processes: once is enough."""
+    """Measure the import time, in two processes: once is enough."""
 
     def none() -> Iterator[Finding]:
         yield Finding("import skyloop", Health.GOOD, "")
@@ -38,7 +38,7 @@ def lacking(monkeypatch: pytest.MonkeyPatch, name: str, error: ImportError) -> N
     monkeypatch.setattr("skyloop.cli.doctor.importlib.import_module", import_module)
 
 
-def test_a_machine_that_is_well(run: Run) -> None:
+def test_a_healthy_machine(run: Run) -> None:
     ended = run("doctor")
     assert ended.code == 0, ended.out
     assert "✓ Python: 3." in ended.out
@@ -48,8 +48,8 @@ def test_a_machine_that_is_well(run: Run) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "latin-1", "ascii", "utf-8"])
-def test_a_terminal_that_lacks_characters_gets_others(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ended in UnicodeEncodeError where the terminal has no check mark."""
+def test_missing_characters_of_a_terminal_are_replaced(encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended in UnicodeEncodeError if the terminal had no check mark."""
     findings = [Finding("part", health, "0.5 … 1 µs × Zoë at \udcff", "try → again") for health in Health]
     monkeypatch.setattr(doctor, "examine", lambda: iter(findings))
     out = io.TextIOWrapper(io.BytesIO(), encoding)
@@ -65,9 +65,7 @@ def test_a_terminal_that_lacks_characters_gets_others(encoding: str, monkeypatch
     assert len(lines) == 6
 
 
-def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs_it(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_part_is_listed_with_its_install_command(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     lacking(monkeypatch, "uvicorn", ModuleNotFoundError("No module named 'uvicorn'", name="uvicorn"))
     ended = run("doctor")
     assert ended.code == 0
@@ -80,7 +78,7 @@ def test_several_missing_modules_are_listed_as_in_a_sentence(monkeypatch: pytest
     assert finding.detail == "none1, none2 and none3 not installed"
 
 
-def test_a_check_that_needs_a_part_that_is_not_installed_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_without_its_optional_part_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def cameras() -> Iterator[Finding]:
         raise MissingExtraError("video://", "video", cause="No module named 'av'")
         yield
@@ -98,21 +96,21 @@ def test_a_part_that_is_broken_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPa
     assert "✗ recorded video, H.264 [video]: av: libav.so: cannot open" in ended.out
 
 
-def test_a_directory_that_can_not_be_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impossible_directory_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/proc/none/run")
     ended = run("doctor")
     assert ended.code == 1
     assert "✗ local transport: /proc/none/run can't be made" in ended.out
 
 
-def test_another_system_is_told_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unsupported_system_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.platform", "darwin")
     ended = run("doctor")
     assert ended.code == 1
     assert "✗ local transport: needs Linux" in ended.out
 
 
-def test_a_driver_that_can_not_be_loaded_is_a_fault_of_its_own(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_fails_to_load_is_a_separate_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(scheme: str) -> type:
         raise RuntimeError(f"{scheme} is broken")
 
@@ -123,5 +121,5 @@ def test_a_driver_that_can_not_be_loaded_is_a_fault_of_its_own(run: Run, monkeyp
     assert "✓ recorded video" in ended.out
 
 
-def test_what_is_found_is_never_taken_for_markup() -> None:
+def test_findings_are_never_parsed_as_markup() -> None:
     assert str(as_text(Finding("a", Health.GOOD, "[bold]b[/]"))) == "✓ a: [bold]b[/]"

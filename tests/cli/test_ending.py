@@ -1,4 +1,4 @@
-"""``skyloop land``, ``return`` and ``stop``, with real proxies: of a drone of one's own, of others, and of all."""
+"""``skyloop land``, ``return`` and ``stop``, with real proxies: of your own drone, of others', and of all."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_drone_on_the_ground_has_landed_already(run: Run) -> None:
 
 
 @pytest.mark.usefixtures("alpha")
-def test_a_drone_of_another_is_left_to_it_unless_the_priority_is_higher(run: Run) -> None:
+def test_another_pilots_drone_is_not_touched_unless_the_priority_is_higher(run: Run) -> None:
     with skyloop.connect("alpha", name="the pilot", on_exit="hover") as drone:
         drone.takeoff()
         ended = run("land", "alpha")
@@ -98,22 +98,22 @@ def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None
         refused = run("stop", "b1")
         assert (refused.code, refused.err) == (
             2,
-            "skyloop: an emergency stop asks before: give --yes where nobody can answer\n",
+            "skyloop: an emergency stop asks first: give --yes if there is no terminal to answer on\n",
         )
         assert one.feedback().state.airborne
         ended = run("stop", "--all", "--yes", "--json")
         assert ended.code == 0
         assert {"name": "b1", "ok": True, "outcome": "motors off"} in json.loads(ended.out)
         eventually(lambda: state("b1") == "emergency", "its motors are off")
-    assert run("land", "--all", "b1").err == "skyloop: --all is every drone: give it alone, or names\n"
+    assert run("land", "--all", "b1").err == "skyloop: --all means every drone: give either --all or names\n"
 
 
-def test_no_drone_at_all_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_drone_found_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.transport.local.list_names", list)
     for command in (["land", "--all"], ["stop", "--all", "--yes"]):
         ended = run(*command)
         assert ended.code == 1
-        assert ended.err.startswith("skyloop: no drone is found")
+        assert ended.err.startswith("skyloop: no drone found")
 
 
 def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:

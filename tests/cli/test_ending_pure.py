@@ -1,4 +1,4 @@
-"""``skyloop land`` and ``stop`` against a played proxy: silence, failures, and two of the same priority."""
+"""``skyloop land`` and ``stop`` against a simulated proxy: silence, failures, and two of the same priority."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def proxy() -> Iterator[ScriptedProxy]:
 
 
 def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The vehicle's downlink is dead, and the proxy answers no request: it can be stopped all the same."""
+    """The vehicle's downlink is dead, and the proxy answers no request: it can still be stopped."""
 
     def prepare(_: str, **options: Any) -> tuple[Drone, float]:
         drone = Drone(proxy.server.dial, app=options["name"], on_exit="hover", policy=QUICK)
@@ -50,7 +50,7 @@ def test_a_stop_waits_for_no_state_and_no_authority(proxy: ScriptedProxy, monkey
     assert ending._stop("alpha") == "motors off"
 
 
-def test_all_hear_of_all_when_one_fails_in_a_way_that_nobody_expected(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unexpected_failure_of_one_does_not_hide_the_others(capsys: pytest.CaptureFixture[str]) -> None:
     def end(name: str) -> str:
         if name == "b":
             raise ZeroDivisionError("a bug")
@@ -86,7 +86,7 @@ def test_every_drone_is_ended_at_once_however_many_there_are() -> None:
 
 
 @pytest.mark.parametrize(("state", "outcome"), [(LANDING, "landed, by its pilot"), (FLYING, None)])
-def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
+def test_a_landing_of_the_same_priority_serves_both(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch, state: FlightState, outcome: str | None
 ) -> None:
     def busy(*_: object, **__: object) -> None:
@@ -120,7 +120,7 @@ def test_who_lands_it_at_the_same_priority_already_lands_it_for_both(
 
 @pytest.mark.parametrize("connected", [True, False])
 def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch, connected: bool) -> None:
-    """One that was still being connected to flew home after it."""
+    """A drone that was still connecting flew home after it."""
     proxy.state = FlightState.FLYING
 
     def connect(_name: str, _advice: str, **_: object) -> Drone:
@@ -141,7 +141,7 @@ def test_no_return_begins_after_ctrl_c(proxy: ScriptedProxy, monkeypatch: pytest
 
 
 def _interrupted(fly: Any) -> Any:
-    """Ctrl-C, between the connection and the command."""
+    """Send Ctrl-C between the connection and the command."""
 
     def flown(drone: Drone, *arguments: Any, **options: Any) -> None:
         ending._stay(drone)

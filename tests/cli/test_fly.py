@@ -1,4 +1,4 @@
-"""Flying a controller from a file: that it lands, whatever happens to the controller."""
+"""Flying a controller from a file: the drone lands even if the controller fails."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_without_takeoff_the_controller_is_left_to_do_it(run: Run, alpha: Proces
 
 
 @pytest.mark.process
-def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Process, write: Write) -> None:
+def test_a_takeover_keeps_the_drone(start: Callable[..., Process], alpha: Process, write: Write) -> None:
     process = start(
         "fly", write(GOOD + "    def on_authority(self, status):\n        self.stop()\n"), "--drone", "alpha"
     )
@@ -145,7 +145,7 @@ def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Pr
 
 
 @pytest.mark.process
-def test_nobody_flies_while_somebody_does(run: Run, alpha: Process, write: Write) -> None:
+def test_a_second_pilot_is_refused(run: Run, alpha: Process, write: Write) -> None:
     with skyloop.connect("alpha", name="the pilot"):
         ended = run("fly", write(GOOD), "--drone", "alpha", "--seconds", "1")
         assert ended.code == 1
@@ -188,14 +188,16 @@ def test_a_recording_serves_a_controller_that_only_looks(run: Run, write: Write)
         ("video://none.mp4", "none.mp4"),
     ],
 )
-def test_a_wrong_target_is_told_in_one_line(run: Run, alpha: Process, write: Write, address: str, said: str) -> None:
+def test_a_wrong_target_is_reported_in_one_line(
+    run: Run, alpha: Process, write: Write, address: str, said: str
+) -> None:
     ended = run("fly", write(GOOD), "--drone", address)
     assert ended.code == 2, ended.err
     assert said in ended.err
     assert len(ended.err.splitlines()) == 1
 
 
-def test_a_wrong_file_is_told_before_anything_is_connected(run: Run, write: Write) -> None:
+def test_a_wrong_file_is_reported_before_connecting(run: Run, write: Write) -> None:
     assert run("fly", "none.py", "--drone", "nobody").err.startswith("skyloop: there is no file none.py")
     assert run("fly", write("x = 1"), "--drone", "nobody").code == 2
     assert "choose one with --class" in run("fly", write(GOOD + GOOD.replace("Good", "Better"))).err
@@ -203,7 +205,7 @@ def test_a_wrong_file_is_told_before_anything_is_connected(run: Run, write: Writ
 
 
 class Stranger:
-    """Stands for a drone: a controller only keeps it."""
+    """A stand-in for a drone: a controller only stores it."""
 
 
 def test_a_controller_that_wants_more_than_a_drone_is_refused() -> None:
@@ -249,7 +251,7 @@ def test_what_failed_because_of_another_error_shows_both_without_skyloops_lines(
 
 
 def test_what_failed_begins_with_the_line_of_the_user() -> None:
-    """Their own line comes first, not that of the library which they called, nor the loop that called them."""
+    """Their own line comes first, not one of the library they called, nor of the loop that called them."""
 
     def on_frame() -> object:
         return json.loads("{")
@@ -264,7 +266,7 @@ def test_what_failed_begins_with_the_line_of_the_user() -> None:
     assert "Traceback (most recent call last):" in rest
 
 
-def test_a_misspelt_callback_is_told_before_the_take_off(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_misspelt_callback_is_reported_before_the_take_off(capsys: pytest.CaptureFixture[str]) -> None:
     class Mine(skyloop.Controller):
         def onframe(self, frame: skyloop.Frame) -> None: ...
 

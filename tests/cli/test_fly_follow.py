@@ -1,4 +1,4 @@
-"""``skyloop fly follow``: what it says before it flies, and a flight."""
+"""``skyloop fly follow``: its messages before a flight, and a flight."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.processes import Process
         ((), "give --class CLASS, such as person, or --box X,Y,W,H"),
         (("--box", "1,2,3"), "must be X,Y,W,H"),
         (("--box", "1,2,x,4"), "must be X,Y,W,H"),
-        (("--box", "1,2,nan,4"), "must be of finite numbers"),
+        (("--box", "1,2,nan,4"), "must consist of finite numbers"),
         (("--class", "person", "--mode", "folow"), "no mode named 'folow'; did you mean 'follow'?"),
         (("--class", "person", "--side", "behnd"), "no side named 'behnd'; did you mean 'behind'?"),
         (("--class", "person", "--distance", "1"), "must be above nearest_m, which is 2"),
@@ -34,7 +34,7 @@ from tests.support.processes import Process
         (("--class", "person", "--detector", "none.onnx"), "there is no file none.onnx"),
     ],
 )
-def test_what_is_wrong_is_told_before_anything_is_connected(run: Run, words: tuple[str, ...], said: str) -> None:
+def test_errors_are_reported_before_connecting(run: Run, words: tuple[str, ...], said: str) -> None:
     ended = run("fly", "follow", "--drone", "nobody", *words)
     assert ended.code == 2
     assert said in ended.err
@@ -50,7 +50,7 @@ def test_a_wrong_class_of_a_file_is_told_with_what_it_may_have_been(run: Run) ->
     assert "named 'persn'; did you mean 'person'?" in ended.err
 
 
-def test_a_file_of_that_name_is_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_named_follow_is_mentioned(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "follow").write_text("x = 1")
     assert "not the file of that name" in run("fly", "follow").err
@@ -116,7 +116,7 @@ path = { kind = "waypoints", points = [[0, -1.5, 0], [0, 1.5, 0]], speed = 0.6 }
 
 
 def away_m(feedback: Feedback) -> float:
-    """The true distance from the drone to the person."""
+    """Return the true distance from the drone to the person."""
     native = dict(feedback.native or {})
     return math.dist(*([float(native[f"truth.{one}{axis}"]) for axis in "xy"] for one in ("", "anna.")))  # type: ignore[arg-type]
 

@@ -51,7 +51,7 @@ class Mine(skyloop.Controller):
 
 
 def save(path: Path, text: str) -> None:
-    """As editors do: the new file takes the place of the old one."""
+    """Save like an editor: the new file replaces the old one."""
     new = path.with_suffix(".new")
     new.write_text(text)
     new.replace(path)
@@ -71,13 +71,13 @@ def looker(alpha: Process) -> Iterator[skyloop.Drone]:
 
 
 def speeds(seen: list[Applied]) -> list[float | str]:
-    """What the pilot wanted, in order: the speed to the left, or the name of another action."""
+    """Return the pilot's requests in order: the speed to the left, or the name of another action."""
     wanted = [one.asked for one in list(seen)]
     return [action.left if isinstance(action, Velocity) else type(action).__name__ for action in wanted]
 
 
 class Loaded:
-    """Stands for a reloader: what was loaded, in turn."""
+    """A stand-in for a reloader: the loaded classes, in turn."""
 
     age_s = 0.0
 
@@ -93,7 +93,7 @@ class Loaded:
 
 
 class Listening(Controller):
-    """Commands from a callback that it registered itself."""
+    """Sends commands from a callback it registered itself."""
 
     speed = 0.1
 
@@ -129,7 +129,7 @@ def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_mo
         flying = background(lambda: flight.run_reloading(None, loaded, lambda found: found(drone)))  # type: ignore[arg-type]
 
         def load(found: type[Controller], told: str, speed: float | None) -> None:
-            """After the change is told, so many commands are all of this speed."""
+            """Check that after the reported change, this many commands all have this speed."""
             loaded.found.append(found)
             proxy.until(lambda: any(told in line for line in said), told)
             count = len(proxy.commands)
@@ -139,7 +139,7 @@ def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_mo
             assert set(after[after.index(action) :]) == {action}
 
         load(Second, "reloaded Second", 0.2)
-        load(Broken, "the one before keeps flying", 0.2)
+        load(Broken, "the previous one keeps flying", 0.2)
         load(Failing, "the controller failed: hovering", None)
         load(Listening, "reloaded Listening", 0.1)
         drone.close()
@@ -158,7 +158,7 @@ def test_a_saved_file_takes_over_without_a_command_being_missed(
         process.until("reloaded Mine")
         looker.wait(lambda _: 0.2 in speeds(seen), 20.0)
         save(mine, "def (")
-        process.until("the one before keeps flying")
+        process.until("the previous one keeps flying")
         now = len(seen)
         looker.wait(lambda _: len(seen) > now + 10, 20.0)
         process.signal(signal.SIGINT)
@@ -202,7 +202,7 @@ def test_an_error_in_on_frame_hovers_too(start: Callable[..., Process], tmp_path
 
 
 @pytest.mark.process
-def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
+def test_an_error_in_on_authority_is_reported_and_the_drone_left_to_its_new_pilot(
     start: Callable[..., Process], looker: skyloop.Drone, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.py"

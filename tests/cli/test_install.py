@@ -1,4 +1,4 @@
-"""Optional parts: one command installs them in a checkout as from a wheel; all that are missing are named at once."""
+"""Optional parts: one command installs them in a checkout or from a wheel; all missing ones are named at once."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_an_unknown_part_is_refused_with_those_that_exist(run: Run) -> None:
         install.requirements(["nothing"])
 
 
-def test_what_can_not_be_installed_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_installations_are_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "run", lambda command: SimpleNamespace(returncode=1))
     ended = run("install", "metrics")
     assert (ended.code, ended.err) == (1, "skyloop: metrics can't be installed: see above\n")
@@ -95,7 +95,7 @@ def test_a_folder_that_was_never_installed_says_so(monkeypatch: pytest.MonkeyPat
 def test_all_missing_parts_are_named_at_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The demo told of one part after the other, each after an installation."""
+    """The demo named the missing parts one at a time, each after an installation."""
     monkeypatch.setattr(install, "_is_there", lambda module: module == "PIL")
     error = MissingExtraError("the simulator", "sim", cause="No module named 'cv2'")
     told: list[str] = []
@@ -118,7 +118,7 @@ def test_all_missing_parts_are_named_at_once(
 def test_a_library_that_no_module_looked_for_is_brought_by_a_part_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """``skyloop keys show`` ended with a traceback where there is no cryptography."""
+    """``skyloop keys show`` ended with a traceback without cryptography."""
 
     def keys(*_: object, **__: object) -> None:
         raise ModuleNotFoundError("No module named 'cryptography'")
@@ -131,7 +131,7 @@ def test_a_library_that_no_module_looked_for_is_brought_by_a_part_too(
         "skyloop: skyloop keys needs an optional part that is not installed (No module named 'cryptography'): "
         "skyloop install network\n"
     )
-    monkeypatch.setattr(install, "_is_there", lambda module: True)  # then it is a mistake of ours, shown in full
+    monkeypatch.setattr(install, "_is_there", lambda module: True)  # then it is our own mistake, shown in full
     with pytest.raises(ModuleNotFoundError):
         run_app(keys, ["keys", "show"])  # type: ignore[arg-type]
 

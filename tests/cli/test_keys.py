@@ -1,4 +1,4 @@
-"""``skyloop keys``: a lab made, shown and changed from the command line."""
+"""``skyloop keys``: a lab created, shown and changed from the command line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_lab_from_its_beginning(run: Run, folder: Path) -> None:
     first = run("keys", "issue", "alpha", "--role", "proxy", "--drones", "alpha", "--dir", str(folder))
     assert first.code == 0
     assert f"copy {folder / 'issued' / 'alpha'} to its machine" in first.out
-    assert "roster" not in first.out  # nobody else has one
+    assert "roster" not in first.out  # no one else has one
     second = run("keys", "issue", "jane", "--role", "pilot", "--drones", "alpha*", "--dir", str(folder))
     assert second.out.startswith("jane, pilot of alpha*: valid until 2")
     assert f"copy {folder / 'roster.json'} into the keys of the others: alpha" in second.out
@@ -59,7 +59,7 @@ def test_an_identity_shows_its_copy_of_the_list_also_to_programs(run: Run, folde
     assert (found["number"], [key["name"] for key in found["keys"]]) == (2, ["jane"])
 
 
-def test_what_ends_within_a_week_is_told(run: Run, tmp_path: Path) -> None:
+def test_keys_that_expire_within_a_week_are_listed(run: Run, tmp_path: Path) -> None:
     now = datetime.now(UTC)
     lab = Lab.make(tmp_path / "lab", now=now - 10 * DAY)
     lab.issue(make_identity("old", "pilot"), days=1, now=now - 2 * DAY + timedelta(hours=1))
@@ -79,7 +79,7 @@ def test_what_ends_within_a_week_is_told(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["init"], "has an authority already"),
+        (["init"], "already has an authority"),
         (["issue", "Jane", "--role", "pilot"], "cannot be the name of a key"),
         (["issue", "jane", "--role", "captain"], "pilot, observer, proxy, router"),
         (["issue", "jane", "--role", "pilot", "--drones", "a/b"], "names no drones"),
@@ -97,7 +97,9 @@ def test_wrong_words_end_with_2_and_say_what_would_be_right(
 
 
 @pytest.mark.parametrize("command", [["issue", "jane", "--role", "pilot"], ["show"], ["revoke", "jane"]])
-def test_without_a_lab_the_way_to_one_is_told(run: Run, tmp_path: Path, command: list[str]) -> None:
+def test_a_missing_lab_is_reported_with_the_command_that_makes_one(
+    run: Run, tmp_path: Path, command: list[str]
+) -> None:
     ended = run("keys", *command, "--dir", str(tmp_path / "nowhere"))
     assert ended.code == 2
     assert "skyloop keys init" in ended.err
@@ -107,7 +109,7 @@ def test_without_a_lab_the_way_to_one_is_told(run: Run, tmp_path: Path, command:
     ("options", "said"),
     [
         (["--keys", "KEYS/alpha"], "give --network multicast as well"),
-        (["--network", "--keys", "KEYS/jane"], "a proxy needs some of --role proxy"),
+        (["--network", "--keys", "KEYS/jane"], "a proxy needs keys of --role proxy"),
         (["--network", "--keys", "KEYS/bravo"], "not for the name 'alpha'"),
         (["--network", "--keys", "KEYS/nobody"], "there is no folder"),
         (["--network", "--keys", "KEYS/alpha", "--listen", "tcp/127.0.0.1:0"], "must begin with quic/ or tls/"),
@@ -136,7 +138,7 @@ def test_a_router_starts_with_a_routers_keys_only(run: Run, tmp_path: Path) -> N
         lab.issue(make_identity(name, role))
     ended = run("router", "--print-config", "--keys", str(lab.folder("jane")))
     assert (ended.code, ended.out) == (2, "")
-    assert "a router needs some of --role router" in ended.err
+    assert "a router needs keys of --role router" in ended.err
     printed = json.loads(run("router", "--print-config", "--keys", str(lab.folder("hub"))).out)
     assert [subject["id"] for subject in printed["access_control"]["subjects"]] == ["hub", "jane"]
     assert printed["transport"]["link"]["tls"]["enable_mtls"] is True

@@ -1,4 +1,4 @@
-"""``skyloop list`` asks a process that serves several vehicles once."""
+"""``skyloop list`` queries a process with several vehicles only once."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ def test_one_connection_for_all_of_a_process(proxies: list[Proxy], monkeypatch: 
     assert len({row.pid for row in rows}) == 1
 
 
-def test_who_is_not_in_the_overview_is_asked(proxies: list[Proxy]) -> None:
-    proxies[1].overview.end()  # as one that keys keep out of the others' overview
+def test_vehicles_missing_from_the_overview_are_queried(proxies: list[Proxy]) -> None:
+    proxies[1].overview.end()  # like one that keys exclude from the others' overview
     assert [row.state for row in listing.running()] == ["landed"] * 3
 
 
@@ -63,7 +63,7 @@ def test_a_process_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(listing, "observed", silent)
     rows = [listing.Row("a", pid=1, host="here"), listing.Row("b", pid=1, host="here")]
-    assert [row.problem for row in listing.told(rows, None)] == ["a is silent", "b is silent"]
+    assert [row.problem for row in listing.reported(rows, None)] == ["a is silent", "b is silent"]
     assert listing.of_one_process([*rows, listing.Row("c"), listing.Row("d")]) == [
         rows,
         [listing.Row("c")],

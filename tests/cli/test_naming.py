@@ -1,4 +1,4 @@
-"""One way to name a drone and one to name a network, in every command; errors in the words of the command line."""
+"""One way to name a drone and one to name a network, in every command; errors in the terms of the command line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_every_command_about_a_drone_takes_it_as_name_and_as_drone(command: str)
     group: Any = typer.main.get_command(build([command]))
     options = {word for param in group.commands[command].params for word in param.opts}
     assert "--drone" in options
-    if command != "audit":  # whose files are on this host
+    if command != "audit":  # its files are on this host
         assert {"--network", "--keys"} <= options
 
 
@@ -53,13 +53,13 @@ def test_a_drone_is_named_by_either(name: str | None, drone: str | None, default
 def test_a_drone_that_is_not_named_or_named_twice_is_refused(run: Run) -> None:
     with pytest.raises(UsageError, match="NAME a and --drone b name two drones"):
         naming.one_drone("a", "b")
-    with pytest.raises(UsageError, match="give its NAME, or --drone NAME; none is running: skyloop sim"):
+    with pytest.raises(UsageError, match="give NAME or --drone NAME; none is running: skyloop sim"):
         naming.one_drone(None, None)
     assert naming.drones(["a", "b"], ["b", "c"]) == ["a", "b", "c"]
     for words in (["watch"], ["teleop"], ["param"], ["record"], ["land"], ["stop", "--yes"], ["camera", "calibrate"]):
         ended = run(*words)
         assert (ended.code, ended.out) == (2, "")
-        assert ended.err.startswith("skyloop: no drone is named: give its NAME, or --drone NAME; none is running")
+        assert ended.err.startswith("skyloop: no drone given: give NAME or --drone NAME; none is running")
 
 
 @pytest.mark.parametrize("words", [["nobody"], ["--drone", "nobody"], ["--drone=nobody"]])
@@ -89,9 +89,9 @@ def test_a_network_without_a_place_is_searched_by_multicast(words: list[str], me
 @pytest.mark.parametrize(
     ("where", "said"),
     [
-        ("nonsense/x", "'nonsense/x' is no network address: it looks like 10.0.0.5:7447"),
-        ("host:70000", "is no network address"),
-        ("nowhere.invalid:7447", "cannot join the network: the host's name is not known"),
+        ("nonsense/x", "'nonsense/x' is not a network address, such as 10.0.0.5:7447"),
+        ("host:70000", "is not a network address"),
+        ("nowhere.invalid:7447", "cannot join the network: the host's name is unknown"),
     ],
 )
 def test_a_wrong_network_is_refused_without_a_library_s_paths(run: Run, where: str, said: str) -> None:
@@ -129,7 +129,7 @@ def test_every_hint_has_its_words_in_python_and_in_the_terminal() -> None:
 
 
 def test_the_words_of_options_are_the_same_everywhere() -> None:
-    """One spelling, one help: a second one would be a second way."""
+    """One spelling and one help text: a second would be a second way."""
     found: dict[str, set[str]] = {}
     group: Any = typer.main.get_command(build())
     for name in OF_DRONES:

@@ -1,4 +1,4 @@
-"""Parameters on the command line: what a person types and reads, and a real proxy behind it."""
+"""Parameters on the command line: typed and shown values, with a real proxy behind."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_vector_that_is_shown_can_be_typed_again(vector: tuple[float, ...]) ->
         (Parameter("a", ParameterType.FLOAT, 0.0), ""),
     ],
 )
-def test_what_is_allowed_is_told_in_words(parameter: Parameter, words: str) -> None:
+def test_allowed_values_are_described_in_words(parameter: Parameter, words: str) -> None:
     assert allowed(parameter) == words
 
 
@@ -135,7 +135,7 @@ def test_values_are_written(run: Run, alpha: Process) -> None:
         (["--prioriti", "3"], "no parameter named '--prioriti'"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_line(run: Run, alpha: Process, words: list[str], said: str) -> None:
+def test_errors_are_reported_in_one_line(run: Run, alpha: Process, words: list[str], said: str) -> None:
     ended = run("param", "alpha", *words)
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err

@@ -1,4 +1,4 @@
-"""How a flight goes, in one line; the cameras of a machine; what the shell completes; tables in narrow terminals."""
+"""A flight's progress in one line; a machine's cameras; shell completion; tables in narrow terminals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_flight_keeps_one_line_up_to_date_in_a_terminal(tmp_path: Path) -> Non
 
 
 def machine(tmp_path: Path, **names: tuple[str, str]) -> tuple[Path, Path]:
-    """Folders as the kernel makes them, of cameras with these names and numbers of their nodes."""
+    """Create folders like the kernel's, for cameras with these names and node numbers."""
     system, devices = tmp_path / "sys", tmp_path / "dev"
     for folder in (system, devices):
         folder.mkdir()

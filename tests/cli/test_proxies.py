@@ -28,7 +28,7 @@ pytestmark = pytest.mark.process
 
 @contextmanager
 def stopped(process: Process) -> Iterator[None]:
-    """As Ctrl-Z does."""
+    """Suspend it, like Ctrl-Z."""
     process.signal(signal.SIGSTOP)
     try:
         yield
@@ -68,7 +68,7 @@ def test_the_list_of_none_says_how_to_start_one(
     assert run("list", "--json").out == "[]\n"
 
 
-def test_a_stopped_proxy_is_told_by_every_command(
+def test_every_command_reports_a_stopped_proxy(
     run: Run, alpha: Process, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(import_module("skyloop.client.connect"), "NAME_TIMEOUT_S", 0.1)
@@ -256,7 +256,7 @@ def test_the_address_of_a_simulation_is_put_together_from_its_options() -> None:
     ("others", "said"),
     [(["cameras"], "has no value"), (["seed=3"], "give --seed 3"), (["wind=0", "wind=1"], "given twice")],
 )
-def test_an_option_that_is_none_is_answered_with_what_is(others: list[str], said: str) -> None:
+def test_an_unknown_option_is_answered_with_the_known_ones(others: list[str], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         address("room", 0, 1.0, others)
 
@@ -280,11 +280,11 @@ def test_the_cockpit_says_what_is_wrong(run: Run, alpha: Process) -> None:
 
 def test_the_list_names_the_drones_of_other_users(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.transport.local.names_of_others", lambda: {"mary": ["bravo", "alpha"]})
-    theirs = "mary runs alpha, bravo: a user's proxies are closed to others, but for a group's (SKYLOOP_GROUP)."
+    theirs = "mary runs alpha, bravo: a user's proxies are closed to others, except to a group (SKYLOOP_GROUP)."
     assert run("list").err == f"{theirs}\n"
     assert run("list", "--json").err == ""
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", f"/tmp/skyloop-none-{os.getpid()}")
     start = "Start one: skyloop proxy sim:// --name alpha"
     assert run("list").out == f"No proxy of yours is running on this host. {theirs} {start}\n"
     ours = "No proxy of yours is running on this host."
-    assert run("land", "--all").err == f"skyloop: no drone is found. {ours} {theirs} {start}\n"
+    assert run("land", "--all").err == f"skyloop: no drone found. {ours} {theirs} {start}\n"

@@ -82,4 +82,4 @@ def test_a_recording_that_is_not_complete_fails(
     monkeypatch.setattr("skyloop.recording.engine.Engine.status", property(lambda engine: failed))
     ended = run("record", "alpha", "-o", str(tmp_path), "--seconds", "0.1", "--min-free-mb", "0")
     assert ended.code == 1
-    assert "not complete: No space left" in ended.err
+    assert "incomplete: No space left" in ended.err

@@ -1,4 +1,4 @@
-"""``skyloop ros``: what the options become, and what it says without rclpy. tests/ros tests the bridge itself."""
+"""``skyloop ros``: the effect of its options, and its message without rclpy. tests/ros tests the bridge itself."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_options(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     ]
 
 
-def test_what_makes_no_sense_is_refused(run: Run) -> None:
+def test_nonsense_is_refused(run: Run) -> None:
     assert run("ros", "alpha", "--domain", "500").code == 2
     assert "0 to 101" in run("ros", "alpha", "--domain", "500").err
     assert run("ros").code == 2

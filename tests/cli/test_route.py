@@ -1,4 +1,4 @@
-"""Routes from the command line: checked, and flown to their end or until somebody interrupts."""
+"""Routes from the command line: checked, and flown to their end or an interrupt."""
 
 from __future__ import annotations
 

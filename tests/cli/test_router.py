@@ -1,4 +1,4 @@
-"""``skyloop router --print-config`` gives what Zenoh's own router takes; the options of the network."""
+"""``skyloop router --print-config`` prints a configuration for Zenoh's own router; the options of the network."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_the_printed_configuration_is_one(run: Run, monkeypatch: pytest.MonkeyPa
     assert printed["transport"]["link"]["protocols"] == ["tcp", "udp"]
 
 
-def test_addresses_that_are_none_are_told(run: Run) -> None:
+def test_invalid_addresses_are_reported(run: Run) -> None:
     for words in (
         ("router", "--listen", "nonsense:port"),
         ("proxy", "sim://", "--network", "--connect", "host:70000"),
@@ -31,7 +31,7 @@ def test_addresses_that_are_none_are_told(run: Run) -> None:
     ):
         ended = run(*words)
         assert ended.code == 2
-        assert "is no network address" in ended.err
+        assert "is not a network address" in ended.err
 
 
 @pytest.mark.parametrize(

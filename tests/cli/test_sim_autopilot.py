@@ -1,4 +1,4 @@
-"""``skyloop sim --autopilot``: what is said about several before any firmware is started."""
+"""``skyloop sim --autopilot``: errors about several ones, before any firmware starts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.commands import Run
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--autopilot px4 --autopilot ardupilot", "--autopilot is given 2 times for --drones 1"),
+        ("--autopilot px4 --autopilot ardupilot", "--autopilot given 2 times for --drones 1"),
         ("--drones 2 --autopilot px4 --autopilot betaflight", "choose one, such as --option vehicle=iris"),
         ("--drones 2 --speed 2 --autopilot px4 --autopilot betaflight", "speed must be 1, not 2"),
         ("--autopilot px4 --firmware px4", "give one of them"),

@@ -1,4 +1,4 @@
-"""``skyloop sim --firmware``: an emulated drone as a process of its own."""
+"""``skyloop sim --firmware``: an emulated drone as a separate process."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_ports_count_from_a_base() -> None:
         (("--lose", "0.1"), "--lose is for --firmware: give --firmware ardrone2 as well"),
         (("--bind", "0.0.0.0"), "--bind is for --firmware"),
         (("--firmware", "ardrone2", "--name", "mine"), "--name is the proxy's"),
-        (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be chosen with --firmware"),
+        (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be set with --firmware"),
         (
             ("--firmware", "ardrone3"),
             "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'betaflight', 'px4', 'tello'",
@@ -97,7 +97,7 @@ def test_ports_count_from_a_base() -> None:
         (("--firmware", "ardrone2", "--port-base", "0", "--bind", "no such host"), "can't be opened"),
     ],
 )
-def test_what_makes_no_sense_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
+def test_nonsense_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
     ended = run("sim", "--world", "empty", *arguments)
     assert ended.code != 0
     assert said in ended.err
@@ -136,4 +136,4 @@ def test_several_autopilots_say_where_they_are_and_end_when_told(start: Callable
 def test_an_ardrone_has_a_video_port_of_its_own(run: Run) -> None:
     ended = run("sim", "--firmware", "ardrone2", "--video-port", "5600")
     assert ended.code == 2
-    assert "the others have a port of their own" in ended.err
+    assert "the others have their own port" in ended.err

@@ -1,4 +1,4 @@
-"""Flying by the keys of a terminal."""
+"""Flying with the terminal's keys."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class Fingers:
         return self.hands.step(keys, self.now_s, state)
 
     def wait(self, seconds: float, state: FlightState = FLYING) -> list[Order | Deflection]:
-        """Step as often as the loop does, without a key."""
+        """Step at the rate of the loop, without a key."""
         wanted: list[Order | Deflection] = []
         for _ in range(round(seconds / 0.05)):
             wanted += self.press(state=state)
         return wanted
 
     def hold(self, key: str, seconds: float, every_s: float = 0.03) -> list[Order | Deflection]:
-        """A key that is down: a press, nothing for half a second, then repeats."""
+        """Hold a key: a press, half a second of nothing, then repeats."""
         wanted = self.press(key) + self.wait(0.5)
         for _ in range(round(seconds / every_s)):
             wanted += self.press(key, after_s=every_s)
@@ -96,7 +96,7 @@ def test_an_order_to_stop_lets_all_sticks_go(key: str) -> None:
 
 
 def test_a_landing_is_not_ended_by_a_stick_that_was_held_or_is_still() -> None:
-    """L during, or soon after, a stick key: the vehicle shows only after a while that it lands."""
+    """L during, or soon after, a stick key: the vehicle shows its landing only after some time."""
     fingers = Fingers()
     fingers.hold("w", 0.3)
     assert fingers.press("l") == ["land"]
@@ -147,7 +147,7 @@ def test_esc_that_is_held_stops_no_motors(every_s: float) -> None:
 
 
 def test_repeats_that_were_held_up_stop_no_motors() -> None:
-    """The program, or the network to it, stood still for a moment while Esc was held."""
+    """The program, or its network connection, stalled for a moment while Esc was held."""
     fingers = Fingers()
     fingers.press("esc")
     fingers.press("esc", after_s=0.5)
@@ -164,7 +164,7 @@ def test_repeats_that_were_held_up_stop_no_motors() -> None:
 
 @pytest.mark.parametrize("key", ["w", "esc"])
 def test_esc_held_just_past_its_first_repeat_is_one_press_once_the_keyboard_is_known(key: str) -> None:
-    """It was let go after one repeat, which is as late as a slow second press, and the motors were cut."""
+    """Released after one repeat, which comes as late as a slow second press, it cut the motors."""
     fingers = Fingers()
     fingers.hold(key, 0.3)
     fingers.wait(3.0)
@@ -200,7 +200,7 @@ def test_repeats_that_were_held_up_behind_the_first_one_stop_no_motors() -> None
 
 @pytest.mark.parametrize("gap_s", [0.5, 0.9])
 def test_who_goes_on_pressing_esc_stops_the_motors_whatever_the_keyboards_delay(gap_s: float) -> None:
-    """Presses in the rhythm of the keyboard's delay were each taken for its first repeat, and nothing ever stopped."""
+    """Presses in the rhythm of the keyboard's delay were each taken for its first repeat, and nothing stopped."""
     fingers = Fingers()
     fingers.hold("w", 0.3)
     fingers.wait(3.0)
@@ -272,7 +272,7 @@ def test_each_key_that_is_told_does_something() -> None:
 def test_sequences_are_told_from_esc_and_from_letters(
     data: bytes, keys: list[str] | None, flushed: list[str] | None
 ) -> None:
-    """Ctrl with an arrow ends in a letter, and Alt with a letter begins with an Esc: neither is a press of either."""
+    """Ctrl with an arrow ends in a letter, and Alt with a letter begins with Esc: neither counts as either key."""
     tokens = Tokenizer()
     found = tokens.feed(data)
     if keys is not None:
@@ -295,8 +295,8 @@ def test_an_arrow_that_comes_slowly_is_an_arrow() -> None:
 
 
 @pytest.mark.parametrize(("focus", "told"), [(b"\x1b[O", "another window"), (b"\x1b[I", "again")])
-def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus: bytes, told: str) -> None:
-    """A terminal with another window in front of it heard no key, and said nothing."""
+def test_a_window_without_keys_is_reported_and_swallows_no_esc(focus: bytes, told: str) -> None:
+    """A terminal behind another window received no keys, without a message."""
     tokens = Tokenizer()
     assert tokens.feed(focus) == []
     assert told in tokens.other
@@ -305,7 +305,7 @@ def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus
     assert tokens.feed(b"\x1b\x1b" + focus + b"l") == ["esc", "esc", "l"]
     assert told in tokens.other
     assert tokens.feed(b"\x1b[15~") == []
-    assert tokens.other == "this key is none here"
+    assert tokens.other == "this key has no function here"
     tokens.feed(b"\x1b")
     tokens.flush()
     assert tokens.other == ""
@@ -313,14 +313,18 @@ def test_a_window_that_gets_no_keys_is_told_and_takes_no_press_of_esc_away(focus
 
 def test_a_key_that_does_nothing_says_so() -> None:
     fingers = Fingers()
-    for key, told in (("x", "X is no key here"), ("\n", "Enter is no key here"), ("\x01", "'\\x01' is no key here")):
+    for key, told in (
+        ("x", "X has no function here"),
+        ("\n", "Enter has no function here"),
+        ("\x01", "'\\x01' has no function here"),
+    ):
         assert fingers.press(key) == []
         assert fingers.hands.no_effect == told
     assert fingers.press("w") == [FORWARD]
     assert fingers.hands.no_effect == ""
     assert fingers.press("l") == ["land"]
     assert fingers.press("up", state=LANDING) == []
-    assert fingers.hands.no_effect.startswith("↑ has no effect on a landing, which H ends")
+    assert fingers.hands.no_effect.startswith("↑ has no effect during a landing")
     assert fingers.press("esc", after_s=5.0) == ["hover"]
     assert fingers.press("esc", after_s=0.15) == ["stop"]
     assert fingers.press("t") == []
@@ -338,7 +342,7 @@ def test_whatever_a_terminal_sends_is_keys(parts: list[bytes]) -> None:
 
 @pytest.fixture
 def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
-    """A terminal: the end of the person, and the one that is standard input."""
+    """A terminal: the person's end, and the end used as standard input."""
     person, program = pty.openpty()
     with os.fdopen(program, "rb", buffering=0) as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
@@ -353,7 +357,7 @@ def test_ctrl_z_and_ctrl_s_are_keys_and_what_a_shell_makes_of_the_terminal_is_un
         ours = termios.tcgetattr(program)
         os.write(person, b"\x13\x1aw\x1b[A")
         assert keyboard.keys(WAIT_S) == ["\x13", "\x1a", "w", "up"]
-        termios.tcsetattr(program, termios.TCSANOW, before)  # as a shell does before it continues a job
+        termios.tcsetattr(program, termios.TCSANOW, before)  # like a shell before it continues a job
         signal.raise_signal(signal.SIGCONT)
         assert termios.tcgetattr(program) == ours
         os.write(person, b"\x1b")
@@ -372,7 +376,7 @@ def proxy() -> Iterator[ScriptedProxy]:
 
 
 def test_a_hover_ends_a_take_off_that_does_not_show_yet(proxy: ScriptedProxy) -> None:
-    """T, then Esc or H while it still stood: nothing was sent, and it took off."""
+    """T, then Esc or H while it was still on the ground: nothing was sent, and it took off."""
     proxy.state = FlightState.LANDED
     with flown(proxy) as drone:
         drone.wait("landed", WAIT_S)
@@ -436,7 +440,7 @@ def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
 
 
 def test_keys_that_have_no_effect_say_why(proxy: ScriptedProxy) -> None:
-    """With the link lost, or sticks refused, nothing moved and nothing was said."""
+    """With the link lost, or sticks refused, nothing moved, without a message."""
     with flown(proxy) as drone:
         drone.wait("flying", WAIT_S)
         pilot = Teleop(drone, 0.5, 0.8)
@@ -468,11 +472,11 @@ def test_without_a_terminal_it_says_so(run: Run, monkeypatch: pytest.MonkeyPatch
         monkeypatch.setattr("sys.stdin", nothing)
         ended = run("teleop", "alpha")
     assert ended.code == 2
-    assert "no terminal" in ended.err
+    assert "not a terminal" in ended.err
 
 
 class Terminal:
-    """``skyloop teleop`` in a terminal of its own."""
+    """``skyloop teleop`` in a separate terminal."""
 
     def __init__(self, *arguments: str) -> None:
         self._master, slave = pty.openpty()
@@ -492,14 +496,14 @@ class Terminal:
             self.text += os.read(self._master, 65536).decode("utf-8", "replace")
 
     def wait(self, timeout_s: float = 20.0) -> int:
-        """Read on until it has ended."""
+        """Read until it has ended."""
         deadline = time.monotonic() + timeout_s
         while self.process.poll() is None:
             assert time.monotonic() < deadline, self.text[-2000:]
             if select.select([self._master], [], [], 0.05)[0]:
                 try:
                     self.text += os.read(self._master, 65536).decode("utf-8", "replace")
-                except OSError:  # its other end is closed
+                except OSError:  # the other end is closed
                     break
         return self.process.wait(5)
 
@@ -527,7 +531,7 @@ def test_a_flight_by_keys(terminal: Terminal) -> None:
         drone.wait("hovering", timeout_s=30.0)
         terminal.press(b"w\x1b[D")
         drone.wait(lambda feedback: (feedback.velocity_m_s or (0.0,))[0] > 0.05, 20.0)
-        drone.wait("hovering", timeout_s=30.0)  # no key is held any more
+        drone.wait("hovering", timeout_s=30.0)  # no key is held
         terminal.press(b"+")
         terminal.until("1 m/s, 1.6 rad/s")
         terminal.press(b"r")
@@ -558,7 +562,7 @@ def test_esc_twice_cuts_the_motors_and_ctrl_c_ends(terminal: Terminal) -> None:
 
 @pytest.mark.process
 def test_l_lands_while_a_stick_key_is_held_and_esc_that_is_held_cuts_nothing(terminal: Terminal) -> None:
-    """The stick's hover came after the landing, which autopilots break off for it."""
+    """The stick's hover followed the landing, and autopilots break off a landing for it."""
     terminal.until("take off")
     with skyloop.connect("alpha", access="observe") as drone:
         terminal.press(b"t")
@@ -570,7 +574,7 @@ def test_l_lands_while_a_stick_key_is_held_and_esc_that_is_held_cuts_nothing(ter
         for _ in range(8):
             terminal.press(b"\x1b")
             time.sleep(0.03)
-        terminal.until("Esc is held")
+        terminal.until("holding Esc")
         for _ in range(4):
             terminal.press(b"\x1bw")
             time.sleep(0.03)

@@ -1,4 +1,4 @@
-"""Colour where a terminal has it, and nowhere else."""
+"""Colour in terminals that support it, and nowhere else."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_what_matters_is_coloured_in_a_terminal(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(("variable", "value"), [("NO_COLOR", "1"), ("TERM", "dumb")])
-def test_who_wants_no_colour_gets_none(monkeypatch: pytest.MonkeyPatch, variable: str, value: str) -> None:
+def test_no_colour_is_respected(monkeypatch: pytest.MonkeyPatch, variable: str, value: str) -> None:
     monkeypatch.setenv(variable, value)
     assert coloured("skyloop: no file", Terminal()) == "skyloop: no file"
 
@@ -37,5 +37,5 @@ def test_a_pipe_gets_plain_text() -> None:
 
 
 def test_without_standard_error_nothing_is_coloured_and_nothing_fails() -> None:
-    """A flight's reports go through here: one that failed would end it."""
+    """A flight's reports pass through here: a failure would end it."""
     assert coloured("skyloop: no file", None) == "skyloop: no file"

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture(autouse=True)
 def priority(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keeps that of the tests' own process."""
+    """Keep the priority of the tests' own process."""
     monkeypatch.setattr("skyloop.recording.view.give_way", lambda: None)
 
 
@@ -63,12 +63,12 @@ def test_parameters_are_written_under_a_lease_that_is_held_for_that_moment(alpha
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("alpha",), "give one of --foxglove and --rerun"),
-        (("alpha", "--foxglove", "--rerun"), "give one of --foxglove and --rerun"),
-        (("alpha", "--foxglove", "--save", "x.rrd"), "--connect and --save are of --rerun"),
-        (("alpha", "--rerun", "--write"), "--write is of --foxglove"),
+        (("alpha",), "give either --foxglove or --rerun"),
+        (("alpha", "--foxglove", "--rerun"), "give either --foxglove or --rerun"),
+        (("alpha", "--foxglove", "--save", "x.rrd"), "--connect and --save are for --rerun"),
+        (("alpha", "--rerun", "--write"), "--write is for --foxglove"),
         (("alpha", "--rerun", "--connect", "rerun+http://a:1/proxy", "--save", "x.rrd"), "leave out --save and --port"),
-        (("--foxglove",), "no drone is named"),
+        (("--foxglove",), "no drone given"),
         (("alhpa", "--foxglove"), "did you mean 'alpha'"),
     ],
 )

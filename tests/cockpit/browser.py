@@ -33,7 +33,7 @@ WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15"
 
 
 class Deck:
-    """A cockpit, its browser, and proxies that are started for one test."""
+    """A cockpit, its browser, and proxies started for one test."""
 
     def __init__(self, browser: Browser, address: str) -> None:
         self.address = address
@@ -49,14 +49,14 @@ class Deck:
         return process
 
     def cockpit(self, *options: str) -> str:
-        """Another cockpit, with options of ``skyloop cockpit``; its address."""
+        """Start another cockpit with options of ``skyloop cockpit``; return its address."""
         usual = self.address
         self.own_cockpit(*options)
         other, self.address = self.address, usual
         return other
 
     def own_cockpit(self, *options: str) -> Process:
-        """Another cockpit whose pages are opened from now on, and which can be stopped."""
+        """Start another cockpit for later pages; it can be stopped."""
         process = Process("-m", "skyloop", "cockpit", "--port", "0", *options)
         self._processes.append(process)
         process.until("/\n")
@@ -64,9 +64,9 @@ class Deck:
         return process
 
     def page(self, *names: str, prepare: str = "", panels: bool = True, **options: Any) -> DronePage:
-        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first.
+        """Open the page with these drones, once it shows the last of them. ``prepare``: a script that runs first.
 
-        With the panels beside the picture, as for a person who chose them, unless ``panels`` is false.
+        The panels are shown beside the picture, as for a person who chose them, unless ``panels`` is false.
         """
         if panels:
             prepare += PANELS
@@ -77,7 +77,7 @@ class Deck:
         return shown
 
     def overview(self, prepare: str = "", **options: Any) -> DronePage:
-        """The page with all drones; one that is opened has the panels beside its picture."""
+        """Open the page with all drones; a drone opened from it has its panels beside the picture."""
         page = self._new_page(prepare + PANELS, options)
         shown = DronePage(page, "")
         page.goto(f"{self.address}#/")
@@ -98,7 +98,7 @@ class Deck:
 
 
 class DronePage:
-    """One open page, and what it shows of one drone."""
+    """One open page, and its view of one drone."""
 
     def __init__(self, page: Page, drone: str) -> None:
         self.page = page
@@ -116,7 +116,7 @@ class DronePage:
             self.page.keyboard.press(key)
 
     def until(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
-        """Wait while the browser goes on, never longer than this."""
+        """Wait while the browser continues, never longer than this."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, (
@@ -133,7 +133,7 @@ class DronePage:
 
     @contextmanager
     def holding(self, *keys: str) -> Iterator[None]:
-        """Keys that are held meanwhile."""
+        """Hold keys during the block."""
         for key in keys:
             self.page.keyboard.down(key)
         try:
@@ -150,7 +150,7 @@ class DronePage:
         self.until(lambda: self.attribute(".camera", "data-seq") not in ("", first), "another picture")
 
     def ask_for_control(self) -> None:
-        """Press the key, once the page has its line to the cockpit."""
+        """Press the key, once the page is connected to the cockpit."""
         self.until(lambda: not self.pane.locator(".taking .primary").is_disabled(), "the line is open")
         self.press("c")
 
@@ -163,7 +163,7 @@ class DronePage:
         *,
         again: Callable[[], bool] = lambda: True,
     ) -> None:
-        """As a person does it: press again if nothing came of it, as when it came too late on a busy machine."""
+        """Act like a person: press again without effect, for example when late on a busy machine."""
         pressed_s = 0.0
 
         def done() -> bool:
@@ -190,7 +190,7 @@ class DronePage:
 
 @contextmanager
 def runtime() -> Iterator[None]:
-    """A directory of sockets for these tests alone; with a short path, as those of sockets must be."""
+    """A separate directory of sockets for these tests, with a short path, as sockets require."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
         yield
@@ -198,7 +198,7 @@ def runtime() -> Iterator[None]:
 
 @contextmanager
 def _chromium(playwright: Playwright) -> Iterator[Browser]:
-    arguments = ["--enable-unsafe-swiftshader"]  # three dimensions without a graphics card
+    arguments = ["--enable-unsafe-swiftshader"]  # 3-D without a graphics card
     if os.geteuid() == 0:
         arguments.append("--no-sandbox")  # Chromium has no sandbox for the superuser
     browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
@@ -208,7 +208,7 @@ def _chromium(playwright: Playwright) -> Iterator[Browser]:
 
 @contextmanager
 def browser_and_cockpit(name: Literal["chromium", "firefox"] = "chromium") -> Iterator[tuple[Browser, str]]:
-    """A browser, and the address of a cockpit that shows every proxy as it comes. Skips where there is none."""
+    """A browser, and the address of a cockpit that shows every proxy as it appears. Skips without a browser."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
     if {"chromium": CHROMIUM, "firefox": firefox.FIREFOX}[name] is None:
         pytest.skip(f"no {name} here (Debian: apt install chromium firefox-esr)")

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def node() -> Iterator[Node]:
-    """A proxy named alpha, with a vehicle that flies."""
+    """A proxy named alpha, with a flying vehicle."""
     node = Node()
     yield node
     node.stop()
@@ -33,7 +33,7 @@ def client(node: Node) -> Iterator[TestClient]:
 
 @pytest.fixture(scope="module")
 def open_cockpit(request: pytest.FixtureRequest) -> Iterator[tuple[Browser, str]]:
-    """The browser and cockpit of one module's tests: Chromium, unless it is marked ``IN_FIREFOX`` or ``IN_BOTH``."""
+    """The browser and cockpit of one module's tests: Chromium, unless marked ``IN_FIREFOX`` or ``IN_BOTH``."""
     with browser_and_cockpit(getattr(request, "param", "chromium")) as opened:
         yield opened
 

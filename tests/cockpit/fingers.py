@@ -20,7 +20,7 @@ Send = Callable[[Literal["touchStart", "touchMove", "touchEnd"], str, Places], N
 
 
 class Fingers:
-    """Any number of fingers, each by its name, at places on the screen in CSS pixels from the upper left corner."""
+    """Any number of named fingers, at places on the screen in CSS pixels from the upper left corner."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -75,7 +75,7 @@ def _firefox(page: Page) -> Iterator[Send]:
     browser = page.context.browser
     assert browser is not None
     with bidi(browser) as call:
-        name = uuid4().hex  # what tells this page from the others, as Playwright does not say what Firefox calls it
+        name = uuid4().hex  # identifies this page, as Playwright does not reveal Firefox's name for it
         page.evaluate("name => { window.name = name; }", name)
 
         def named(context: str) -> bool:
@@ -124,7 +124,7 @@ def take_control(page: DronePage) -> None:
 
 
 def tap_until(page: DronePage, name: str, state: str) -> None:
-    """Tap again if it came too late to count, as on a busy machine."""
+    """Tap again if the first tap came too late to count, as on a busy machine."""
     tapped_s = -math.inf
 
     def reached() -> bool:

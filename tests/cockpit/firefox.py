@@ -1,10 +1,10 @@
-"""Firefox, for the tests of the page: driven by Playwright as Chromium is.
+"""Firefox for the tests of the page: driven by Playwright, like Chromium.
 
-Playwright speaks WebDriver BiDi to an unpatched Firefox (channel ``moz-firefox``), but sends commands that Firefox does
-not have, each release others, and gives up at the first. So ``launch`` has Playwright start this module in place of
-Firefox: it starts Firefox, passes every message on, and confirms what Firefox does not know. What a test needs of that
-is a preference of the browser instead. A test opens it by ``browser.browser_and_cockpit("firefox")`` and is then the
-same as in Chromium; ``fingers.on`` moves fingers in both. Start a browser once per file, as it takes seconds.
+Playwright speaks WebDriver BiDi to an unpatched Firefox (channel ``moz-firefox``), but sends commands that Firefox
+lacks, different ones in each release, and gives up at the first. ``launch`` therefore makes Playwright start this
+module instead of Firefox: it starts Firefox, relays every message, and confirms the unknown ones. Tests set preferences
+of the browser instead. A test opens it by ``browser.browser_and_cockpit("firefox")`` and then runs as in Chromium;
+``fingers.on`` moves fingers in both. Start a browser once per file, as it takes seconds.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _OPTIONS: dict[str, Any] = {"max_size": None, "compression": None, "ping_interva
 
 @contextmanager
 def launch(playwright: Playwright, preferences: Mapping[str, str | float | bool] = {}) -> Iterator[Browser]:
-    """Firefox with these preferences besides ``PREFERENCES``, gone at the end.
+    """Run Firefox with these preferences in addition to ``PREFERENCES``, and remove its profile at the end.
 
     ``ui.primaryPointerCapabilities=1`` is a screen that is touched,
     ``layout.css.prefers-color-scheme.content-override=0`` a dark system, 1 a light one.
@@ -68,7 +68,7 @@ def launch(playwright: Playwright, preferences: Mapping[str, str | float | bool]
 
 
 def _skip_if_it_can_not_be_asked(browser: Browser) -> None:
-    """Firefox 140.12 applies a page's policy to what Playwright evaluates beside the page, too: nothing works then."""
+    """Work around Firefox 140.12, which applies a page's policy to Playwright's own scripts, so that nothing works."""
     page = browser.new_page()
     try:
         page.goto("data:text/html,<meta http-equiv='Content-Security-Policy' content=\"default-src 'self'\">")
@@ -83,7 +83,7 @@ def _skip_if_it_can_not_be_asked(browser: Browser) -> None:
 
 @contextmanager
 def bidi(browser: Browser) -> Iterator[Callable[..., dict[str, Any]]]:
-    """Sends what Playwright has no call for, and returns its result (https://w3c.github.io/webdriver-bidi)."""
+    """Send a command without a Playwright call, and return its result (https://w3c.github.io/webdriver-bidi)."""
     with unix_connect(_sockets[browser], uri="ws://localhost", compression=None, max_size=None) as socket:
         numbers = count(_SECOND_IDS)
 
@@ -99,7 +99,7 @@ def bidi(browser: Browser) -> Iterator[Callable[..., dict[str, Any]]]:
 
 
 class _Relay:
-    """Passes messages on between Playwright, a second client, and Firefox."""
+    """Relay messages between Playwright, a second client, and Firefox."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -133,7 +133,7 @@ class _Relay:
 
 
 async def main() -> None:
-    """Firefox, and where Playwright looks for it."""
+    """Return Firefox, and where Playwright looks for it."""
     assert FIREFOX is not None, "no Firefox here"
     process = await asyncio.create_subprocess_exec(FIREFOX, *sys.argv[1:], stderr=asyncio.subprocess.PIPE)
     assert process.stderr is not None

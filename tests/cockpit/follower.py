@@ -1,4 +1,4 @@
-"""A stand-in for what follows a target: it sees the box where it was, and flies forward."""
+"""A stand-in for a follower: it sees the box at its original place, and flies forward."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skyloop.vision.tracking import Box, outline
 
 @dataclass
 class StandIn:
-    """Counts what it is called with; a test may change what it says, and make it fail or wait."""
+    """Counts its calls; a test may change its answers, and make it fail or wait."""
 
     camera: CameraInfo
     box: Box
@@ -75,7 +75,7 @@ class StandIn:
 
 
 class StandIns:
-    """Makes them, and keeps them for a test."""
+    """Creates them, and keeps them for a test."""
 
     def __init__(self, prepare: Callable[[StandIn], None] = lambda _: None) -> None:
         self.made: list[StandIn] = []

@@ -1,4 +1,4 @@
-"""Tokens, certificates, and whose program is at the other end."""
+"""Tokens, certificates, and the owner of the program at the other end."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ def test_tokens_are_read(tmp_path: Path) -> None:
     [
         ("", "has no token"),
         ("# nothing\n", "has no token"),
-        ("pilot\n", "line 1: ROLE TOKEN"),
-        ("\nadmin 0123456789abcdef\n", "line 2: ROLE TOKEN"),
-        ("pilot short\n", "16 to 256 characters"),
-        ("pilot " + "x" * 257, "16 to 256 characters"),
-        ("pilot " + "ä" * 20, "16 to 256 characters of ASCII"),
-        ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is in the file already"),
+        ("pilot\n", "line 1: expected ROLE TOKEN"),
+        ("\nadmin 0123456789abcdef\n", "line 2: expected ROLE TOKEN"),
+        ("pilot short\n", "16 to 256 ASCII characters"),
+        ("pilot " + "x" * 257, "16 to 256 ASCII characters"),
+        ("pilot " + "ä" * 20, "16 to 256 ASCII characters"),
+        ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is already in the file"),
     ],
 )
-def test_what_is_wrong_with_a_file_of_tokens_is_told(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_token_files_are_reported(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(FileFormatError, match=said):
         read_tokens(written(tmp_path, text))
 
@@ -91,7 +91,7 @@ def test_a_file_that_others_may_read_is_refused(tmp_path: Path, mode: int) -> No
         read_tokens(written(tmp_path, "pilot 0123456789abcdef\n", mode))
 
 
-def test_a_file_that_is_not_there_or_no_text(tmp_path: Path) -> None:
+def test_a_missing_or_binary_token_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="can't be read"):
         read_tokens(tmp_path / "nowhere")
     path = written(tmp_path, "")
@@ -118,7 +118,7 @@ def test_a_token_with_each_request() -> None:
 
 
 @given(some.text(max_size=300))
-def test_what_is_no_token_lets_nobody_in(text: str) -> None:
+def test_an_invalid_token_admits_no_one(text: str) -> None:
     gate = TokenGate([ANN, BOB], "c")
     assert gate.known(text) is None or text.encode() in (ANN.secret, BOB.secret)
 
@@ -149,7 +149,7 @@ def test_a_session_can_be_ended_and_there_are_not_too_many() -> None:
     assert gate.person(scope(cookie=f"c={newest}")) == ANN.person
 
 
-def test_sessions_outlive_the_process_while_what_began_them_lets_in(tmp_path: Path) -> None:
+def test_sessions_survive_a_restart_while_their_token_is_valid(tmp_path: Path) -> None:
     def gate(*tokens: Token, boot: str = "one", pairing: Pairing | None = None) -> TokenGate:
         return TokenGate(tokens, "c", pairing=pairing, kept=SessionFile(tmp_path / "sessions", boot))
 
@@ -174,7 +174,7 @@ def test_sessions_outlive_the_process_while_what_began_them_lets_in(tmp_path: Pa
     assert let_in(gate(ANN, BOB)) == [False] * 4
 
 
-def test_where_sessions_cannot_be_kept_they_last_as_long_as_the_process(tmp_path: Path) -> None:
+def test_sessions_that_cannot_be_saved_last_until_the_process_ends(tmp_path: Path) -> None:
     gate = TokenGate([ANN], "c", kept=SessionFile(tmp_path / "gone" / "sessions"))
     cookie = gate.begin(ANN.person, ANN.secret.decode())
     assert gate.person(scope(cookie=f"c={cookie}")) == ANN.person
@@ -218,8 +218,8 @@ def test_the_table_of_sockets() -> None:
     assert uid_in(HEAD + "cut off\n", ("127.0.0.1", 1), ("127.0.0.1", 2)) is None
 
 
-def test_a_socket_that_its_program_has_closed_is_nobodys() -> None:
-    """It stands there as the superuser's: a stranger who sends and hangs up must not pass for that."""
+def test_a_closed_socket_has_no_owner() -> None:
+    """The table lists it as the superuser's: a stranger who sends and hangs up must not pass for that."""
     table = HEAD + entry("0100007F:D431", "0100007F:1F90", 0, inode=0, state="04")
     assert uid_in(table, ("127.0.0.1", 0xD431), ("127.0.0.1", 0x1F90)) is None
 
@@ -233,7 +233,7 @@ def test_addresses_of_the_other_family() -> None:
 
 
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
-def test_the_kernel_knows_who_calls(family: socket.AddressFamily) -> None:
+def test_the_kernel_identifies_the_caller(family: socket.AddressFamily) -> None:
     host = "127.0.0.1" if family == socket.AF_INET else "::1"
     with socket.create_server((host, 0), family=family) as server:
         here = server.getsockname()[:2]
@@ -243,7 +243,7 @@ def test_the_kernel_knows_who_calls(family: socket.AddressFamily) -> None:
         assert peer_uid(there, here) is None
 
 
-def test_only_this_user_and_the_superuser_are_let_in() -> None:
+def test_only_this_user_and_the_superuser_are_admitted() -> None:
     asked: list[Any] = []
 
     def uid_of(client: tuple[str, int], server: tuple[str, int]) -> int | None:

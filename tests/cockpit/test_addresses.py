@@ -1,4 +1,4 @@
-"""The page's port, the addresses that others reach it by, and the code that lets a phone in once."""
+"""The page's port, its addresses for others, and the code that admits a phone once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HERE = "127.0.0.1"
 
 @pytest.fixture
 def ports(monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
-    """The default port and the next of this test: two free ones in a row."""
+    """The default port and the next one in this test: two consecutive free ports."""
     while True:
         with ExitStack() as stack:
             first = stack.enter_context(bind(HERE, 0)).getsockname()[1]
@@ -44,7 +44,7 @@ def test_the_port_is_the_same_each_time(ports: tuple[int, int], capsys: pytest.C
     assert capsys.readouterr().err == ""
 
 
-def test_where_it_is_taken_who_has_it_is_told(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_taken_port_names_its_process(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
         assert listening.getsockname()[1] == ports[1]
     said = capsys.readouterr().err
@@ -52,19 +52,21 @@ def test_where_it_is_taken_who_has_it_is_told(ports: tuple[int, int], capsys: py
     assert f"at port {ports[1]}" in said
 
 
-def test_where_all_are_taken_any_free_one_does(ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_free_port_is_used_if_all_defaults_are_taken(
+    ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(addresses, "NEXT_PORTS", 0)
     with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
         assert listening.getsockname()[1] not in ports
 
 
-def test_nobody_listens_there() -> None:
+def test_a_free_port_has_no_listener() -> None:
     with bind(HERE, 0) as listening:
         port = listening.getsockname()[1]
     assert listener_of(port) == ""
 
 
-def test_what_is_printed_is_an_address_that_is_answered() -> None:
+def test_the_printed_address_answers() -> None:
     assert reachable("192.0.2.7") == ["192.0.2.7"]
     for everywhere in ("0.0.0.0", "::"):
         names = own_names(everywhere, 8420, addresses.host_names())
@@ -75,7 +77,7 @@ def test_what_is_printed_is_an_address_that_is_answered() -> None:
         assert not names.own("elsewhere.local:8420")
 
 
-def test_where_no_route_leads_further_the_addresses_of_the_interfaces_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interface_addresses_are_printed_without_a_default_route(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket.socket, "connect", no_route)
     monkeypatch.setattr(addresses, "own_addresses", lambda: ["192.0.2.9", "198.51.100.9"])
     assert reachable("0.0.0.0") == ["192.0.2.9", "198.51.100.9"]
@@ -93,15 +95,15 @@ def test_the_addresses_of_the_interfaces_can_be_bound() -> None:
             assert listening.getsockname()[0] == address != HERE
 
 
-def test_where_there_is_no_network_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_network_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     Announcer(None, loopback=False)("http://127.0.0.1:8123/")
-    assert "this machine is in no network" in capsys.readouterr().err
+    assert "this machine has no network" in capsys.readouterr().err
     Announcer(None, loopback=True)("http://127.0.0.1:8123/")
     Announcer(None, loopback=False)("http://[2001:db8::1]:8123/")
     assert capsys.readouterr().err == ""
 
 
-def test_a_code_works_once_and_not_for_ever() -> None:
+def test_a_code_works_once_and_expires() -> None:
     now_ns = 0
     used: list[str] = []
     pairing = Pairing(Role.OBSERVER, lambda: now_ns)
@@ -130,7 +132,7 @@ def test_an_expired_code_is_replaced(capsys: pytest.CaptureFixture[str]) -> None
     for _ in range(2):
         pairing.expire()
     told, shown = capsys.readouterr().out.splitlines()
-    assert told == "the address to pair with is too old now"
+    assert told == "the pairing address has expired"
     second = shown.rpartition("#pair=")[2]
     assert pairing.person(first, HERE) is None
     assert pairing.person(second, HERE) is not None
@@ -153,7 +155,7 @@ def test_a_browser_is_paired(capsys: pytest.CaptureFixture[str]) -> None:
         assert code not in said[1], "the next one is shown"
         client.cookies.clear()
         refused = client.post("/api/login", json={"token": code}, headers=ORIGIN)
-        assert (refused.status_code, "was used" in refused.json()["error"]) == (401, True)
+        assert (refused.status_code, "already used" in refused.json()["error"]) == (401, True)
 
 
 def test_pairing_and_certificates_exclude_each_other() -> None:

@@ -1,4 +1,4 @@
-"""How many connections the cockpit takes, whose give way, and how long one may say nothing."""
+"""How many connections the cockpit accepts, which ones give way, and how long one may be silent."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SMALL = Places(anonymous=6, anonymous_of_address=3, known=8, known_of_address=4)
 
 
 class Hall:
-    """An admission, with the connections that it has ended."""
+    """An admission, with the connections it has ended."""
 
     def __init__(self, places: Places = SMALL) -> None:
         self.admission = Admission(places)
@@ -69,7 +69,7 @@ def test_the_oldest_stranger_of_an_address_gives_way_to_a_newer_one() -> None:
 
 
 def test_a_guesser_at_the_same_address_does_not_end_the_handshakes_of_people() -> None:
-    """A hundred wrong tokens a second, whose answers wait, ended each connection of the address within 0.3 s."""
+    """A hundred wrong tokens a second with delayed answers ended every connection of the address within 0.3 s."""
     hall = Hall()
     person = hall.open()
     for _ in range(100):
@@ -109,26 +109,26 @@ def test_observers_leave_places_for_pilots() -> None:
     for number in range(SMALL.observers):
         hall.open(f"address {number}", OBSERVER)
     late = hall.open("late")
-    assert "observers" in hall.admission.requested(late, OBSERVER, 0)
+    assert "observer connections" in hall.admission.requested(late, OBSERVER, 0)
     assert hall.admission.counts.refused == 1
     assert hall.after(HEADER_S) == [late]
     for number in range(SMALL.known - SMALL.observers):
         hall.open(f"pilot {number}", PILOT)
-    assert "all that this cockpit takes" in hall.admission.requested(hall.open("z"), PILOT, 0)
+    assert "the most that this cockpit accepts" in hall.admission.requested(hall.open("z"), PILOT, 0)
 
 
 def test_one_address_has_so_many_places_and_gets_them_back() -> None:
     hall = Hall()
     open_ = [hall.open("a", OBSERVER) for _ in range(SMALL.known_of_address)]
     more = hall.open("a")
-    assert "4 connections of observers are open from a" in hall.admission.requested(more, OBSERVER, 0)
+    assert "4 observer connections are open from a" in hall.admission.requested(more, OBSERVER, 0)
     assert hall.admission.requested(more, PILOT, 0) == "", "a pilot's are counted by themselves"
     hall.admission.closed(open_[0])
     hall.open("a", OBSERVER)
     assert hall.admission.requested(open_[1], OBSERVER, 0) == "", "who has a place keeps it"
 
 
-def test_who_says_nothing_in_time_is_ended() -> None:
+def test_silent_connections_are_closed() -> None:
     hall = Hall()
     silent, asked, person = hall.open(), hall.open(), hall.open("b", OBSERVER)
     hall.admission.requested(asked, None, 0)
@@ -141,7 +141,7 @@ def test_who_says_nothing_in_time_is_ended() -> None:
     assert hall.admission.counts.timed_out == 3
 
 
-def test_with_nobody_there_nobody_is_shed() -> None:
+def test_shedding_without_connections_does_nothing() -> None:
     Admission().shed()
 
 
@@ -182,8 +182,10 @@ class Speaker(asyncio.Protocol):
         transport.write(b"hello")
 
 
-def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    """No descriptor is left: it is tried again after a while, a stranger's is given up, and little is said."""
+def test_accepting_pauses_while_the_system_is_out_of_descriptors(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without a free descriptor the cockpit retries after a while, drops a stranger's connection and logs little."""
     monkeypatch.setattr(logging.getLogger(listening.__name__), "filters", [])  # a cockpit that ran here limits repeats
     admission = Admission()
     ended = []
@@ -218,11 +220,11 @@ def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, ca
     asyncio.run(main())
     assert ended == ["idle"]
     assert [record.message for record in caplog.records if record.name == listening.__name__] == [
-        "no connection can be taken: none left"
+        "can't accept connections: none left"
     ] * 2
 
 
-def test_a_handshake_that_is_not_finished_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unfinished_handshake_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listening, "SWEEP_S", 0.001)
     clock, admission = ManualClock(), Admission()
 
@@ -248,7 +250,7 @@ def test_a_handshake_that_is_not_finished_is_ended(monkeypatch: pytest.MonkeyPat
     assert admission.counts.timed_out == 1
 
 
-def test_a_socket_that_was_closed_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_closed_listening_socket_ends_the_listener(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         async def accept(_: socket.socket) -> Any:
             raise OSError(errno.EBADF, "closed")
@@ -268,7 +270,7 @@ def test_this_process_has_places(monkeypatch: pytest.MonkeyPatch) -> None:
     assert places_here() == Places()
 
 
-def test_a_message_that_a_stranger_can_cause_is_told_once_in_a_while() -> None:
+def test_messages_caused_by_strangers_are_rate_limited() -> None:
     clock = ManualClock()
     limit = RepeatLimit(10.0, clock)
 
@@ -299,7 +301,7 @@ def test_messages_are_limited_however_many_different_ones_there_were() -> None:
 
 
 @pytest.mark.parametrize(("kind", "told"), [("http", 503), ("websocket", 1013)])
-def test_who_has_too_many_connections_is_told(kind: str, told: int) -> None:
+def test_too_many_connections_are_refused_with_the_reason(kind: str, told: int) -> None:
     sent: list[Any] = []
 
     async def send(message: Any) -> None:

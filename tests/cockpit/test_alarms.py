@@ -1,4 +1,4 @@
-"""Which alarms a drone has, as tables."""
+"""The alarms of a drone, as tables."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
             (link(), flying(state=FlightState.EMERGENCY), 0.1, {}),
             [("emergency", "critical", "emergency: the motors are off")],
         ),
-        ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), [("failsafe", "warning", "failsafe: hovering by itself")]),
-        ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), [("failsafe", "critical", "failsafe: landing by itself")]),
+        ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), [("failsafe", "warning", "failsafe: hovering")]),
+        ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), [("failsafe", "critical", "failsafe: landing")]),
         ((link(), flying(battery=0.19), 0.1, {}), [("battery", "warning", "battery low: 19%")]),
         ((link(), flying(battery=0.14), 0.1, {}), [("battery", "critical", "battery critical: 14%")]),
         ((link(), flying(), 2.5, {}), [("feedback_age", "critical", "feedback is 2.5 s old")]),
@@ -123,7 +123,7 @@ def test_the_usual_thresholds_are_the_proxys_defaults() -> None:
 
 
 @pytest.mark.parametrize("value", [True, "much", (1.0,), math.nan, math.inf])
-def test_what_is_no_number_of_a_driver_is_no_threshold(value: Value) -> None:
+def test_thresholds_that_are_not_numbers_are_ignored(value: Value) -> None:
     assert thresholds_of(Config(dict.fromkeys(PARAMETERS.values(), value))) == USUAL
 
 

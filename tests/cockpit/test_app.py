@@ -1,4 +1,4 @@
-"""The page and its two streams, with a drone that is not there."""
+"""The page and its two streams, with a stand-in for a drone."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_drones_are_listed(client: TestClient) -> None:
 
 
 def follow(socket: WebSocketTestSession, enough: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
-    """The first state that is enough."""
+    """Return the first state that satisfies a condition."""
     deadline = time.monotonic() + 5
     while time.monotonic() < deadline:
         message: dict[str, Any] = socket.receive_json()
@@ -128,7 +128,7 @@ def test_telemetry_flows(client: TestClient, drone: FakeDrone) -> None:
         assert state["alarms"] == [{"id": "vehicle_link", "severity": "critical", "text": "link to the vehicle lost"}]
 
 
-def test_commands_and_logs_are_heard_while_somebody_looks(client: TestClient, drone: FakeDrone) -> None:
+def test_commands_and_logs_are_subscribed_while_a_page_is_open(client: TestClient, drone: FakeDrone) -> None:
     assert not drone.command_listeners
     assert not drone.log_listeners
     drone.newest = flying(native={"pwm": 3, "name": "x", "gyro": (1.0, 2.0)})
@@ -153,7 +153,7 @@ def test_commands_and_logs_are_heard_while_somebody_looks(client: TestClient, dr
     until(lambda: not drone.command_listeners and not drone.log_listeners)
 
 
-def test_another_vehicle_under_the_same_name_is_told(client: TestClient, drone: FakeDrone) -> None:
+def test_another_vehicle_under_the_same_name_is_reported(client: TestClient, drone: FakeDrone) -> None:
     with telemetry(client) as socket:
         assert socket.receive_json()["cameras"][0]["width"] == 64
         socket.receive_json()
@@ -204,7 +204,7 @@ def test_stale_video_is_an_alarm(client: TestClient, drone: FakeDrone) -> None:
         assert "video of front is 3." in state["alarms"][0]["text"]
 
 
-def test_thresholds_of_alarms_are_read_anew_when_a_parameter_is_written(client: TestClient, drone: FakeDrone) -> None:
+def test_alarm_thresholds_are_reread_after_a_parameter_write(client: TestClient, drone: FakeDrone) -> None:
     drone.newest = flying(battery=0.3)
     with telemetry(client) as socket:
         assert follow(socket, lambda _: True)["alarms"] == []
@@ -218,7 +218,7 @@ def wait_for_acknowledgements(client: TestClient, count: int) -> None:
     until(lambda: statistics(client)["frames_acknowledged"] == count, f"{count} were acknowledged")
 
 
-def test_one_picture_is_made_for_all_pages(client: TestClient, drone: FakeDrone) -> None:
+def test_a_picture_is_encoded_once_for_all_pages(client: TestClient, drone: FakeDrone) -> None:
     with ExitStack() as stack:
         pages = [stack.enter_context(video(client)) for _ in range(10)]
         until(lambda: drone.processors["front"])
@@ -266,7 +266,7 @@ def test_video_one_frame_until_acknowledged_then_the_newest(client: TestClient, 
         assert statistics(client)["frames_sent"] == 2, "the same frame is not sent twice"
 
 
-def test_old_acknowledgement_counts_for_nothing(client: TestClient, drone: FakeDrone) -> None:
+def test_an_old_acknowledgement_is_ignored(client: TestClient, drone: FakeDrone) -> None:
     with video(client) as socket:
         until(lambda: drone.processors["front"])
         drone.show(10)
@@ -328,7 +328,7 @@ def test_drawings_follow_the_frame_that_they_belong_to(client: TestClient, drone
         drone.draw(Annotation("follow", "front", later.captured_ns, 64, 48, shapes[:1]))
         drone.draw(Annotation("follow", "bottom", later.captured_ns, 64, 48, ()))
         socket.send_json({"ack": head["ack"]})
-        # Never ahead of its frame, and nothing of another camera.
+        # Never ahead of its frame, and none of another camera.
         head, _ = frame(socket.receive_bytes())
         assert head["captured_ns"] == str(later.captured_ns)
         assert len(socket.receive_json()["shapes"]) == 1
@@ -351,7 +351,7 @@ def test_binary_from_a_page_ends_the_connection(client: TestClient) -> None:
         assert ended.value.code == 1008
 
 
-def test_words_to_the_telemetry_stream_end_the_connection(client: TestClient) -> None:
+def test_messages_to_the_telemetry_stream_end_the_connection(client: TestClient) -> None:
     with telemetry(client) as socket:
         socket.send_text("takeoff")
         message: dict[str, Any] = {}
@@ -361,7 +361,7 @@ def test_words_to_the_telemetry_stream_end_the_connection(client: TestClient) ->
 
 
 @pytest.mark.parametrize("path", ["beta/telemetry", "beta/video/front", "alpha/video/rear", "beta/control"])
-def test_unknown_names_are_told(client: TestClient, path: str) -> None:
+def test_unknown_names_are_refused(client: TestClient, path: str) -> None:
     with (
         open_socket(client, f"drones/{path}") as socket,
         pytest.raises(WebSocketDisconnect) as ended,
@@ -377,8 +377,8 @@ def test_pages_are_counted(client: TestClient, drone: FakeDrone) -> None:
     until(lambda: statistics(client)["pages"] == 0)
 
 
-def test_everything_is_given_back(drone: FakeDrone) -> None:
-    def threads() -> int:  # but the one that encodes JPEGs, which is the process's
+def test_everything_is_released(drone: FakeDrone) -> None:
+    def threads() -> int:  # except the one that encodes JPEGs, which belongs to the process
         return sum(not thread.name.startswith("jpeg") for thread in threading.enumerate())
 
     before = threads()

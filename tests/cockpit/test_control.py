@@ -1,4 +1,4 @@
-"""Flying from a page: a real proxy over the memory transport, a vehicle that does what it is told."""
+"""Flying from a page: a real proxy over the memory transport, and an obedient vehicle."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_without_control_nothing_is_flown(client: TestClient, node: Node) -> Non
         "[" * 4000,
     ],
 )
-def test_what_makes_no_sense_is_no_order(text: str) -> None:
+def test_nonsense_is_not_a_command(text: str) -> None:
     with pytest.raises(DecodeError, match="not understood"):
         decode_command(text)
 
@@ -119,7 +119,7 @@ def test_nonsense_is_refused_and_flies_nothing(client: TestClient, node: Node) -
         assert not node.flyer.applied
 
 
-def test_a_refusal_of_the_proxy_is_told_with_its_reason(client: TestClient, node: Node) -> None:
+def test_a_refusal_by_the_proxy_reaches_the_page_with_its_reason(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().say("fly", forward=0.5)
         assert "landed" in pilot.wait("refused", do="fly")["why"]
@@ -143,7 +143,7 @@ def test_a_silent_page_leaves_a_hovering_drone(client: TestClient, node: Node) -
         until(lambda: count(node, Velocity(forward=0.3)), "a page that speaks again flies again")
 
 
-def test_who_was_pre_empted_is_not_told_of_a_silence(client: TestClient, node: Node) -> None:
+def test_a_pre_empted_page_gets_no_message_about_silence(client: TestClient, node: Node) -> None:
     with page(client) as first, page(client) as second:
         first.take(10).take_off()
         first.say("fly", forward=0.3)
@@ -165,14 +165,14 @@ def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(client: TestClient, 
             hovers = count(node, Hover())
         until(lambda: count(node, Hover()) > hovers)
         watcher.wait(lambda feedback: feedback.owner is None, 5)
-        watcher.wait("hovering", 5)  # the first sample without an owner may be from before the vehicle heard of it
-        # The proxy's ladder goes on from here: nobody is heard, so it lands.
+        watcher.wait("hovering", 5)  # the first sample without an owner may predate the vehicle's hover
+        # The proxy's ladder then continues: no pilot is connected, so it lands.
         with node.connect("me") as owner:
             owner.config["failsafe.land_after_s"] = 0.1
         watcher.wait("landed", 5)
 
 
-def test_emergency_stop_asks_nobody(client: TestClient, node: Node) -> None:
+def test_emergency_stop_needs_no_authority(client: TestClient, node: Node) -> None:
     with node.connect("demo", priority=0, on_exit="hover") as demo:
         demo.takeoff()
         with page(client) as pilot:
@@ -183,7 +183,7 @@ def test_emergency_stop_asks_nobody(client: TestClient, node: Node) -> None:
     assert count(node, EmergencyStop())
 
 
-def test_emergency_stop_of_who_flies(client: TestClient, node: Node) -> None:
+def test_emergency_stop_by_the_pilot(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("fly", forward=0.4)
@@ -213,10 +213,8 @@ def test_flying_to_a_place(client: TestClient, node: Node) -> None:
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
-def test_what_becomes_of_a_flight_to_a_place_is_told_by_the_number_of_its_command(
-    client: TestClient, node: Node
-) -> None:
-    """The page took what came of an earlier one for the newest's: it hovered, or did not when it was let go."""
+def test_the_outcome_of_a_flight_to_a_place_carries_its_command_number(client: TestClient, node: Node) -> None:
+    """The page mistook the result of an earlier one for the newest's: it hovered, or did not when released."""
     with page(client) as pilot:
         pilot.take().take_off()
         with pilot.staying():
@@ -276,7 +274,7 @@ def test_sticks_end_the_way_to_a_place(client: TestClient, node: Node) -> None:
         assert node.flyer.applied[-1] == Hover()
 
 
-def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClient, node: Node) -> None:
+def test_a_place_refused_by_the_proxy_is_reported_with_its_reason(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("set", name="safety.box.x_high", value=2.0)
@@ -290,10 +288,10 @@ def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClie
 
 
 @pytest.mark.parametrize(("said", "method"), [("reset", "reset_emergency"), ("fly", "velocity")])
-def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
+def test_a_refused_replacement_of_a_flight_leaves_it_hovering(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, said: str, method: str
 ) -> None:
-    """Its place stayed in force, and nobody watched the flight there any more."""
+    """The place stayed in force, but the page no longer watched the flight there."""
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("goto", x=50, y=0, z=1)
@@ -309,8 +307,8 @@ def test_what_takes_the_place_of_a_flight_and_is_refused_leaves_it_hovering(
             until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
-def test_a_way_stays_watched_after_a_command_that_took_nobodys_place(client: TestClient, node: Node) -> None:
-    """What the proxy refused of the way there was taken for older than the newest command, which had flown nothing."""
+def test_a_flight_stays_watched_after_a_command_that_replaced_nothing(client: TestClient, node: Node) -> None:
+    """The proxy's refusal was taken for older than the newest command, which had flown nothing."""
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("goto", x=50, y=0, z=1)
@@ -323,7 +321,7 @@ def test_a_way_stays_watched_after_a_command_that_took_nobodys_place(client: Tes
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
-def test_a_way_that_something_else_ended_is_told(client: TestClient, node: Node) -> None:
+def test_a_flight_ended_by_something_else_is_reported(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("goto", x=50, y=0, z=1)
@@ -379,7 +377,7 @@ def test_a_lower_priority_is_refused_and_takes_nothing(client: TestClient, node:
         assert demo.wait(lambda feedback: feedback.owner != "demo", 5).owner_priority == 3
 
 
-def test_who_is_pre_empted_is_told_and_gets_it_back(client: TestClient, node: Node) -> None:
+def test_a_pre_empted_page_is_notified_and_gets_control_back(client: TestClient, node: Node) -> None:
     with page(client) as first, page(client) as second:
         first.take(10).take_off()
         first.say("fly", forward=0.3)
@@ -398,7 +396,7 @@ def test_who_is_pre_empted_is_told_and_gets_it_back(client: TestClient, node: No
 
 
 class Turning(Controller):
-    """Turns all the time, and remembers what it was told."""
+    """Turns all the time, and remembers its notifications."""
 
     def __init__(self, drone: Drone) -> None:
         super().__init__(drone)
@@ -423,7 +421,7 @@ class Following(FollowMarker):
 
 
 @pytest.mark.parametrize("kind", [Turning, Following])
-def test_a_controller_is_told_when_a_person_takes_over_and_goes_on_afterwards(
+def test_a_controller_is_notified_of_a_takeover_and_continues_afterwards(
     client: TestClient, node: Node, kind: type[Turning | Following]
 ) -> None:
     with node.connect("demo") as drone, page(client) as pilot:
@@ -479,15 +477,13 @@ def test_a_controller_that_ends_while_a_person_flies_leaves_the_drone_to_the_per
 # Lost and found -------------------------------------------------------------------------------------------------
 
 
-def test_after_a_proxys_death_nobody_has_control_until_the_person_takes_it_again(
-    client: TestClient, node: Node
-) -> None:
+def test_after_a_proxys_death_the_person_must_take_control_again(client: TestClient, node: Node) -> None:
     with page(client) as pilot, open_socket(client, "drones/alpha/telemetry") as telemetry, pilot.staying():
         pilot.take()
         node.stop()
         told = pilot.wait("authority", mine=False, state="none", holder=None)
         assert "nobody has control" in told["why"]
-        assert "not known" in told["why"]
+        assert "unknown" in told["why"]
         message: dict[str, Any] = {"type": ""}
         while message["type"] != "state" or message["links"]["application"] != "lost":
             message = telemetry.receive_json()
@@ -501,7 +497,7 @@ def test_after_a_proxys_death_nobody_has_control_until_the_person_takes_it_again
         while message["type"] != "state" or message["links"]["application"] != "up":
             message = telemetry.receive_json()
         told = pilot.wait("authority", mine=False)
-        assert "flew meanwhile is not known" in told["why"]
+        assert "did meanwhile is unknown" in told["why"]
         with node.connect("witness", access="observe") as witness:
             for _ in range(20):
                 assert witness.next_feedback().owner is None, "control does not come back by itself"
@@ -520,13 +516,13 @@ def test_a_stop_over_a_lost_link_says_so(client: TestClient, node: Node) -> None
         assert "not sent" in pilot.wait("refused", do="stop")["why"]
 
 
-def test_what_was_refused_is_told_once_and_does_not_happen_later(client: TestClient, node: Node) -> None:
+def test_a_refusal_is_reported_once_and_nothing_happens_later(client: TestClient, node: Node) -> None:
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().say("stop")
         watcher.wait("emergency", 5)
         pilot.wait("done", do="stop")
         stops = -1
-        while stops != (stops := count(node, EmergencyStop())):  # a repeat that is still on its way would stop it again
+        while stops != (stops := count(node, EmergencyStop())):  # a repeat still under way would stop it again
             for _ in range(10):
                 watcher.next_feedback()
         pilot.say("takeoff")
@@ -553,7 +549,7 @@ def test_an_observer_gets_no_controls(node: Node) -> None:
     assert not node.flyer.applied
 
 
-def test_connections_of_pilots_are_given_back(client: TestClient, node: Node) -> None:
+def test_pilot_connections_are_released(client: TestClient, node: Node) -> None:
     with node.connect("watcher", access="observe") as watcher:
         before = links()
         with page(client) as pilot:

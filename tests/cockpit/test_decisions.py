@@ -1,4 +1,4 @@
-"""What a page commanded last counts; and the cockpit takes a drone from nobody by itself."""
+"""A page's last command counts, and the cockpit never takes a drone from others automatically."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def client(node: Node) -> Iterator[TestClient]:
 
 @contextmanager
 def slow_parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
-    """The list of parameters takes as long as a network wants; called: until it was asked for."""
+    """Delay the list of parameters like a slow network; the result waits until it is requested."""
     asked, go_on = threading.Event(), threading.Event()
 
     def slow(real: Callable[[Config], object]) -> Callable[[Config], object]:
@@ -123,7 +123,7 @@ def test_a_page_that_was_away_meanwhile_flies_no_route(
             until_asked()
             pilot.say("hover", automatic=True)
             pilot.wait("sent", do="hover")
-        assert "the page was away" in pilot.wait("refused", do="route")["why"]
+        assert "the page was silent" in pilot.wait("refused", do="route")["why"]
 
 
 # What nobody decides ----------------------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ FLIGHTS = pytest.mark.parametrize("begin", [go_to, fly_a_route, follow, steer])
 def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None], *, leaves: bool
 ) -> None:
-    """The page's go-to, route, and the page that was closed took it back 0.6 s later by a hover of their own."""
+    """The page's go-to or route, or the closed page, took it back 0.6 s later with its own hover."""
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().take_off()
         with pilot.staying():
@@ -164,7 +164,7 @@ def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
             node.flyer.others = "RTL"
             watcher.wait(lambda feedback: feedback.others is not None, 5)
             if begin is steer:
-                pilot.say("hover", automatic=True)  # the page's sticks are let go
+                pilot.say("hover", automatic=True)  # the page's sticks are released
                 pilot.wait("sent", do="hover")
             if not leaves:
                 begun_s = time.monotonic()
@@ -178,7 +178,7 @@ def test_a_safety_pilot_who_chooses_another_mode_keeps_the_drone(
 
 
 @pytest.mark.parametrize("begin", [go_to, follow])
-def test_a_page_that_pings_and_hears_nothing_flies_nothing(
+def test_a_page_that_pings_without_receiving_flies_nothing(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
 ) -> None:
     """It followed its target without end: each report of the tracker was a new command of a silent pilot."""
@@ -199,7 +199,7 @@ def test_a_page_that_pings_and_hears_nothing_flies_nothing(
         assert not any(isinstance(action, Velocity) for action in node.flyer.applied[at:][1:])
 
 
-def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
+def test_a_person_takes_control_back(client: TestClient, node: Node) -> None:
     with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.take().take_off()
         pilot.say("fly", forward=0.4)
@@ -211,10 +211,10 @@ def test_a_person_takes_it_back(client: TestClient, node: Node) -> None:
 
 
 @pytest.mark.parametrize("begin", [go_to, fly_a_route, follow])
-def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
+def test_a_low_battery_return_is_ended_only_by_a_person(
     client: TestClient, node: Node, begin: Callable[[TestClient, Page], None]
 ) -> None:
-    """The end of a go-to or a route, and the tab that was closed half-way, made it hover until it fell."""
+    """The end of a go-to or a route, or a closing tab, made it hover until its battery was empty."""
     with node.connect("watcher", access="observe") as watcher:
         with page(client) as pilot:
             pilot.take().say("set", name="battery.return", value=0.5)
@@ -237,7 +237,7 @@ def test_a_return_because_the_battery_is_low_is_ended_by_nobody_but_a_person(
 # Hands -------------------------------------------------------------------------------------------------------------
 
 
-def test_sticks_that_no_hand_has_moved_are_in_nobodys_hand() -> None:
+def test_untouched_sticks_count_as_released() -> None:
     watch = HandWatch()
     held = Fly(forward=0.5, touches=7)
 

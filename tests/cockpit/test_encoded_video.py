@@ -1,4 +1,4 @@
-"""H.264 on pages: passed on as it comes, in a form that like panes share; a page that falls behind gets its own."""
+"""H.264 on pages: relayed unchanged, in a form shared by similar panes; a page that falls behind gets its own."""
 
 from __future__ import annotations
 
@@ -66,14 +66,14 @@ def unpack(message: bytes) -> tuple[dict[str, Any], bytes]:
 # Forms -------------------------------------------------------------------------------------------------------------
 
 
-def test_like_panes_share_a_form() -> None:
+def test_similar_panes_share_a_form() -> None:
     forms = {form_for(CAMERA, width) for width in (321, 400, 470, 480)}
     assert forms == {Form(750, 0.75)}
     assert form_for(CAMERA, 0).scale == form_for(CAMERA, 5000).scale == 1.0
 
 
 @given(st.integers(1, 4000), st.integers(1, 4000), st.integers(0, 4000), st.none() | st.floats(1, 60))
-def test_a_form_is_one_of_few_and_no_smaller_than_its_pane(
+def test_forms_are_few_and_at_least_as_large_as_their_pane(
     width: int, height: int, pane: int, max_fps: float | None
 ) -> None:
     form = form_for(CameraInfo("front", width, height, 0.0), pane, max_fps)
@@ -82,7 +82,7 @@ def test_a_form_is_one_of_few_and_no_smaller_than_its_pane(
     assert form.scale == 1.0 or form.scale * width >= pane
 
 
-def test_what_the_vehicle_encodes_is_passed_on_where_it_fits() -> None:
+def test_the_vehicles_encoding_is_relayed_if_it_fits() -> None:
     sends = CameraInfo("front", 640, 480, 30.0, stream="h264")
     assert [form_for(sends, width).kind for width in (0, 640, 320)] == ["vehicle", "vehicle", "shared"]
     assert form_for(sends, 640, 12.0).kind == "shared"
@@ -98,7 +98,7 @@ def test_a_box_on_a_smaller_picture_is_of_the_frame() -> None:
 # Who keeps up ------------------------------------------------------------------------------------------------------
 
 
-def test_who_is_late_for_a_second_is_behind_until_all_was_quiet_for_a_while() -> None:
+def test_a_page_late_for_a_second_is_behind_until_it_has_been_on_time_for_a_while() -> None:
     path, now_ns, number = PagePath(), 0, 0
 
     def frames(seconds: float, trip_s: float) -> bool:
@@ -123,7 +123,7 @@ def test_who_is_late_for_a_second_is_behind_until_all_was_quiet_for_a_while() ->
     assert not frames(2.0, 0.03)
 
 
-def test_a_page_that_takes_nothing_is_behind_and_so_is_one_that_is_far_from_the_drone() -> None:
+def test_a_stalled_or_distant_page_is_behind() -> None:
     silent, far = PagePath(), PagePath()
     silent.sent(1, 10, 0)
     for at_s in (0.0, 0.2, 0.3, 1.0, 1.2, 1.4):
@@ -132,7 +132,7 @@ def test_a_page_that_takes_nothing_is_behind_and_so_is_one_that_is_far_from_the_
     assert (silent.late_here, far.late_here) == (False, True), "who is to blame"
 
 
-def test_only_so_much_is_under_way() -> None:
+def test_data_under_way_is_bounded() -> None:
     path = PagePath()
     for number in range(MOST_UNDER_WAY):
         assert path.free
@@ -172,7 +172,7 @@ def test_pictures_follow_one_another_or_begin_with_a_key() -> None:
         stream.encode()
         assert after(first)[0] == [108, 109]
         assert after(0)[0] == [108, 109]
-        stream.seq = 5  # the proxy began anew
+        stream.seq = 5  # the proxy restarted
         stream.encode(key=True)
         assert after(feed.after(0, follows=True)[0][-1].serial - 1)[0] == [6]
         for _ in range(2 * KEPT):
@@ -188,7 +188,7 @@ def test_pictures_follow_one_another_or_begin_with_a_key() -> None:
 
 
 class OnPage:
-    """One camera on one page, with a clock of its own."""
+    """One camera on one page, with its own clock."""
 
     def __init__(self, drone: FakeDrone) -> None:
         self.clock = Clock()
@@ -209,7 +209,7 @@ class OnPage:
 def test_a_page_that_falls_behind_gets_its_own_stream_that_it_acknowledges(drone: FakeDrone) -> None:
     async def watch() -> None:
         page = OnPage(drone)
-        page.clock.now_ns = 0  # pictures bear the machine's time, which is later
+        page.clock.now_ns = 0  # pictures carry the machine's time, which is later
         page.take()
         shared = drone.streams[0]
         shared.encode(key=True)
@@ -243,7 +243,7 @@ def test_a_page_that_falls_behind_gets_its_own_stream_that_it_acknowledges(drone
     asyncio.run(watch())
 
 
-def test_what_gives_nothing_is_left_and_tried_again(drone: FakeDrone) -> None:
+def test_a_silent_form_is_abandoned_and_retried(drone: FakeDrone) -> None:
     async def watch() -> None:
         page = OnPage(drone)
         page.clock.now_ns = 0
@@ -279,7 +279,7 @@ def test_what_gives_nothing_is_left_and_tried_again(drone: FakeDrone) -> None:
     asyncio.run(watch())
 
 
-def test_a_key_is_asked_for_after_a_gap(drone: FakeDrone) -> None:
+def test_a_key_picture_is_requested_after_a_gap(drone: FakeDrone) -> None:
     async def watch() -> None:
         page = OnPage(drone)
         page.clock.now_ns = 0
@@ -376,7 +376,7 @@ def test_small_video_as_h264_in_one_message(client: TestClient, drone: FakeDrone
         until(lambda: not stream.consumers, "nobody sees it")
 
 
-def test_a_page_that_reads_nothing_leaves_the_others_alone(client: TestClient, drone: FakeDrone) -> None:
+def test_a_stalled_page_does_not_affect_the_others(client: TestClient, drone: FakeDrone) -> None:
     with video(client) as stalled, video(client) as quick:
         for socket in (stalled, quick):
             socket.send_json({"h264": True, "width": 0})

@@ -1,4 +1,4 @@
-"""The page in Firefox: what a person does first, by keys, and that fingers arrive. The rest is tested in Chromium."""
+"""The page in Firefox: a person's first steps, by keys, and the arrival of fingers. Chromium tests the rest."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_person_logs_in_and_flies_by_keys(open_cockpit: tuple[Browser, str], d
         page.page.get_by_label("Token").fill("0123456789abcdefP")
         page.page.get_by_role("button", name="Enter").click()
         page.pane.wait_for()
-        page.problems.clear()  # that nobody was logged in yet
+        page.problems.clear()  # that no one was logged in yet
         page.wait_for_new_picture()
         page.take_off()
         with page.holding("w"):

@@ -1,4 +1,4 @@
-"""Drones that come, vanish, come back and are forgotten."""
+"""Drones that appear, vanish, return and are forgotten."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def run(work: Callable[[], Awaitable[None]]) -> None:
 
 
 async def settle(fleet: Fleet) -> None:
-    """Look, and let those who were found be connected to."""
-    await fleet.look()
+    """Search, and wait until the found ones are connected."""
+    await fleet.search()
     while fleet._connecting:
         await asyncio.gather(*fleet._connecting.values())
 
 
-def test_one_connection_a_drone() -> None:
+def test_one_connection_per_drone() -> None:
     hangar = Hangar("alpha", "beta")
 
     async def work() -> None:
@@ -80,7 +80,7 @@ def test_one_connection_a_drone() -> None:
     assert all(drone.closed for drone in hangar.drones.values())
 
 
-def test_one_that_does_not_answer_is_told_and_tried_again() -> None:
+def test_an_unresponsive_proxy_is_reported_and_retried() -> None:
     hangar = Hangar("alpha")
     hangar.fails.add("alpha")
 
@@ -168,7 +168,7 @@ def test_a_lost_drone_on_a_page_is_not_forgotten_and_one_that_is_back_neither() 
     run(work)
 
 
-def test_a_finder_that_fails_is_asked_again() -> None:
+def test_a_failing_finder_is_retried() -> None:
     hangar = Hangar("alpha")
     asked = 0
 
@@ -243,13 +243,13 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
             until(lambda: rows(client)[0]["links"]["application"] == "up", "its connection leads to where it is now")
             assert [(row["name"], row["transport"]) for row in rows(client)] == [("alpha", "network")]
             while (state := page.receive_json())["type"] != "state" or state["links"]["application"] != "up":
-                pass  # the page that shows it goes on
+                pass  # its page stays connected
     finally:
         before.stop()
         after.stop()
 
 
-def test_the_overview_tells_who_holds_control(nodes: Nodes) -> None:
+def test_the_overview_shows_the_holder_of_control(nodes: Nodes) -> None:
     with cockpit(Fleet(nodes, look_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
         control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})
         until(lambda: rows(client)[0]["me"])

@@ -1,4 +1,4 @@
-"""Land all, stop all: from any page of a pilot, whatever is open on it and whoever flies."""
+"""Land all, stop all: from any pilot's page, with any drone open and any pilot flying."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_stop_all_cuts_the_motors_of_drones_that_no_page_shows(nodes: tuple[Node
 
 
 @pytest.mark.parametrize("do", ["stop_all", "land_all"])
-def test_a_drone_to_which_there_is_no_connection_is_told_not_to_be_stopped(nodes: tuple[Node, Node], do: str) -> None:
+def test_unreachable_drones_are_reported_as_not_stopped(nodes: tuple[Node, Node], do: str) -> None:
     """It was left out, and all seemed to be stopped."""
 
     def connect(found: Found) -> Drone:
@@ -83,7 +83,7 @@ def test_land_all_lands_what_others_fly_and_gives_control_back(nodes: tuple[Node
         assert count(beta, Land())
 
 
-def test_each_drone_that_is_not_landed_is_told_with_its_reason(nodes: tuple[Node, Node]) -> None:
+def test_drones_that_do_not_land_are_reported_with_the_reason(nodes: tuple[Node, Node]) -> None:
     alpha, beta = nodes
     with (
         cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client,
@@ -99,7 +99,7 @@ def test_each_drone_that_is_not_landed_is_told_with_its_reason(nodes: tuple[Node
 
 
 def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node, Node]) -> None:
-    """The landing took the authority in the middle of it, and was obeyed by a vehicle that had not heard the stop."""
+    """The landing took the authority during the stop, and a vehicle that had not received the stop obeyed it."""
     fleet = Fleet(Nodes(*nodes), look_s=0.05)
     with cockpit(fleet) as client, everybody(client) as pilot:
         until(lambda: len(fleet.stations) == 2)
@@ -109,7 +109,7 @@ def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node,
         pilot.wait("each", drone="beta", state="done")
 
 
-def test_a_landing_of_all_goes_on_without_the_page(nodes: tuple[Node, Node]) -> None:
+def test_landing_all_continues_without_the_page(nodes: tuple[Node, Node]) -> None:
     with cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client, nodes[0].connect("demo", on_exit="hover") as demo:
         demo.takeoff()
         with everybody(client) as pilot:
@@ -143,7 +143,7 @@ def test_a_recording_is_not_landed_or_stopped(node: Node) -> None:
         played.stop()
 
 
-def test_an_observer_stops_nobody(nodes: tuple[Node, Node]) -> None:
+def test_an_observer_cannot_stop_drones(nodes: tuple[Node, Node]) -> None:
     with (
         cockpit(Fleet(Nodes(*nodes)), this_user(Role.OBSERVER)) as client,
         open_socket(client, "control") as socket,

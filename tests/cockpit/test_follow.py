@@ -1,4 +1,4 @@
-"""Following what a page marked: a real proxy, a vehicle that flies as it is told, and a stand-in that follows."""
+"""Following a target marked on a page: a real proxy, an obedient vehicle, and a stand-in for the follower."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def refused(pilot: Page, do: str) -> str:
 
 
 def draws(watcher: Drone, frames: int) -> None:
-    """A person takes as long as so many frames."""
+    """Wait this many frames, as a person would."""
     for _ in itertools.islice(watcher.frames("front"), frames):
         pass
 
@@ -154,7 +154,7 @@ def test_it_catches_up_frame_by_frame_before_it_steers(client: TestClient, node:
         ({"camera": "rear"}, "no camera named 'rear'; known: front"),
         ({"box": [4, 4, 2, 12]}, "width=2, height=12 and must be at least 6 pixels"),
         ({"box": [40, 4, 10, 12]}, "at least half of it must be in the image of 32×24"),
-        ({"captured_ns": "17"}, "s old when its box came"),
+        ({"captured_ns": "17"}, "s old when its box arrived"),
         ({"captured_ns": "9" * 18}, "newer than any"),
         ({"mode": "chase"}, "no mode of following named 'chase'"),
         ({"mode": "follow"}, "take control first"),
@@ -162,7 +162,7 @@ def test_it_catches_up_frame_by_frame_before_it_steers(client: TestClient, node:
         ({"distance_m": 0.5}, "distance_m is 0.5 and must be above nearest_m, which is 2"),
     ],
 )
-def test_what_can_not_be_followed_is_refused_with_what_is_allowed(
+def test_invalid_targets_are_refused_with_the_allowed_values(
     client: TestClient, stand_ins: StandIns, values: dict[str, Any], words: str
 ) -> None:
     with marker(client) as pilot:
@@ -188,7 +188,7 @@ def test_what_can_not_be_followed_is_refused_with_what_is_allowed(
         '{"do":"follow_select"}',
     ],
 )
-def test_what_makes_no_sense_is_no_command(text: str) -> None:
+def test_nonsense_is_not_a_follow_command(text: str) -> None:
     with pytest.raises(DecodeError, match="not understood"):
         decode_command(text)
 
@@ -196,7 +196,7 @@ def test_what_makes_no_sense_is_no_command(text: str) -> None:
 def test_without_frames_or_a_target_there_is_nothing_to_follow(client: TestClient) -> None:
     with marker(client) as pilot:
         pilot.say("follow", camera="front", captured_ns="5", box=BOX)
-        assert "choose the camera first" in refused(pilot, "follow")
+        assert "select the camera first" in refused(pilot, "follow")
         pilot.say("follow_select", camera="rear")
         assert "no camera named 'rear'" in refused(pilot, "follow_select")
         pilot.take().say("follow_mode", mode="follow")
@@ -207,7 +207,7 @@ def test_without_frames_or_a_target_there_is_nothing_to_follow(client: TestClien
         pilot.say("follow_select", camera=None, n=4)
         pilot.wait("sent", n=4)
         pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX)
-        assert "choose the camera first" in refused(pilot, "follow")
+        assert "select the camera first" in refused(pilot, "follow")
 
 
 def test_without_opencv_the_refusal_names_the_extra(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -231,17 +231,17 @@ def following(client: TestClient, node: Node) -> Iterator[Marker]:
             yield pilot
 
 
-def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
-    """Who gave it while it flew after a target was told that it had lost control, and of refusals of idle by lease."""
+def test_a_consensual_handover_causes_no_refusal(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    """The giver, while following a target, got the news of a lost control, and of idle refused for its lease."""
     with following(client, node) as giver, page(client) as asker:
         with giver.staying():
-            giver.select()  # the next target is being drawn
+            giver.select()  # a box for the next target is being drawn
         asker.say("take", priority=8, ask=True)
         [asked] = giver.wait("asked")["questions"]
         giver.say("answer", id=asked["id"], grant=True)
         told = giver.wait("authority", mine=False)
         assert told["given"]
-        if told["holder"] is None:  # for a moment nobody has it
+        if told["holder"] is None:  # for a moment no one has it
             told = giver.wait("authority", holder=asked["by"])
         assert told["why"] == f"{asked['by']} has control now"
         giver.say("ping", n=6)
@@ -271,7 +271,7 @@ def test_a_hand_over_that_both_want_ends_in_no_refusal(client: TestClient, node:
         ("stop", {}, FlightState.EMERGENCY),
     ],
 )
-def test_anything_else_that_is_commanded_ends_it(
+def test_any_other_command_ends_following(
     client: TestClient, node: Node, do: str, values: dict[str, Any], then: FlightState
 ) -> None:
     with following(client, node) as pilot:
@@ -284,7 +284,7 @@ def test_anything_else_that_is_commanded_ends_it(
         assert count(node, FORWARD) == flown, "nothing more comes from what was followed"
 
 
-def test_who_takes_control_ends_it(client: TestClient, node: Node) -> None:
+def test_a_takeover_ends_following(client: TestClient, node: Node) -> None:
     with following(client, node) as pilot, node.connect("other", priority=0) as other:
         assert pilot.wait("follow", state="ended")["problem"] == NO_CONTROL
         other.hover()
@@ -307,7 +307,7 @@ def test_a_page_that_is_gone_hovers(client: TestClient, node: Node) -> None:
     until(lambda: not any(thread.name == "skyloop-follow" for thread in threading.enumerate()))
 
 
-def test_it_hovers_while_no_frames_come_and_goes_on_when_they_do(
+def test_it_hovers_without_frames_and_resumes_with_them(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with following(client, node) as pilot:
@@ -322,10 +322,10 @@ def test_it_hovers_while_no_frames_come_and_goes_on_when_they_do(
         until(lambda: node.flyer.state is FlightState.FLYING)
 
 
-def test_it_hovers_while_the_vehicles_motion_is_not_known_and_goes_on_when_it_is(
+def test_it_hovers_while_the_motion_is_unknown_and_resumes_afterwards(
     client: TestClient, node: Node, stand_ins: StandIns
 ) -> None:
-    """It was sent level attitudes, or velocities of zero that nothing can measure, in place of a hover."""
+    """Instead of a hover it was sent level attitudes, or zero velocities that it could not measure."""
     with following(client, node) as pilot:
         stand_ins.last.says(unknown="the vehicle's velocity is not known")
         told = pilot.wait("follow", state="waiting")
@@ -345,7 +345,7 @@ def test_a_tracker_that_is_stuck_flies_nothing(client: TestClient, node: Node, s
         pilot.wait("follow", state="flying")
 
 
-def test_what_was_pressed_too_long_ago_sets_off_no_more(
+def test_an_old_request_no_longer_sets_off(
     client: TestClient, node: Node, stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("skyloop.cockpit.follow_session.SET_OFF_S", 0.2)
@@ -399,8 +399,8 @@ def test_detections_of_processors_are_used(client: TestClient, node: Node, stand
 
 
 @pytest.mark.process
-def test_nothing_is_imported_when_a_first_target_is_marked() -> None:
-    """SciPy was, with 400 modules: for a second or more the cockpit answered nobody's sticks."""
+def test_marking_a_first_target_imports_nothing() -> None:
+    """SciPy was, with 400 modules: for a second or more the cockpit processed no sticks."""
     pytest.importorskip("scipy", reason="needs the extra detect: skyloop install detect")
     command = [sys.executable, "-c", FIRST_TARGET]
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
@@ -409,12 +409,12 @@ def test_nothing_is_imported_when_a_first_target_is_marked() -> None:
 
 def test_a_command_that_the_proxy_refuses_ends_it(client: TestClient, node: Node, stand_ins: StandIns) -> None:
     with following(client, node) as pilot:
-        node.flyer.state = FlightState.LANDING  # somebody else's doing
+        node.flyer.state = FlightState.LANDING  # commanded by others
         assert "it is landing" in pilot.wait("follow", state="ended")["problem"]
         assert stand_ins.last.frames
 
 
-def test_numbers_come_five_times_a_second_at_most(client: TestClient, node: Node) -> None:
+def test_numbers_are_sent_at_most_five_times_a_second(client: TestClient, node: Node) -> None:
     with following(client, node) as pilot:
         began_s = time.monotonic()
         for _ in range(5):
@@ -422,8 +422,8 @@ def test_numbers_come_five_times_a_second_at_most(client: TestClient, node: Node
         assert time.monotonic() - began_s > 0.75
 
 
-def test_frames_that_are_kept_are_not_held(client: TestClient, node: Node) -> None:
-    """What is kept is a JPEG: the proxy has its memory back."""
+def test_kept_frames_do_not_hold_the_proxys_memory(client: TestClient, node: Node) -> None:
+    """Frames are kept as JPEGs: the proxy has its memory back."""
     with marker(client) as pilot, node.connect("watcher", access="observe") as watcher:
         pilot.select()
         draws(watcher, frames=30)

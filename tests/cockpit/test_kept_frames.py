@@ -1,4 +1,4 @@
-"""The frames of the last seconds: which are kept, which is found, which is tracked next."""
+"""The frames of the last seconds: which ones are kept, found, and tracked next."""
 
 from __future__ import annotations
 
@@ -38,10 +38,14 @@ def test_the_last_seconds_are_kept_and_no_more_bytes_than_allowed() -> None:
 def test_the_frame_of_the_box_is_found_or_the_refusal_says_why_not() -> None:
     frames = kept(*range(1000, 8000, 100))
     assert frames.find(5000 * MS).header.seq == 5000
-    for at_ms, words in ((1000, "6.9 s old when its box came, and the last 3.0 s"), (5050, "did not"), (9000, "newer")):
+    for at_ms, words in (
+        (1000, "6.9 s old when its box arrived, and only the last 3.0 s"),
+        (5050, "did not"),
+        (9000, "newer"),
+    ):
         with pytest.raises(RefusedError, match=words):
             frames.find(at_ms * MS)
-    with pytest.raises(RefusedError, match="no frame yet"):
+    with pytest.raises(RefusedError, match="no frame has arrived"):
         KeptFrames().find(0)
 
 
@@ -65,7 +69,7 @@ def test_catching_up_takes_each_frame_but_those_closer_than_a_stride() -> None:
     assert [sparse.next_after(at * MS) is None for at in (0, 500, 1000)] == [False, False, True]
 
 
-def test_a_frame_that_is_kept_as_a_jpeg_is_a_frame_again() -> None:
+def test_a_frame_kept_as_jpeg_can_be_restored() -> None:
     pixels = np.full((24, 32, 3), (200, 40, 90), np.uint8)
     header = FrameHeader("front", 3, 70, 80, 32, 24, Encoding.BGR8, pixels.size)
     original = Arrival(header, pixels.reshape(-1), 90, 5, FeedbackHistory()).frame()

@@ -1,4 +1,4 @@
-"""Drones on the network are found beside those of this host, and flown as swarms by pattern."""
+"""Drones on the network are found in addition to those of this host, and flown as swarms by pattern."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def place() -> str:
     return f"127.0.0.1:{free_port('127.0.0.1')}"
 
 
-def test_those_of_this_host_come_first_and_far_ones_beside_them() -> None:
+def test_local_proxies_come_first_followed_by_remote_ones() -> None:
     here = place()
     listening = FabricSettings(listen=(here,), multicast=False)
     both = CompositeServer([LocalServer("alpha"), FabricServer("alpha", listening)])

@@ -1,4 +1,4 @@
-"""Nothing old is executed: what a page asks for comes in time, or never happens."""
+"""Nothing old is executed: a page's command is carried out in time, or never."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ ORDERS: list[tuple[Callable[..., AnyCommand], tuple[object, ...]]] = [
 
 
 @pytest.mark.parametrize(("kind", "values"), [*ORDERS, (LandAll, ())], ids=lambda one: getattr(one, "__name__", ""))
-def test_an_order_is_refused_when_it_may_be_older_than_half_a_second(
+def test_a_command_that_may_be_older_than_half_a_second_is_refused(
     kind: Callable[..., AnyCommand], values: tuple[object, ...]
 ) -> None:
     def why(age_s: float, unsure_s: float = 0.0) -> str:
@@ -102,7 +102,7 @@ def test_a_take_off_from_before_a_stall_does_not_happen(client: TestClient, node
         pilot.take_off()
 
 
-def test_motors_are_not_cut_by_keys_that_were_pressed_long_ago(client: TestClient, node: Node) -> None:
+def test_old_key_presses_do_not_cut_the_motors(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("stop", at_s=time.monotonic() - 12.0)
@@ -115,13 +115,13 @@ def test_motors_are_not_cut_by_keys_that_were_pressed_long_ago(client: TestClien
         until(lambda: node.flyer.state is FlightState.EMERGENCY)
 
 
-def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node: Node) -> None:
+def test_old_stick_commands_are_ignored_and_no_sign_of_life(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("fly", forward=0.3)
         until(lambda: node.flyer.state is FlightState.FLYING)
         begin_s = time.monotonic()
-        for _ in range(40):  # what an 8 s stall held back comes all at once, and goes on coming
+        for _ in range(40):  # messages held back by an 8 s stall arrive all at once, and more follow
             pilot.say("fly", left=0.4, at_s=time.monotonic() - 8.0)
             pilot.say("ping", at_s=time.monotonic() - 8.0, seen_s=time.monotonic() - 8.0)
             time.sleep(0.02)
@@ -131,8 +131,8 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
         pilot.wait("refused", do="fly")
 
 
-def test_what_waited_is_handled_together() -> None:
-    """The sockets of a cockpit that gets too little of its computer."""
+def test_queued_messages_are_handled_together() -> None:
+    """The sockets of a cockpit that gets too little processor time."""
     coming = [{"type": "websocket.receive", "text": text} for text in "abc"]
 
     class Socket:
@@ -144,10 +144,10 @@ def test_what_waited_is_handled_together() -> None:
     assert handled == [("a", "b", "c")]
 
 
-def test_of_sticks_that_waited_only_the_newest_fly(
+def test_only_the_newest_of_queued_stick_commands_flies(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All of them flew, one after the other, each up to 0.5 s old, and so did those from before an emergency stop."""
+    """All of them flew, one after another, each up to 0.5 s old, even those from before an emergency stop."""
     handle = ControlSession._on_messages
 
     def handle_all(session: ControlSession, messages: Sequence[str | bytes]) -> None:
@@ -164,8 +164,8 @@ def test_of_sticks_that_waited_only_the_newest_fly(
         assert not any(count(node, Velocity(left=tenths / 10)) for tenths in range(1, 8))
 
 
-def test_sticks_that_were_let_go_hover_however_late_that_is_heard(client: TestClient, node: Node) -> None:
-    """It was refused as too old, and what is newer kept the velocity of before: a page says it only once."""
+def test_released_sticks_hover_however_late_the_message_arrives(client: TestClient, node: Node) -> None:
+    """It was refused as too old, and newer sticks kept the previous velocity: a page sends it only once."""
     with page(client) as pilot:
         pilot.take().take_off()
         with pilot.staying():
@@ -176,7 +176,7 @@ def test_sticks_that_were_let_go_hover_however_late_that_is_heard(client: TestCl
             pilot.wait("sent", do="hover")
 
 
-def test_each_order_is_answered_under_its_number(client: TestClient, node: Node) -> None:
+def test_each_command_is_answered_with_its_number(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.say("take", priority=4, n=1)
         assert pilot.wait("sent", do="take")["n"] == 1
@@ -191,7 +191,7 @@ def test_each_order_is_answered_under_its_number(client: TestClient, node: Node)
         until(lambda: count(node, Land()))
 
 
-def test_what_waited_behind_something_slow_is_too_old_by_then(
+def test_a_command_queued_behind_a_slow_one_becomes_too_old(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with page(client) as pilot:
@@ -208,9 +208,7 @@ def test_what_waited_behind_something_slow_is_too_old_by_then(
         assert "after it was requested" in pilot.wait("refused", do="set")["why"]
 
 
-def test_an_order_that_was_told_as_not_sent_does_not_happen_when_the_link_is_back(
-    client: TestClient, node: Node
-) -> None:
+def test_a_command_reported_as_not_sent_never_happens_later(client: TestClient, node: Node) -> None:
     with node.connect("watcher", access="observe") as watcher, page(client) as pilot:
         until(lambda: any("cockpit stop connected" in event.text for event in watcher.recent_events()))
         node.stop()
@@ -223,7 +221,7 @@ def test_an_order_that_was_told_as_not_sent_does_not_happen_when_the_link_is_bac
         assert not count(node, EmergencyStop())
 
 
-def test_a_pong_tells_the_cockpits_clock(client: TestClient) -> None:
+def test_a_pong_carries_the_cockpits_clock(client: TestClient) -> None:
     with page(client) as pilot:
         before_s = time.monotonic()
         pilot.socket.send_json({"do": "ping", "n": 3})
@@ -235,7 +233,7 @@ def test_a_ping_is_answered_whatever_its_time() -> None:
     assert untimely(Alive(), NOW_S), "it is no sign of life"
 
 
-def test_a_take_off_that_came_to_nothing_is_not_repeated_for_ever(
+def test_a_failed_take_off_is_not_repeated_forever(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("skyloop.cockpit.control_session._BEGUN_NS", 1_000_000_000)
@@ -251,7 +249,7 @@ def test_a_take_off_that_came_to_nothing_is_not_repeated_for_ever(
             assert count(node, Takeoff()) == asked, "and then no more"
 
 
-def test_a_packet_that_was_late_is_no_refusal_of_what_its_repeats_do(
+def test_a_late_packet_does_not_refuse_its_repeats(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     on_event = ControlSession._on_event

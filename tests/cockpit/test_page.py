@@ -1,4 +1,4 @@
-"""What a person sees and does on the cockpit's page: Chromium, a real cockpit, real proxies of simulated drones."""
+"""A person's view and actions on the cockpit's page: Chromium, a real cockpit, real proxies of simulated drones."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MAX_AGE_MS = 200.0
 
 
 def observe(name: str) -> skyloop.Drone:
-    """What the drone itself says, besides the page."""
+    """Return the drone's own report, besides the page's."""
     return skyloop.connect(name, access="observe", name="test")
 
 
 def rotation(page: DronePage) -> float:
-    """How far the horizon is turned on the page [degrees]."""
+    """Return the horizon's rotation on the page [degrees]."""
     found = re.search(r"rotate\((-?[\d.]+)\)", page.attribute(".horizon .roll", "transform"))
     assert found is not None
     return float(found[1])
@@ -46,7 +46,7 @@ def test_video_moves_and_is_young(deck: Deck) -> None:
         ages.append(float(page.attribute(".camera", "data-age-ms")))
         return int(page.attribute(".camera", "data-seq")) >= first + 20
 
-    # The page's own figure: age when it was sent, and the time since. A busy machine gets more tries.
+    # The page's own figure: age when sent, plus the time since. A busy machine gets more tries.
     for _ in range(5):
         ages.clear()
         first = int(page.attribute(".camera", "data-seq"))
@@ -60,7 +60,7 @@ def test_video_moves_and_is_young(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_video_that_is_scrolled_away_is_not_asked_for(deck: Deck) -> None:
+def test_video_out_of_sight_is_not_requested(deck: Deck) -> None:
     deck.proxy("away")
     page = deck.page("away", viewport={"width": 390, "height": 500})
     page.wait_for_new_picture()
@@ -80,7 +80,7 @@ def test_horizon_follows_the_attitude(deck: Deck) -> None:
             drone.velocity(left=left)
 
             def tilts_as_the_drone(sign: float = left) -> bool:
-                # Right side down is positive roll; seen from within, the horizon then turns to the left.
+                # Right side down is positive roll; seen from inside, the horizon then turns to the left.
                 return rotation(page) * sign > 1.5 * abs(sign)
 
             page.until(tilts_as_the_drone, f"the horizon turns for {left} m/s to the left")
@@ -112,7 +112,7 @@ def test_keyboard_flight(deck: Deck) -> None:
         assert before is not None
         assert after is not None
         assert after[0] > before[0], "it flew forward; how far depends on how soon the page saw its speed"
-        # Nothing flies while somebody writes, and none of it is lost when the page loses the focus.
+        # Nothing flies while a person types, and no text is lost when the page loses the focus.
         page.pane.locator('input[aria-label="Filter events by words"]').click()
         page.page.keyboard.type("www")
         assert drone.feedback().state is FlightState.HOVERING
@@ -152,7 +152,7 @@ def test_a_lower_priority_is_refused_with_its_reason(deck: Deck) -> None:
 
 
 def allow_time(name: str) -> None:
-    """More than the usual 10 s to answer: a busy machine's browser is slow."""
+    """Allow more than the usual 10 s for an answer: a busy machine's browser is slow."""
     with skyloop.connect(name, name="patience") as drone:
         drone.config["authority.ask_s"] = 120.0
 
@@ -168,13 +168,13 @@ def test_a_person_who_is_asked_for_control_keeps_it_and_then_hands_it_over(deck:
         "asks", name="survey.py", authority=skyloop.Authority(priority=4, takeover="ask", stay=True, for_s=120)
     ) as drone:
         page.wait_for_text(".asks", "survey.py asks for control")
-        for words in ("Priority 4, yours 8", "Wanted for 2 min", "it has control when the time is over"):
+        for words in ("Priority 4, yours 8", "Wanted for 2 min", "it gets control when the time is up"):
             assert words in page.says(".asks")
         assert 60 < int(page.says(".asks-left b").split()[0]) <= 120
         assert "survey.py asks for control" in (page.pane.locator("[aria-live=assertive]").text_content() or "")
         assert page.page.evaluate("document.activeElement === document.body"), "the focus is not taken from who flies"
         page.until(lambda: not panel.get_by_role("button", name="Keep it").is_disabled(), "there was time to read it")
-        # By keyboard alone; what is written in the reason flies nothing.
+        # By keyboard alone; typing the reason flies nothing.
         page.press("q", "Tab")
         page.page.keyboard.type("what is this")
         page.press("Enter")
@@ -223,7 +223,7 @@ def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
         assert page.pane.get_by_role("button", name="Ask for control").is_visible()
         page.ask_for_control()
         page.wait_for_text(".waiting", "follow.py keeps it for now: “measuring until noon” · you are number 1 in line")
-        page.wait_for_text(".waiting", "min to wait")  # then the higher priority has it
+        page.wait_for_text(".waiting", "min to wait")  # then the higher priority gets it
         assert drone.authority.state == "held"
         page.pane.get_by_role("button", name="Stop waiting").click()
         page.until(lambda: not page.pane.locator(".waiting").is_visible(), "it waits no more")
@@ -245,7 +245,7 @@ def test_emergency_stops_the_motors(deck: Deck) -> None:
         drone.takeoff()
         page.until(lambda: not page.pane.locator(".taking .primary").is_disabled(), "the line is open")
         page.wait_for_text(".holder", "flies.py")
-        with page.holding("Control", "Enter"):  # without control, and nothing is asked
+        with page.holding("Control", "Enter"):  # without control, and without a question
             page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "the motors are off")
         page.wait_for_text(".pill", "emergency")
         page.wait_for_text(".alarms", "motors are off")
@@ -274,7 +274,7 @@ def test_parameters(deck: Deck) -> None:
         assert "must be at least 0.1" in page.says('[data-parameter="limits.speed"] .answer'), "the drone's own words"
         assert drone.config["limits.speed"] == 1.5
         write("fast")
-        page.wait_for_text('[data-parameter="limits.speed"] .answer', "a number is needed")
+        page.wait_for_text('[data-parameter="limits.speed"] .answer', "enter a number")
 
 
 def test_two_watch_while_one_flies(deck: Deck) -> None:
@@ -356,7 +356,7 @@ def test_gamepad(deck: Deck) -> None:
 
         def flies_forward() -> bool:
             nonlocal pushed_s
-            if time.monotonic() - pushed_s > 3.0:  # after a stall of a busy machine sticks count once they were centred
+            if time.monotonic() - pushed_s > 3.0:  # after a stall of a busy machine, sticks must be centred first
                 page.page.evaluate("window.pad.axes = [0, 0, 0, 0]")
                 page.page.wait_for_timeout(200)
                 page.page.evaluate("window.pad.axes = [0, 0, 0, -1]")
@@ -389,7 +389,7 @@ def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
         pressed_s = time.monotonic()
 
         def arrived() -> bool:
-            """It hovers on its way where a busy machine let the page be silent: it is sent again, as a person would."""
+            """It hovers on its way if a busy machine made the page silent: send it again, as a person would."""
             nonlocal pressed_s
             if "waypoint is reached" in page.says(".notice"):
                 return True
@@ -443,9 +443,7 @@ def test_a_phone(deck: Deck, scheme: str) -> None:
     assert box["y"] + box["height"] <= 844, "in reach without scrolling"
 
 
-def test_a_token_lets_in_as_an_observer_or_a_pilot(
-    open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path
-) -> None:
+def test_a_token_admits_an_observer_or_a_pilot(open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path) -> None:
     tokens = tmp_path / "tokens"
     tokens.write_text("pilot 0123456789abcdefP ann\nobserver 0123456789abcdefO bob\n")
     tokens.chmod(0o600)
@@ -457,7 +455,7 @@ def test_a_token_lets_in_as_an_observer_or_a_pilot(
         page.goto(f"{address}#asked")
         page.get_by_label("Token").fill("not a token of this cockpit")
         page.get_by_role("button", name="Enter").click()
-        page.get_by_text("this token is not known here").wait_for()
+        page.get_by_text("this token is unknown here").wait_for()
         page.get_by_label("Token").fill("0123456789abcdefO")
         page.get_by_role("button", name="Enter").click()
         page.get_by_text("You may watch, not fly.").wait_for()

@@ -1,4 +1,4 @@
-"""The page for everybody: axe-core finds no fault in it, and keys reach all that a mouse does."""
+"""An accessible page: axe-core finds no fault in it, and keys reach everything a mouse does."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.process
 
 
 def faults(page: Page) -> list[str]:
-    """What axe-core finds, each in a line: theme, rule, element, what is wrong."""
+    """Return axe-core's findings, one per line: theme, rule, element, problem."""
     if not page.evaluate("'axe' in window"):
         page.evaluate(AXE.read_text())
     lines: list[str] = []
@@ -119,7 +119,7 @@ MISSED = f"""() => [...document.querySelectorAll("body *")].filter((element) => 
 
 
 def missed(page: Page) -> list[str]:
-    """What the tabulator key does not reach, or without showing it."""
+    """Return elements that the Tab key misses, or reaches without showing it."""
     page.evaluate("document.activeElement.blur()")
     page.evaluate("for (const one of document.querySelectorAll('[data-reached]')) delete one.dataset.reached")
     for _ in range(300):

@@ -1,4 +1,4 @@
-"""The page that is committed is the one that its sources make: see cockpit-page/build.mjs."""
+"""The committed page matches its sources: see cockpit-page/build.mjs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_BYTES = 1_000_000
 
 
 def hash_of(folder: Path) -> str:
-    """As the build computes it: over name, NUL, content, NUL of each file, by name."""
+    """Hash like the build: over name, NUL, content, NUL of each file, by name."""
     found = [path for part in ("src", "public") for path in (folder / part).rglob("*") if path.is_file()]
     named = {path.relative_to(folder).as_posix(): path for path in [*found, *(folder / name for name in SETTINGS)]}
     total = hashlib.sha256()
@@ -32,7 +32,7 @@ def test_the_build_is_of_these_sources() -> None:
     assert manifest["sources"] == hash_of(PAGE), "the page's sources have changed: make page"
 
 
-def test_nobody_wrote_to_what_was_built() -> None:
+def test_the_built_files_are_unmodified() -> None:
     manifest = json.loads((STATIC / "manifest.json").read_text())
     files = {path.relative_to(STATIC).as_posix(): path for path in STATIC.rglob("*") if path.is_file()}
     assert set(files) - {"manifest.json"} == set(manifest["files"])
@@ -43,7 +43,7 @@ def test_nobody_wrote_to_what_was_built() -> None:
     assert sum(path.stat().st_size for path in files.values()) < MOST_BYTES
 
 
-def test_it_fetches_nothing_from_elsewhere() -> None:
+def test_the_page_loads_nothing_from_other_hosts() -> None:
     page = (STATIC / "index.html").read_text()
     assert "http" not in page
     assert "style=" not in page

@@ -154,7 +154,7 @@ def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, 
     clip.value.save_as(tmp_path / "clip")
     assert (tmp_path / "clip").stat().st_size > 1000
     assert not page.pane.locator(".clip-mark").is_visible()
-    apart = camera.get_by_role("button", name="in a window of its own")
+    apart = camera.get_by_role("button", name="in its own window")
     apart.click()
     page.until(lambda: apart.get_attribute("aria-pressed") == "true", "it has a window of its own")
     page.until(
@@ -163,12 +163,12 @@ def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, 
     apart.click()
     page.until(lambda: apart.get_attribute("aria-pressed") == "false", "it is back")
     assert page.page.evaluate("window.apart.srcObject") is None
-    camera.get_by_role("button", name="on the full screen").click()
+    camera.get_by_role("button", name="full screen").click()
     page.until(lambda: camera.evaluate("camera => document.fullscreenElement === camera"), "it is full")
-    camera.get_by_role("button", name="Motors off").wait_for()  # in reach there, too
+    camera.get_by_role("button", name="Motors off").wait_for()  # within reach there, too
     camera.get_by_role("button", name="Follow something").click()
     page.wait_for_text(".follow-hint", "Drag a box")
-    camera.get_by_role("button", name="Motors off").click(trial=True)  # also above what a box is drawn on
+    camera.get_by_role("button", name="Motors off").click(trial=True)  # also above the layer for drawing a box
     camera.get_by_role("button", name="Follow something").click()
     page.page.evaluate("document.exitFullscreen()")
     page.page.locator(".bar .safety").wait_for()

@@ -1,6 +1,6 @@
-"""The page tells the truth when its link is bad, and nobody stops a drone by chance: Chromium, with what is stopped.
+"""The page is truthful on a bad link, and no accident stops a drone: Chromium, with suspended processes.
 
-What is stopped is stopped for real: the cockpit's process, or the browser's that draws the page (SIGSTOP).
+Suspension is real: of the cockpit's process, or of the browser's renderer (SIGSTOP).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SMALL = "sim://?world=empty&cameras="
 
 
 def own_cockpit(deck: Deck, folder: Path) -> Process:
-    """One that may be stopped without those of other tests."""
+    """A cockpit that may be stopped without those of other tests."""
     return deck.own_cockpit("--recordings", str(folder))
 
 
@@ -77,7 +77,7 @@ def test_an_emergency_stop_held_in_a_stall_is_pending_for_two_seconds_and_never_
         page.until(lambda: stop.get_attribute("data-fate") == "refused", "it was refused")
         for _ in range(20):
             assert flies.next_feedback().state is FlightState.HOVERING
-        # A short stall is another thing: it was pressed a moment ago, and the page still shows it as pending.
+        # A short stall is different: the press was a moment ago, and the page still shows it as pending.
         with stopped(cockpit.pid), page.holding("Control", "Enter"):
             page.until(lambda: stop.get_attribute("data-fate") == "pending", "it is shown as pending")
         page.until(lambda: flies.feedback().state is FlightState.EMERGENCY, "late, and in time")
@@ -95,7 +95,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
         assert time.monotonic() - stopped_s < 6.0
         page.until(lambda: float(page.says(".old b").split()[0]) > 2.0, "the age counts")
         assert "was hovering" in page.says(".pill")
-        assert "Not known" in page.says(".holder")
+        assert "Unknown" in page.says(".holder")
         assert "you had control" in page.says(".holder")
         assert page.pane.get_attribute("data-mine") == "false"
         for part in (".pane-body", ".holder", ".deeds", ".pill", ".battery"):
@@ -106,7 +106,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
         assert page.page.locator(".banner:visible").count() == 1, "one cause is told once, and hides nothing"
         assert page.pane.locator("h2").is_visible()
         with observe("grey") as drone:
-            page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control ran out")
+            page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control expired")
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is heard again")
     page.until(lambda: page.pane.locator(".ended").is_visible(), "it tells that control was lost")
     assert "nobody has control" in page.says(".ended")
@@ -131,7 +131,7 @@ def test_a_stopped_browser_is_a_silent_pilot(open_cockpit: tuple[Browser, str], 
             drone.wait(lambda feedback: not feedback.lease, 5.0)
         page.page.keyboard.up("w")
         page.until(lambda: page.pane.locator(".ended").is_visible(), "it tells that control was lost")
-        assert "control ran out" in page.says(".ended")
+        assert "control expired" in page.says(".ended")
         page.until(lambda: "Nobody" in page.says(".holder"), "it is told who has control now")
         assert not drone.feedback().lease, "it is not taken back by itself"
         page.pane.get_by_role("button", name="Understood").click()
@@ -144,14 +144,14 @@ def test_after_a_proxys_death_and_return_control_is_the_persons_to_take(deck: De
     page = deck.page("returns")
     page.take_control()
     proxy.signal(signal.SIGKILL)
-    page.wait_for_text(".ended", "nobody has control, and what returns does is not known")
+    page.wait_for_text(".ended", "nobody has control, and the state of returns is unknown")
     page.wait_for_text(".holder", "Nobody")
-    page.wait_for_text(".pill", "not known")
+    page.wait_for_text(".pill", "unknown")
     assert page.pane.get_attribute("data-old") == "true"
     proxy.end()
     deck.proxy("returns", SMALL)
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is back")
-    page.wait_for_text(".ended", "what returns flew meanwhile is not known")
+    page.wait_for_text(".ended", "what returns did meanwhile is unknown")
     with observe("returns") as drone:
         for _ in range(30):
             assert drone.next_feedback().owner is None
@@ -189,14 +189,14 @@ def test_the_emergency_stop_is_held_shown_as_it_counts_and_names_the_drone(deck:
         page.page.locator('.pane[data-drone="left"] .pane-head h2').click()
         page.until(lambda: "left" in own.inner_text(), "it names the one that is chosen")
         for _ in range(4):
-            own.click()  # as by chance
+            own.click()  # as if by accident
             page.press("Enter")
         with page.holding("Control", "Enter"):
             counting.wait_for()
             assert "Motors of left off" in counting.inner_text()
         page.until(lambda: "released too early" in counting.inner_text(), "it says that nothing was done")
         assert {left.feedback().state, right.feedback().state} == {FlightState.HOVERING}
-        # While somebody writes; test_page_dialogs.py has it with a dialog over it.
+        # While a person types; test_page_dialogs.py covers an open dialog.
         field = page.page.locator('.pane[data-drone="left"] input[aria-label="Filter events by words"]')
         field.fill("wind")
         with page.holding("Control", "Enter"):
@@ -252,7 +252,7 @@ def test_land_all_and_stop_all_are_there_with_nothing_opened(deck: Deck) -> None
 
 
 def test_a_stop_that_is_held_is_ended_by_no_other_key_or_finger(deck: Deck) -> None:
-    """To let go of the key that flew, or to touch another drone with the other hand, kept all motors running."""
+    """Releasing the key that flew, or touching another drone with the other hand, kept all motors running."""
     for name in ("left", "right"):
         deck.proxy(name, SMALL)
     page = deck.page("left", "right")
@@ -269,7 +269,7 @@ def test_a_stop_that_is_held_is_ended_by_no_other_key_or_finger(deck: Deck) -> N
         def stands() -> bool:
             state = drone.feedback().state
             if state is FlightState.EMERGENCY:
-                drone.reset_emergency()  # which counts for nothing while it falls
+                drone.reset_emergency()  # which has no effect while it falls
             return state is FlightState.LANDED
 
         page.until(stands, "it has fallen, and is reset")
@@ -293,7 +293,7 @@ def test_a_recording_has_no_flight_controls_and_ends_neutrally(deck: Deck) -> No
     page.page.locator(".past li").get_by_role("button", name="Replay").first.click()
     replay = page.page.locator('.pane[data-recording="true"]')
     replay.wait_for()
-    # What is not to be seen goes with the page's next drawing. A recording is not stopped, nor the drone behind it.
+    # Elements to hide disappear with the page's next drawing. Neither a recording nor the drone behind it is stopped.
     for hidden in (replay.locator(".strip"), replay.locator("form.waypoint"), page.page.locator(".safety .own")):
         hidden.wait_for(state="hidden")
     replay.locator(".pill", has_text="recording over").wait_for(timeout=10_000)

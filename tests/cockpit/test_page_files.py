@@ -1,4 +1,4 @@
-"""The page's files: compressed where the browser takes that, and not sent again while they are the same."""
+"""The page's files: compressed if the browser accepts that, and not sent again while unchanged."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def script(client: TestClient) -> str:
     return str(client.get("/").text.split('"')[1])
 
 
-def test_compressed_for_who_takes_it(client: TestClient) -> None:
+def test_files_are_compressed_for_browsers_that_accept_it(client: TestClient) -> None:
     packed = client.get("/static/cockpit.js", headers={"accept-encoding": "br, gzip"})
     assert (packed.headers["content-encoding"], packed.content) == ("gzip", SCRIPT)
     assert int(packed.headers["content-length"]) == len(gzip.compress(SCRIPT, 9)) < len(SCRIPT) / 10
@@ -53,7 +53,7 @@ def test_compressed_for_who_takes_it(client: TestClient) -> None:
     assert "javascript" in packed.headers["content-type"]
 
 
-def test_what_is_named_by_its_content_is_kept_for_good(client: TestClient, static: Path) -> None:
+def test_files_named_by_content_are_cached_forever(client: TestClient, static: Path) -> None:
     address = script(client)
     assert address.startswith("/static/cockpit.js?v=")
     for kept in (address, "/static/scene-ABCD1234.js"):
@@ -65,7 +65,7 @@ def test_what_is_named_by_its_content_is_kept_for_good(client: TestClient, stati
     assert client.get(script(client)).content == SCRIPT + b"//"
 
 
-def test_not_sent_again_while_it_is_the_same(client: TestClient) -> None:
+def test_unchanged_files_are_not_sent_again(client: TestClient) -> None:
     tag = client.get("/static/cockpit.js").headers["etag"]
     again = client.get("/static/cockpit.js", headers={"if-none-match": tag})
     assert (again.status_code, again.content) == (304, b"")
@@ -73,7 +73,7 @@ def test_not_sent_again_while_it_is_the_same(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("path", ["gone.js", "..%2Findex.html", "%00", "a" * 300, ""])
-def test_what_is_not_there_is_not_found(client: TestClient, path: str) -> None:
+def test_missing_files_are_not_found(client: TestClient, path: str) -> None:
     assert client.get(f"/static/{path}").status_code in (400, 404)
 
 

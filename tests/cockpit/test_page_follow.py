@@ -1,4 +1,4 @@
-"""Following what is marked on the picture, by mouse and by finger: a simulated person, the real tracker and law."""
+"""Following a target marked on the picture, by mouse and by finger: a simulated person, the real tracker and law."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Edges = tuple[float, float, float, float]  #: left, top, right, bottom [CSS pixe
 
 
 class Sight:
-    """Where the person is in the pictures that the page shows, which are old on a busy machine."""
+    """The person's place in the page's pictures, which are old on a busy machine."""
 
     def __init__(self, page: DronePage, walker: Walker, drone: Drone) -> None:
         self._page, self._walker = page, walker
@@ -34,7 +34,7 @@ class Sight:
         page.until(lambda: bool(self._states), "it is known where the drone is")
 
     def on_screen(self, captured: str = "") -> Edges:
-        """Where the person is in the picture of a capture; without one, in that which is on the screen."""
+        """Return the person's place in the picture of a capture; by default, in the one on the screen."""
         captured_ns = int(captured or self._page.attribute(".camera", "data-drawn"))
         state = min(list(self._states), key=lambda state: abs(state.captured_ns - captured_ns))
         return on_screen(self._page, self._walker.box(state))
@@ -42,7 +42,7 @@ class Sight:
     def draw(
         self, press: Callable[[float, float], None], drag: Callable[[float, float], None], lift: Callable[[], None]
     ) -> None:
-        """Drag a box around the person as the picture shows it that stands still; anew if it is another one by then."""
+        """Drag a box around the person in the frozen picture; again if another one is shown by then."""
         page = self._page
         still = page.pane.locator(".still")
 
@@ -52,13 +52,13 @@ class Sight:
             page.until(
                 lambda: still.is_visible() or "One moment" in page.says(".follow-hint"), "the picture stands still"
             )
-            if not still.is_visible():  # the cockpit has not kept that one
+            if not still.is_visible():  # the cockpit did not keep that frame
                 lift()
                 return False
             stands = self.on_screen(page.attribute(".still", "data-captured"))
             if abs(stands[0] - left) < 0.15 * (right - left):
                 return True
-            lift()  # which is no box
+            lift()  # too small for a box
             page.until(lambda: not still.is_visible(), "it goes on")
             return False
 
@@ -69,7 +69,7 @@ class Sight:
 
 
 def on_screen(page: DronePage, box: Box) -> Edges:
-    """Left, top, right and bottom of a box of the picture on the screen, a little loosely [CSS pixels]."""
+    """Return left, top, right and bottom of a box of the picture on the screen, a little loosely [CSS pixels]."""
     x, y, width, height = box
     picture = page.pane.locator(".video").first.bounding_box()
     assert picture is not None
@@ -93,7 +93,7 @@ def place_x(drone: Drone) -> float:
 
 
 def detected(walker: Walker, drone: Drone, frame: Frame) -> None:
-    """What ``skyloop detect`` would draw."""
+    """Draw like ``skyloop detect``."""
     if frame.feedback is not None:
         x, y, width, height = walker.box(frame.feedback)
         corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
@@ -130,7 +130,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
             focused = "(button) => button === document.activeElement"
             return bool(panel.get_by_role("button", name="Follow").evaluate(focused))
 
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         picture(page, "follow-marked")
         assert drone.feedback().state is FlightState.HOVERING, "nothing flies yet"
         page.until(chosen_by_enter, "the panel can be read by now")
@@ -147,7 +147,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers")
         page.until(lambda: not panel.is_visible(), "the panel is closed")
 
-        # What a processor draws is chosen by a click; nothing is dragged.
+        # A processor's detection is chosen by a click, without dragging.
         drone.on_frame(lambda frame: detected(walker, drone, frame))
         page.press("f")
         page.wait_for_text(".follow-hint", "Drag a box")
@@ -166,7 +166,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.until(hover_over_it, "what is under the mouse is shown")
         picture(page, "follow-detection")
         page.until(chosen, "it is chosen, although the drone still swings")
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         page.until(chosen_by_enter, "the panel can be read by now")
         page.press("Enter")
         page.until(lambda: drone.feedback().state is FlightState.FLYING, "it flies")
@@ -196,12 +196,12 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
 
             sight.draw(put, put, lambda: hand.lift("finger"))
             hand.lift("finger")
-        page.wait_for_text(".follow-phase", "Tracked: nothing flies")
+        page.wait_for_text(".follow-phase", "Tracking, not flying")
         picture(page, "follow-phone-marked")
         panel = page.pane.get_by_role("region", name="Target")
         tapped_s = -math.inf
 
-        def follows() -> bool:  # tapped again where the panel had moved on with the person before the finger came down
+        def follows() -> bool:  # tap again if the panel had moved with the person before the finger came down
             nonlocal tapped_s
             if "Tracked" in page.says(".follow-phase") and time.monotonic() - tapped_s > 4.0:
                 tapped_s = time.monotonic()

@@ -28,7 +28,7 @@ SMALL = ("cameras=front", "width=160", "height=120", "fps=10", "position=1")
 
 @pytest.fixture(scope="module")
 def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
-    """The cockpit, with three drones that fly in one world."""
+    """The cockpit, with three drones flying in one world."""
     options = [word for option in SMALL for word in ("--option", option)]
     world = Process("-m", "skyloop", "sim", "--drones", "3", "--name", "d", "--world", "empty", *options)
     try:
@@ -71,7 +71,7 @@ def test_all_drones_one_of_them_and_back(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_no_key_flies_what_is_not_seen_and_all_land(deck: Deck) -> None:
+def test_keys_fly_no_invisible_drone_and_all_land(deck: Deck) -> None:
     page = deck.page("d1")
     with ExitStack() as stack:
         seen = {name: stack.enter_context(skyloop.connect(name, access="observe", name="test")) for name in NAMES}

@@ -1,4 +1,4 @@
-"""Recordings and replays on the page: a flight is recorded, kept in order, and scrubbed through."""
+"""Recordings and replays on the page: a flight is recorded, organised, and scrubbed through."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def deck() -> Iterator[Deck]:
 
 
 def replay(deck: Deck, name: str) -> DronePage:
-    """The page with a recording that is replayed by its button."""
+    """Open the page with a recording replayed by its button."""
     page = deck.overview()
     page.page.get_by_role("button", name=f"Replay {name}").click()
     page.page.locator(".replay-slider:visible").wait_for(timeout=LONG_S * 1000)
@@ -38,7 +38,7 @@ def position(page: DronePage) -> float:
 
 
 def drag(page: DronePage, share: float) -> None:
-    """To a share of the bar, with the mouse."""
+    """Move to a share of the bar, with the mouse."""
     box = page.pane.locator(".replay-rail").bounding_box()
     assert box is not None
     mouse, y = page.page.mouse, box["y"] + box["height"] / 2
@@ -55,7 +55,7 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
     page = deck.page("filmed")
     page.wait_for_new_picture()
     page.page.get_by_role("button", name="Record", exact=True).click()
-    page.page.get_by_role("button", name="Put a mark into the recording of filmed").click()
+    page.page.get_by_role("button", name="Add a mark to the recording of filmed").click()
     with skyloop.connect("filmed", name="up.py") as drone:
         drone.takeoff()
         drone.land(wait=False)
@@ -120,12 +120,12 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
     page.page.get_by_role("button", name="More about First flight.mcap").click()
     page.page.get_by_role("button", name="Delete First flight.mcap").click()
     page.page.get_by_role("button", name="Move to the trash").click()
-    page.page.locator(".recordings .note", has_text="end that first").wait_for()
+    page.page.locator(".recordings .note", has_text="end the replay first").wait_for()
     page.page.get_by_role("button", name="End replay").click()
     page.page.get_by_role("button", name="Move to the trash").click()
     page.page.get_by_role("button", name="Undo").wait_for()
     assert (tmp_path / "trash" / "First flight.mcap").exists()
     page.page.get_by_role("button", name="Undo").click()
     page.page.get_by_role("button", name="Replay First flight.mcap").wait_for()
-    # Deleting was refused while it was replayed, and what belongs to the replay is gone with it.
+    # Deleting was refused during the replay, and the replay's elements are gone with it.
     assert all("409" in found or "404" in found for found in page.problems), page.problems

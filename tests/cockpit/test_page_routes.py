@@ -18,7 +18,7 @@ SIM = "sim://?world=empty&cameras=front&width=64&fps=10&wind=0"
 
 
 def write(page: DronePage, label: str, text: str) -> None:
-    """Into a field of numbers, by keys: Firefox does not clear one before it is filled."""
+    """Fill a number field by keys: Firefox does not clear one first."""
     page.pane.get_by_label(label, exact=True).focus()
     page.press("Control+A", *text)
 
@@ -87,7 +87,7 @@ def test_a_route_of_three_waypoints_is_planned_and_flown(deck: Deck, tmp_path: P
         resume = pane.get_by_role("button", name="Resume the route")
 
         def arrived() -> bool:
-            """It pauses by itself where a busy machine lets the page be silent for half a second."""
+            """It pauses if a busy machine makes the page silent for half a second."""
             if resume.is_visible():
                 resume.click(timeout=5000)
             return "done" in page.says(".route-progress")
@@ -125,7 +125,7 @@ def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
         assert drawn.startswith("Z1: box "), "it has the name that the map and refusals call it by"
         other.wait_for_text(".zones select", "Z1, box")
         assert other.pane.get_by_role("button", name="Delete").is_disabled(), "the other page has no control"
-        # What makes no sense is refused, and the zone stays.
+        # Nonsense is refused, and the zone stays.
         top = page.pane.get_by_label("top in metres")
         bottom = page.pane.get_by_label("bottom in metres")
         page.page.bring_to_front()

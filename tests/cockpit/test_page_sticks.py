@@ -1,4 +1,4 @@
-"""Sticks belong to what a person touches: fingers, gamepads and keys, in a real browser."""
+"""Sticks belong to the drone that a person touches: fingers, gamepads and keys, in a real browser."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ window.other = (axes) => pad("other", 1, axes);
 window.pads = [];
 navigator.getGamepads = () => window.pads;
 """
-BLIND = "sim://?world=empty&cameras=none"  # pictures are no matter here, and cost a busy machine much
+BLIND = "sim://?world=empty&cameras=none"  # pictures are irrelevant here, and costly on a busy machine
 MOVES_M_S = 0.15
 
 
 def speed(drone: Drone) -> float:
-    """Across the floor [m/s]."""
+    """Return the horizontal speed [m/s]."""
     return max(abs(one) for one in (drone.feedback().velocity_m_s or (0.0, 0.0, 0.0))[:2])
 
 
 @contextmanager
 def flown(deck: Deck, *names: str, **options: Any) -> Iterator[tuple[DronePage, dict[str, DronePage], list[Drone]]]:
-    """A page with these drones in the air, all flown by it; the page of each, and who watches it."""
+    """Open a page with these drones in the air, all flown by it; yield each drone's page and observer."""
     for name in names:
         deck.proxy(name, BLIND)
     page = deck.page(*names, **options)
@@ -56,12 +56,12 @@ def flown(deck: Deck, *names: str, **options: Any) -> Iterator[tuple[DronePage, 
 
 
 def stays(page: DronePage, drone: Drone, seconds: float = 1.5) -> bool:
-    """Whether it comes to rest, and nothing moves it across the floor afterwards.
+    """Return whether it comes to rest, and then stays at rest.
 
-    By the mean of six samples in a row: one alone is off by 0.044 m/s (standard deviation), and so beyond the limit in
-    one of some tens of such tests.
+    Uses the mean of six consecutive samples: a single one deviates by 0.044 m/s (standard deviation), and so exceeds
+    the limit in one of some tens of such tests.
     """
-    seen: dict[int, tuple[float, float]] = {}  # by when they were taken: a stalled machine shows one several times
+    seen: dict[int, tuple[float, float]] = {}  # by time of capture: a stalled machine shows one several times
 
     def moves() -> float:
         page.page.wait_for_timeout(50)
@@ -80,7 +80,7 @@ def stays(page: DronePage, drone: Drone, seconds: float = 1.5) -> bool:
 
 
 def until_it_flies(page: DronePage, drone: Drone, push: Callable[[], object], let_go: Callable[[], object]) -> None:
-    """Push, and again where a busy machine stalled the page: what is held then is let go first."""
+    """Push, again if a busy machine stalled the page: a stick held then must be released first."""
     pushed_s = 0.0
 
     def flies() -> bool:
@@ -88,7 +88,7 @@ def until_it_flies(page: DronePage, drone: Drone, push: Callable[[], object], le
         if time.monotonic() - pushed_s > 3.0:
             if pushed_s:
                 let_go()
-                page.take_off()  # where control ran out meanwhile
+                page.take_off()  # if control expired meanwhile
                 page.page.wait_for_timeout(300)
             push()
             pushed_s = time.monotonic()
@@ -98,7 +98,7 @@ def until_it_flies(page: DronePage, drone: Drone, push: Callable[[], object], le
 
 
 class Thumb:
-    """A finger on the right stick of a drone's pane."""
+    """Hold a finger on the right stick of a drone's pane."""
 
     def __init__(self, page: DronePage, hand: fingers.Fingers) -> None:
         self._hand = hand
@@ -117,7 +117,7 @@ class Thumb:
 
 
 def test_a_finger_on_another_drone_flies_that_one_with_nothing_and_lifted_fingers_fly_nothing(deck: Deck) -> None:
-    """It flew with the first one's stick, and on after all fingers were lifted."""
+    """It flew with the first one's stick, and continued after all fingers were lifted."""
     size = {"width": 1200, "height": 1900}
     with flown(deck, "left", "right", viewport=size, has_touch=True) as (page, pages, (left, right)):
         pages["left"].pane.locator("h2").click()
@@ -126,7 +126,7 @@ def test_a_finger_on_another_drone_flies_that_one_with_nothing_and_lifted_finger
         with fingers.on(page.page) as hand:
             thumb = Thumb(pages["left"], hand)
             until_it_flies(pages["left"], left, thumb.push, thumb.lift)
-            hand.put("other", other["x"] + 4, max(other["y"] + 5, 700.0))  # its margin, where it can be seen
+            hand.put("other", other["x"] + 4, max(other["y"] + 5, 700.0))  # its margin, where visible
             hand.lift("other")
             page.until(lambda: pages["right"].pane.get_attribute("data-selected") == "true", "it is selected")
             page.until(lambda: left.feedback().state is FlightState.HOVERING, "the one that was flown hovers")
@@ -168,7 +168,7 @@ def test_a_key_that_is_held_for_one_drone_does_not_fly_another(deck: Deck) -> No
 
 
 def test_a_gamepad_that_is_unplugged_beside_another_one_hovers_and_a_waking_press_is_no_command(deck: Deck) -> None:
-    """The other one flew at once, by whatever its sticks said; and the press that wakes a gamepad took off."""
+    """The other one flew at once, by its present sticks; and the press that wakes a gamepad took off."""
     deck.proxy("pads", BLIND)
     page = deck.page("pads", prepare=PADS)
     with skyloop.connect("pads", access="observe", name="test") as drone:
@@ -225,7 +225,7 @@ def test_control_that_comes_back_while_a_stick_is_held_flies_nothing(deck: Deck)
 
 
 def test_a_page_that_is_left_and_come_back_to_flies_nothing_that_was_held(deck: Deck) -> None:
-    """By Back and Forward, as a browser may keep a page as it was."""
+    """By Back and Forward, as a browser may keep a page unchanged."""
     with flown(deck, "back") as (page, _, (drone,)):
         keyboard = page.page.keyboard
         until_it_flies(page, drone, lambda: keyboard.down("w"), lambda: keyboard.up("w"))
@@ -237,7 +237,7 @@ def test_a_page_that_is_left_and_come_back_to_flies_nothing_that_was_held(deck: 
 
 
 def test_two_tabs_fly_one_drone_each_in_its_turn(deck: Deck) -> None:
-    """The tab that lost control to another one of the same person flies no more, with a key held all the while."""
+    """The tab that lost control to the person's other tab flies no more, with a key held throughout."""
     with flown(deck, "tabs") as (first, _, (drone,)):
         second = DronePage(first.page.context.new_page(), "tabs")
         second.page.goto(f"{deck.address}#tabs")

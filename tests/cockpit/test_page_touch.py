@@ -1,4 +1,4 @@
-"""The page under fingers: the flight mode on a telephone and a tablet, the size of what is pressed, and alarms."""
+"""The page under fingers: the flight mode on a phone and a tablet, the size of touch targets, and alarms."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def apart(one: dict[str, float], other: dict[str, float]) -> bool:
 
 
 def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
-    """Both sticks on the picture, all on one screen, and nothing of it under something else."""
+    """Check that both sticks are on the picture, all on one screen, and nothing is covered."""
     screen = {"left": 0.0, "top": 0.0, "right": float(size[0]), "bottom": float(size[1])}
     video, stop, holder = box(page, ".video"), box(page, ".strip .stop"), box(page, ".holder")
     sticks = [box(page, ".thumb", place) for place in (0, 1)]
@@ -76,7 +76,7 @@ def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
 
 
 def check_head(page: DronePage) -> None:
-    """On a narrow telephone, too, all of the head has a place of its own, with a battery that is full."""
+    """Check that on a narrow phone, too, everything in the head has its own place, even with a full battery."""
     page.page.set_viewport_size({"width": NARROW[0], "height": NARROW[1]})
     page.until(lambda: "100 %" in page.says(".battery"), "the battery is full")
     parts = {name: box(page, name) for name in (".fly", "h2", ".pill", ".battery", ".full", ".hud", ".chip.age")}
@@ -113,7 +113,7 @@ def test_a_flight_on_a_telephone(deck: Deck) -> None:
             page.until(flies, "two thumbs fly it forward and up")
         page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when they are lifted")
         assert page.page.evaluate(STILL) == still, "nothing scrolls, nothing is enlarged"
-        # Swipes beside the sticks: they would scroll, or load the page anew.
+        # Swipes beside the sticks would scroll or reload the page.
         with fingers.on(page.page) as hand:
             for y in (200, 300, 420, 560):
                 hand.put("swipe", 195, y)
@@ -157,13 +157,13 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
     with skyloop.connect("low", name="test") as drone:
         page.wait_for_text(".holder", "test")
         before: list[Any] = [box(page, part) for part in (".stage", ".deck.space", ".strip .taking")]
-        felt = page.page.evaluate("felt.length")  # a busy machine may have had an alarm of old feedback
+        felt = page.page.evaluate("felt.length")  # a busy machine may have raised an alarm of old feedback
         drone.config["battery.warn"] = 1.0
         page.wait_for_text(".alarms", "battery low")
         assert [box(page, part) for part in (".stage", ".deck.space", ".strip .taking")] == before
         page.until(lambda: page.page.evaluate("felt.length") > felt, "a vibration")
         acknowledge = page.pane.get_by_role("button", name="OK: acknowledge battery low")
-        page.page.wait_for_timeout(700)  # until it can have been read
+        page.page.wait_for_timeout(700)  # until there was time to read it
         acknowledge.tap()
         page.until(lambda: not page.pane.locator(".alarms").is_visible(), "it is folded")
         page.wait_for_text(".alarm-chip", "1 alarm")
@@ -172,6 +172,6 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
         page.wait_for_text(".alarms", "battery critical")
         page.until(lambda: page.page.evaluate("felt.length") >= felt + 3, "felt again and again")
         drone.land()
-    page.page.get_by_role("button", name="Alarms' sound").tap()
+    page.page.get_by_role("button", name="Alarm sound").tap()
     assert page.page.evaluate("localStorage.getItem('skyloop-sound')") == "off"
     assert page.problems == []

@@ -1,4 +1,4 @@
-"""Video on the page in Chromium: H.264 decoded and drawn, JPEGs where it can't be; a stalled page harms nobody."""
+"""Video on the page in Chromium: H.264 decoded and drawn, JPEGs otherwise; a stalled page harms no others."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ PIXELS: Final = """canvas => [...canvas.getContext("2d").getImageData(0, 0, canv
   .filter((_, at) => at % 37 === 0)"""
 ARDRONE: Final = re.compile(r"at udp (\d+), navdata udp (\d+), video \w+ (\d+), control tcp (\d+)")
 WIDE: Final = {"width": 2200, "height": 1500}  #: a pane has room for a picture's full size
-MOST_S: Final = 40.0  # on a machine that is busy pictures come late, and it is tried again
-FAR: Final = 12.0  # of 255, on average: two encodings of one picture are nearer than that
+MOST_S: Final = 40.0  # on a busy machine pictures arrive late, and the test retries
+FAR: Final = 12.0  # of 255, on average: two encodings of one picture are closer than that
 
 
 @pytest.fixture(scope="module")
 def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
-    """The cockpit, with one drone that stands."""
+    """The cockpit, with one drone on the ground."""
     drone = Process("-m", "skyloop", "proxy", WATCHED, "--name", "film")
     try:
         drone.until("ready")
@@ -103,7 +103,7 @@ def test_h264_is_decoded_and_drawn_as_the_jpeg_is(deck: Deck) -> None:
     assert (rate.get_attribute("title") or "").startswith("H.264")
     plain = deck.page("film", prepare=NO_DECODER)
     plain.until(lambda: form(plain) == "jpeg", "JPEGs are shown")
-    assert "decodes no H.264" in plain.attribute(".chip.rate", "title")
+    assert "can't decode H.264" in plain.attribute(".chip.rate", "title")
     one, other = pixels(page), pixels(plain)
     assert len(one) == len(other) > 8000
     assert sum(abs(a - b) for a, b in zip(one, other, strict=True)) / len(one) < FAR
@@ -126,7 +126,7 @@ def test_over_plain_http_the_page_says_why_and_what_to_do(deck: Deck) -> None:
     page.page.get_by_text("skyloop cockpit --https").wait_for()
 
 
-def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
+def test_a_key_picture_is_requested_after_a_gap(deck: Deck) -> None:
     page = deck.page("film", prepare=LOSES)
     page.until(lambda: form(page).startswith("h264"), "H.264 is shown", MOST_S)
     page.wait_for_new_picture()
@@ -138,16 +138,16 @@ def test_a_key_is_asked_for_after_a_gap(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_a_page_that_falls_behind_is_told_why_its_picture_is_smaller(deck: Deck) -> None:
-    """It fell to 160 × 120, and nobody said why."""
+def test_a_page_that_falls_behind_shows_why_its_picture_is_smaller(deck: Deck) -> None:
+    """It fell to 160 × 120, without any explanation."""
     page = deck.page("film", prepare=SLOW)
     page.until(lambda: form(page) == "h264 own", "it has a stream of its own", MOST_S)
     told = page.pane.locator(".chip.smaller")
     page.until(lambda: told.is_visible(), "it says so")
     said = told.text_content() or ""
     assert said.startswith(("Smaller picture, ", "Coarser picture: "))
-    # On a computer that is busy with other tests as well that is the reason.
-    assert said.endswith(("this connection is slow", "this computer is busy", "late to the cockpit"))
+    # On a computer also busy with other tests, that is the reason.
+    assert said.endswith(("this connection is slow", "this computer is busy", "reach the cockpit late"))
 
 
 def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:
@@ -163,7 +163,7 @@ def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:
 
 @contextmanager
 def emulated(kind: str) -> Iterator[str]:
-    """Emulated firmware; the address to fly it by."""
+    """Run emulated firmware; yield the address to fly it by."""
     options = ["-m", "skyloop", "sim", "--firmware", kind]
     if kind == "tello":
         addresses = Addresses.free()
@@ -188,7 +188,7 @@ def emulated(kind: str) -> Iterator[str]:
 
 @pytest.mark.parametrize("kind", ["ardrone2", "tello"])
 def test_what_the_vehicle_encodes_is_shown_as_it_comes(deck: Deck, kind: str) -> None:
-    """The proxy runs here, where it shows that it encodes nothing."""
+    """The proxy runs here, which shows that it encodes nothing."""
     with emulated(kind) as address:
         proxy = Proxy(make_driver(address), LocalServer(kind), name=kind)
         with proxy:
@@ -200,7 +200,7 @@ def test_what_the_vehicle_encodes_is_shown_as_it_comes(deck: Deck, kind: str) ->
             assert form(page) == "h264 vehicle"
             rate = page.pane.locator(".chip.rate")
             page.until(lambda: "kB/s" in (rate.text_content() or ""), "it says how much")
-            assert "as the vehicle" in (rate.get_attribute("title") or "")
+            assert "from the vehicle" in (rate.get_attribute("title") or "")
             assert streams.known == (), "nothing is encoded, for whomever"
             assert max(pixels(page)) > 0
             assert page.problems == []
@@ -222,7 +222,7 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
     frozen.wait_for_new_picture()
     for page in (live, frozen):
         page.page.wait_for_load_state("networkidle")
-        page.problems.clear()  # on a busy machine the drone's first answers may come too late
+        page.problems.clear()  # on a busy machine the drone's first answers may be late
     with skyloop.connect("film", name="flies.py") as pilot:
         pilot.takeoff()
         with stopped(*(renderers() - others)):
@@ -239,8 +239,8 @@ def test_a_stopped_page_harms_neither_the_pilot_nor_other_pages(open_cockpit: tu
     assert (live.problems, frozen.problems) == ([], [])
 
 
-def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: Deck) -> None:
-    """Those of a detector that takes half a second were never seen, and nobody knew why."""
+def test_late_drawings_are_shown_faded_or_explained(deck: Deck) -> None:
+    """Drawings by a detector that takes half a second were never visible, without any explanation."""
     deck.proxy("slow")
     page = deck.page("slow")
     late_s = 0.6
@@ -254,8 +254,8 @@ def test_drawings_that_come_late_are_shown_pale_or_the_page_says_why_not(deck: D
                 drone.annotate(old, [Polyline(((40, 40), (200, 40), (200, 160)), closed=True)], source="detector")
 
         drone.on_frame(draw)
-        page.until(lambda: "shown pale" in page.says(".drawn-late"), "it says that they are late")
-        # Counted from the picture that is shown, which is a while old itself.
+        page.until(lambda: "shown faded" in page.says(".drawn-late"), "it says that they are late")
+        # Counted from the picture shown, which is itself some time old.
         assert re.search(r"detector draws 0\.[3-9] s late", page.says(".drawn-late"))
         overlay = page.pane.locator(".overlay").first
         page.until(lambda: 0 < overlay.evaluate(DRAWN_ON) < 200, "they are shown, pale")

@@ -1,4 +1,4 @@
-"""What stops and lands drones is on the screen: in each width and zoom, with long words, long names and with alarms."""
+"""The buttons that stop and land are on the screen: at every width and zoom, with long words, long names and alarms."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ pytestmark = pytest.mark.process
 
 FINGER_PX = 44.0
 WIDTHS = (320, 390, 641, 768, 850, 947, 1024, 1440)
-#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: what is left of them.
+#: A window of 1440 × 900 pixels and a tablet's of 1024 × 768, enlarged to 200, 300 and 400 %: the remaining sizes.
 ENLARGED = ((720, 450), (480, 300), (360, 225), (512, 384), (256, 192))
 LONG_NAME = "a-drone-with-a-name-as-long-as-names-can-be-1234"
 PSEUDO = "localStorage.setItem('skyloop-language', 'pseudo');"
-#: What is wrong with the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
+#: Problems of the controls that stop and land: outside of the window, covered, or smaller than ``least`` pixels.
 WRONG = """([drone, least]) => {
   const pane = document.querySelector(`.pane[data-drone="${CSS.escape(drone)}"]`);
   const [own, ...all] = document.querySelectorAll(".safety button");
@@ -56,7 +56,7 @@ def resize(page: DronePage, width: int, height: int) -> None:
 
 
 def sweep(page: DronePage, drones: tuple[str, ...], least: float = 24.0) -> str:
-    """What is wrong at each size, scrolled to the top, to the middle and to the end of what is opened."""
+    """Return the problems at each size, with the open content scrolled to the top, middle and end."""
     found = []
     for width, height in [*((width, 860) for width in WIDTHS), *ENLARGED]:
         resize(page, width, height)
@@ -100,7 +100,7 @@ def test_two_drones_and_all_of_them(deck: Deck) -> None:
 
 
 def share(page: DronePage, selector: str) -> float:
-    """How much of the window a part of the pane has."""
+    """Return how much of the window a part of the pane has."""
     found, size = page.pane.locator(selector).first.bounding_box(), page.page.viewport_size
     assert found is not None
     assert size is not None
@@ -108,7 +108,7 @@ def share(page: DronePage, selector: str) -> float:
 
 
 def test_the_picture_is_first_and_the_panels_are_a_press_away(deck: Deck) -> None:
-    deck.own_cockpit()  # with no cards of drones that other tests flew above the picture
+    deck.own_cockpit()  # without cards of other tests' drones above the picture
     deck.proxy("first")
     page = deck.page("first", panels=False, viewport={"width": 1440, "height": 900})
     assert share(page, ".pictures") > 0.6
@@ -162,7 +162,7 @@ def test_an_alarm_covers_nothing(deck: Deck) -> None:
     deck.proxy("warned")
     page = deck.page("warned", panels=False)
     with skyloop.connect("warned", name="test") as drone:
-        # What comes late on a busy machine changes the lines of text, and with them what is measured here.
+        # Late data on a busy machine changes the lines of text, and with them the measurements.
         page.wait_for_text(".now", "test has control")
         page.wait_for_new_picture()
         page.page.evaluate(DRAWN)
@@ -223,7 +223,7 @@ MOVED = """(selectors) => selectors.flatMap((selector) => {
 
 
 def moved(page: DronePage, *banners: str) -> str:
-    """What a banner moves, at each width, at the top of the page and farther down."""
+    """Return what a banner moves, at each width, at the top of the page and further down."""
     found = []
     for width in WIDTHS:
         resize(page, width, 860)
@@ -235,7 +235,7 @@ def moved(page: DronePage, *banners: str) -> str:
 
 
 def landed(page: DronePage) -> None:
-    """All drones are told to land, as is said where it concerns all of them."""
+    """Order all drones to land, with the message at its usual place."""
     button = page.page.locator(".safety .land-all")
     page.until(lambda: not button.is_disabled(), "there is a drone")
     button.hover()
@@ -255,7 +255,7 @@ window.WebSocket = class extends WebSocket {
 """
 
 
-def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
+def test_messages_about_one_or_all_drones_move_nothing(deck: Deck) -> None:
     for name in ("told", "beside"):
         deck.proxy(name)
     page = deck.page("told", panels=False)
@@ -265,7 +265,7 @@ def test_what_is_said_of_one_drone_or_all_moves_nothing(deck: Deck) -> None:
     assert moved(page, ".safety-message", ".alarms", ".alarm-chip", ".notice", ".card-alarm") == ""
 
 
-def test_what_is_said_above_all_drones_moves_nothing(deck: Deck) -> None:
+def test_messages_above_all_drones_move_nothing(deck: Deck) -> None:
     deck.proxy("listed")
     page = deck.overview(DEAF)
     landed(page)

@@ -1,4 +1,4 @@
-"""Recordings' files from the page: downloaded, renamed, noted about, thrown away; replays moved; by whom."""
+"""Recordings' files on the page: download, rename, annotate, delete; replays moved; with roles."""
 
 from __future__ import annotations
 
@@ -75,11 +75,11 @@ def test_a_name_is_refused_or_is_one_file_of_the_folder(text: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "a name is needed"),
-        (".mcap", "a name is needed"),
+        ("", "the name is empty"),
+        (".mcap", "the name is empty"),
         ("..", "begin with '.'"),
-        ("../up", "'/' in it"),
-        ("a\\b", "in it"),
+        ("../up", "contain '/'"),
+        ("a\\b", "contain"),
         ("a\0b", "U+0000"),
         ("a\nb", "U+000A"),
         ("-rf", "begin with '-'"),
@@ -152,7 +152,7 @@ def test_a_renamed_recording_keeps_its_notes_and_overwrites_nothing(nodes: Nodes
     ]
 
 
-def test_what_is_deleted_can_be_brought_back(nodes: Nodes, folder: Path) -> None:
+def test_deleted_recordings_can_be_restored(nodes: Nodes, folder: Path) -> None:
     data = (folder / "flight.mcap").read_bytes()
     with serve(nodes, folder) as client:
         post(client, "recordings/flight.mcap/notes", {"text": "keep"})
@@ -203,7 +203,7 @@ def test_notes_and_marks_have_limits(folder: Path) -> None:
     assert not notes_path(path).exists()
 
 
-def test_what_is_recorded_is_marked_and_not_moved(nodes: Nodes, folder: Path) -> None:
+def test_running_recordings_can_be_marked_but_not_moved(nodes: Nodes, folder: Path) -> None:
     with serve(nodes, folder, record=FakeRecorder) as client:
         number = post(client, "recordings", {"drones": ["alpha"]}).json()["id"]
         (name,) = {path.name for path in folder.iterdir()} - {"flight.mcap", "other.mcap"}
@@ -222,7 +222,7 @@ def test_what_is_recorded_is_marked_and_not_moved(nodes: Nodes, folder: Path) ->
 # Replays -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_timeline_holds_what_happened(folder: Path) -> None:
+def test_a_timeline_contains_events_and_marks(folder: Path) -> None:
     recording = Recording.open(folder / "flight.mcap")
     found = timeline(recording, "alpha")
     assert [event["kind"] for event in found["events"]].count("collision") == 1
@@ -266,7 +266,7 @@ def test_a_replay_is_moved_by_pilots_and_its_file_stays(nodes: Nodes, folder: Pa
         for body, words in (({"position_s": 99.0}, "at most"), ({"speed": 0}, "at least"), ({"paused": 1}, "bool")):
             answer = post(client, "replays/flight", body)
             assert (answer.status_code in (400, 409), words in answer.json()["error"]) == (True, True)
-        assert "is no replay" in post(client, "replays/alpha", {"paused": True}).json()["error"]
+        assert "is not a replay" in post(client, "replays/alpha", {"paused": True}).json()["error"]
         assert post(client, "replays/gone", {"paused": True}).status_code == 404
         for path, more in (("recordings/flight.mcap/delete", {}), ("recordings/flight.mcap/rename", {"name": "x"})):
             answer = post(client, path, more)

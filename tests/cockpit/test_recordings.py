@@ -1,4 +1,4 @@
-"""Recordings from the page: with a recorder that is not there, and with a real one."""
+"""Recordings on the page: with a stand-in for the recorder, and with a real one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def post(client: TestClient, path: str, body: Any = None) -> Any:
 
 
 def read_on(socket: WebSocketTestSession) -> None:
-    """For ever."""
+    """Block forever."""
     while True:
         socket.receive_json()
 
@@ -90,7 +90,7 @@ def test_a_recording_is_started_watched_and_stopped(nodes: Nodes, folder: Path) 
         ({"drones": ["alpha"] * 65}, 400),
     ],
 )
-def test_what_can_not_be_recorded_is_told(nodes: Nodes, folder: Path, body: Any, status: int) -> None:
+def test_impossible_recordings_are_refused_with_the_reason(nodes: Nodes, folder: Path, body: Any, status: int) -> None:
     with serve(nodes, folder, record=FakeRecorder) as client:
         answer = post(client, "recordings", body)
         assert answer.status_code == status
@@ -98,7 +98,7 @@ def test_what_can_not_be_recorded_is_told(nodes: Nodes, folder: Path, body: Any,
         assert not folder.exists()
 
 
-def test_a_recorder_that_can_not_start_says_why(nodes: Nodes, tmp_path: Path) -> None:
+def test_a_recorder_that_cannot_start_gives_the_reason(nodes: Nodes, tmp_path: Path) -> None:
     def fail(drones: Sequence[str], folder: Path) -> FakeRecorder:
         raise LinkError("the disk is on fire")
 
@@ -109,11 +109,11 @@ def test_a_recorder_that_can_not_start_says_why(nodes: Nodes, tmp_path: Path) ->
     with serve(nodes, tmp_path / "file" / "below", record=FakeRecorder) as client:
         answer = post(client, "recordings", {"drones": ["alpha"]})
         assert answer.status_code == 400
-        assert "can't be made" in answer.json()["error"]
+        assert "can't be created" in answer.json()["error"]
 
 
 @pytest.mark.parametrize("name", ["gone.mcap", "..%2Fsecret.mcap", "secret.txt", "%2Fetc%2Fpasswd"])
-def test_only_recordings_of_the_folder_are_given(nodes: Nodes, folder: Path, name: str) -> None:
+def test_only_recordings_in_the_folder_are_served(nodes: Nodes, folder: Path, name: str) -> None:
     folder.mkdir()
     (folder / "secret.txt").touch()
     (folder.parent / "secret.mcap").touch()
@@ -211,7 +211,7 @@ def test_a_replay_shows_up_and_can_be_ended(nodes: Nodes, folder: Path) -> None:
         gamma.stop()
 
 
-def test_files_are_looked_into_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_inspected_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[str] = []
 
     def look(path: Path) -> Described:

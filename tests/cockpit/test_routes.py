@@ -67,7 +67,7 @@ def test_routes_are_kept_listed_and_deleted(tmp_path: Path) -> None:
 def test_a_name_never_leads_out_of_the_folder(name: str, tmp_path: Path) -> None:
     files = RouteFiles(tmp_path)
     for use in (files.load, files.delete, lambda name: files.save(name, route((1, 2, 1)))):
-        with pytest.raises(UsageError, match="is no name of a route"):
+        with pytest.raises(UsageError, match="is not a valid route name"):
             use(name)
     assert list(tmp_path.iterdir()) == []
 
@@ -143,7 +143,7 @@ def told(pilot: Page, kind: str) -> dict[str, Any]:
 def test_a_route_is_flown_paused_resumed_and_skipped(
     client: TestClient, node: Node, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("SILENT_S", "GONE_S"):  # a test that is held up for half a second is no silent page
+    for name in ("SILENT_S", "GONE_S"):  # a test delayed by half a second must not count as a silent page
         monkeypatch.setattr(control_session, name, getattr(control_session, name) + 30.0)
     number = checked(client)["id"]
     with page(client) as pilot:
@@ -193,10 +193,10 @@ def test_a_page_that_falls_silent_or_commands_something_else_pauses_the_route(cl
 
 
 @pytest.mark.parametrize(("first", "then"), [("route", "route_skip"), ("goto", "route_resume")])
-def test_a_route_that_can_not_be_steered_leaves_the_vehicle_hovering(
+def test_a_failed_route_control_leaves_the_vehicle_hovering(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch, first: str, then: str
 ) -> None:
-    """It flew on to where it had been sent before, and nobody watched that any more."""
+    """It flew on to its previous goal, but no one watched that any more."""
     number = checked(client, {**TRIANGLE, "waypoints": [{"x": 40, "y": 0, "z": 0.5}, {"x": 40, "y": 1, "z": 0.5}]})[
         "id"
     ]

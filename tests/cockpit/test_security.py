@@ -1,4 +1,4 @@
-"""Which requests are answered, and to whom: as pure decisions, and through the app."""
+"""Which requests are answered, and for whom: as pure decisions, and through the app."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def headers(**values: str) -> list[tuple[bytes, bytes]]:
         ("", {"host": "evil.example", "origin": EVIL}, False),
     ],
 )
-def test_whose_page_may_ask(method: str, given: dict[str, str], passes: bool) -> None:
+def test_which_pages_are_answered(method: str, given: dict[str, str], passes: bool) -> None:
     """An empty method is a WebSocket."""
     kind = "http" if method else "websocket"
     assert (foreign(kind, method, headers(**given), NAMES) == "") is passes
@@ -154,18 +154,18 @@ def test_usual_ports_need_not_be_named() -> None:
         ("websocket", "", "/", Role.OBSERVER),
     ],
 )
-def test_what_a_request_needs(kind: str, method: str, path: str, role: Role | None) -> None:
+def test_the_role_that_each_request_needs(kind: str, method: str, path: str, role: Role | None) -> None:
     assert needed(kind, method, path) is role
 
 
 @given(some.text(max_size=40), some.sampled_from(["POST", "PUT", "DELETE", "PATCH"]))
-def test_whatever_changes_something_needs_a_pilot(rest: str, method: str) -> None:
+def test_every_change_needs_a_pilot(rest: str, method: str) -> None:
     assert needed("http", method, f"/api/recordings/{rest}") is Role.PILOT
 
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wrong token is answered at once: these tests tell many. How long it takes else: ``tests/promises/security``."""
+    """Answer wrong tokens at once, as these tests send many. Their real delay: ``tests/promises/security``."""
     monkeypatch.setattr("skyloop.cockpit.access.LONGEST_S", 0.0)
 
 
@@ -184,14 +184,14 @@ def bearer(token: str) -> dict[str, str]:
 
 
 def ended(client: TestClient, path: str, **more: str) -> int:
-    """The code with which a WebSocket was closed before it said anything."""
+    """Return the code with which a WebSocket was closed before any message."""
     with pytest.raises(WebSocketDisconnect) as end, open_socket(client, path, **more) as socket:
         socket.receive_json()
     return int(end.value.code)
 
 
 @pytest.mark.parametrize("token", [None, "", "wrong", PILOT[:-1], PILOT + "x", PILOT.upper(), "x" * 5000])
-def test_without_the_right_token_there_is_nothing(guarded: TestClient, node: Node, token: str | None) -> None:
+def test_nothing_is_served_without_a_valid_token(guarded: TestClient, node: Node, token: str | None) -> None:
     given = {} if token is None else bearer(token)
     for path in ("/api/drones", "/api/statistics", "/api/recordings", "/api/drones/alpha/parameters"):
         answer = guarded.get(path, headers=given)
@@ -244,7 +244,7 @@ def test_a_pilot_flies_under_a_name(guarded: TestClient, node: Node) -> None:
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
-def test_a_token_is_told_once(guarded: TestClient) -> None:
+def test_a_token_is_sent_once(guarded: TestClient) -> None:
     assert guarded.get("/api/session").json() == {
         "role": None,
         "name": "",
@@ -284,14 +284,14 @@ def test_logging_in_takes_one_kind_of_body(guarded: TestClient, given: dict[str,
     assert guarded.post("/api/login", **given).status_code == status
 
 
-def test_where_no_tokens_are_asked_for_none_are_taken() -> None:
+def test_tokens_are_refused_if_not_configured() -> None:
     with cockpit(fake_fleet({"alpha": FakeDrone()})) as client:
         assert client.post("/api/login", headers=ORIGIN, json={"token": PILOT}).status_code == 404
         assert client.post("/api/logout", headers=ORIGIN, json={}).status_code == 200
         assert client.get("/api/session").json() == {"role": "pilot", "name": "", "login": False, "hint": ""}
 
 
-def test_another_user_of_this_machine_is_nobody() -> None:
+def test_another_user_of_this_machine_is_a_stranger() -> None:
     gate = OpenGate(uid_of=lambda *_: 12345)
     with cockpit(fake_fleet({"alpha": FakeDrone()}), gate) as client:
         assert client.get("/api/drones").status_code == 401
@@ -335,7 +335,7 @@ def test_foreign_requests_change_nothing(client: TestClient, path: str, elsewher
 
 
 def test_a_form_of_a_foreign_page_is_not_understood(client: TestClient) -> None:
-    """Forms can be sent without asking first; what they can send is refused even from here."""
+    """Forms can be sent without asking first; their content types are refused even from here."""
     for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"):
         answer = client.post("/api/recordings", headers={**ORIGIN, "content-type": kind}, content=b'{"drones":[]}')
         assert answer.status_code == 415
@@ -361,7 +361,7 @@ def test_foreign_sockets_are_not_opened(client: TestClient, path: str, elsewhere
 
 
 def test_cookies_do_not_let_foreign_pages_in(guarded: TestClient) -> None:
-    """A browser may send the cookie along; the origin tells who asks."""
+    """A browser may send the cookie along; the origin reveals the sender."""
     guarded.post("/api/login", headers=ORIGIN, json={"token": PILOT})
     for path in STREAMS:
         with (

@@ -1,4 +1,4 @@
-"""Starting and ending the cockpit: what goes wrong is told, who may come in, and it goes away with its parent."""
+"""Starting and ending the cockpit: errors are reported, access is limited, and it ends with its parent."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ OBSERVER = "observer-token-0123456789"
 
 @pytest.fixture(autouse=True)
 def own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Where recordings would go; and a directory of sockets for this test alone."""
+    """Folders for recordings, and a directory of sockets for this test alone."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
 
@@ -57,27 +57,27 @@ def tokens(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::"])
-def test_beyond_loopback_not_everybody_may_come_in(host: str) -> None:
+def test_access_beyond_loopback_is_restricted(host: str) -> None:
     with pytest.raises(UsageError, match="--token-file"):
         serve_cockpit(access=Access(host))
 
 
-def test_what_does_not_go_together_is_told(tmp_path: Path) -> None:
+def test_contradicting_options_are_reported(tmp_path: Path) -> None:
     one = tmp_path / "one"
     for given, said in (
         ({"tls_cert": one}, "--tls-key"),
         ({"tls_key": one}, "--tls-cert"),
         ({"client_ca": one}, "need TLS"),
-        ({"client_ca": one, "tls_cert": one, "tls_key": one, "token_file": one}, "not from both"),
+        ({"client_ca": one, "tls_cert": one, "tls_key": one, "token_file": one}, "not both"),
     ):
         with pytest.raises(UsageError, match=said):
             Access(**given)  # type: ignore[arg-type]
 
 
-def test_files_that_can_not_be_used_are_told(tmp_path: Path, tokens: Path) -> None:
+def test_unusable_files_are_reported(tmp_path: Path, tokens: Path) -> None:
     with pytest.raises(UsageError, match="can't be read"):
         serve_cockpit(access=Access(token_file=tmp_path / "gone"))
-    with pytest.raises(UsageError, match=r"there is no .*gone: make certificate and key"):
+    with pytest.raises(UsageError, match=r"gone.* does not exist: make certificate and key"):
         serve_cockpit(access=Access(token_file=tokens, tls_cert=tmp_path / "gone", tls_key=tokens))
     with pytest.raises(UsageError, match="can't be used for TLS"):
         serve_cockpit(access=Access(token_file=tokens, tls_cert=tokens, tls_key=tokens))
@@ -91,7 +91,7 @@ def test_port_in_use() -> None:
 
 
 @pytest.mark.parametrize("port", [-1, 70000])
-def test_port_that_is_none(port: int) -> None:
+def test_an_invalid_port_is_refused(port: int) -> None:
     with pytest.raises(UsageError, match="can't be used"):
         serve_cockpit(port=port)
 
@@ -118,7 +118,7 @@ def test_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.process
-def test_child_tells_why_it_did_not_start() -> None:
+def test_a_child_reports_why_it_did_not_start() -> None:
     with CockpitProcess("nobody-here") as page, pytest.raises(LinkError, match="no proxy named 'nobody-here'"):
         page.address()
 
@@ -127,13 +127,13 @@ def test_child_tells_why_it_did_not_start() -> None:
 
 
 def on_loopback(address: str) -> str:
-    """The address of a server that listens everywhere, as this machine alone reaches it."""
+    """Return the address of a server that listens everywhere, as reached from this machine."""
     scheme, _, port = address.rpartition(":")
     return f"{scheme.partition('://')[0]}://127.0.0.1:{port}"
 
 
 def test_pages_are_served_while_the_cockpit_warms_up(monkeypatch: pytest.MonkeyPatch, tokens: Path) -> None:
-    """A thread of its own imports what following needs: not the event loop's, on which sticks arrive."""
+    """A separate thread imports the requirements of following: not the event loop's, which receives sticks."""
     begun, go_on = threading.Event(), threading.Event()
 
     def warm_up() -> None:
@@ -183,7 +183,7 @@ def test_a_session_is_valid_after_a_restart(tokens: Path) -> None:
             assert json.load(answer)["name"] == "ann"
 
 
-def test_programs_of_this_user_are_let_in_without_a_word() -> None:
+def test_programs_of_this_user_are_admitted_without_a_token() -> None:
     with served() as address:
         assert ask(address, "/api/session") == {"role": "pilot", "name": "", "login": False, "hint": ""}
         request = urllib.request.Request(f"{address}/api/session", headers={"X-Forwarded-For": "192.0.2.1"})
@@ -201,7 +201,7 @@ def test_its_metrics(capfd: pytest.CaptureFixture[str]) -> None:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An authority, a server, a pilot, an observer, somebody without a role, and a pilot of another authority."""
+    """An authority, a server, a pilot, an observer, a person without a role, and a pilot of another authority."""
     if shutil.which("openssl") is None:
         pytest.skip("makes certificates with openssl, which is not here")
     folder = tmp_path_factory.mktemp("tls")
@@ -277,7 +277,7 @@ def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
             assert "Secure" in answer.headers["Set-Cookie"]
 
 
-def test_https_with_a_certificate_of_its_own(
+def test_https_with_a_generated_certificate(
     tmp_path: Path, tokens: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     access = with_certificate(Access(token_file=tokens), tmp_path / "keys" / "pages")
@@ -318,7 +318,7 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
             assert isinstance(frame, bytes)
             assert frame[-2:] == b"\xff\xd9", "a whole JPEG file"
             with pytest.raises(TimeoutError):
-                video.recv(0.3)  # three more were taken: none is sent before the first is acknowledged
+                video.recv(0.3)  # three more were captured: none is sent before the first is acknowledged
             video.send(json.dumps({"ack": 1}))
             assert isinstance(video.recv(5), bytes)
         for foreign in (Origin("http://evil.example"), None):
@@ -348,7 +348,7 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
 
 
 @pytest.mark.process
-def test_the_process_keeps_the_priority_of_those_who_fly(tmp_path: Path) -> None:
+def test_the_process_keeps_its_priority(tmp_path: Path) -> None:
     """A person's sticks pass through it."""
     with CockpitProcess(recordings=tmp_path / "here") as page:
         page.address()
@@ -358,7 +358,7 @@ def test_the_process_keeps_the_priority_of_those_who_fly(tmp_path: Path) -> None
     assert not Path(f"/proc/{pid}").exists()
 
 
-def test_what_encodes_pictures_makes_room_for_those_who_fly() -> None:
+def test_encoding_threads_have_a_lower_priority() -> None:
     usual = os.getpriority(os.PRIO_PROCESS, 0)
     assert _ENCODER.submit(os.getpriority, os.PRIO_PROCESS, 0).result(5) == usual + NICENESS
     assert os.getpriority(os.PRIO_PROCESS, 0) == usual

@@ -1,4 +1,4 @@
-"""A page in control that is silent is a silent pilot: hover, then landing, as for any program."""
+"""A silent page in control is a silent pilot: hover, then landing, as for any program."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ S = 1_000_000_000
 
 
 class Flown:
-    """A pilot's connection over a link that is always up, on a clock of its own: what it sends and asks."""
+    """A pilot's connection over a link that is always up, with its own clock: what it sends and requests."""
 
     def __init__(self) -> None:
         self.now_ns = 100 * S
@@ -68,7 +68,7 @@ class Flown:
         self.pilot._authority.granted(lease, self.now_ns)
 
     def goes_on(self, seconds: float, step_s: float = 0.02) -> list[Command]:
-        """What is sent meanwhile."""
+        """Collect everything sent during the block."""
         before = len(self.sent)
         for _ in range(round(seconds / step_s)):
             self.now_ns += round(step_s * S)
@@ -85,7 +85,7 @@ class Flown:
         self.asked.append(wish)
 
 
-def test_nothing_is_repeated_for_a_page_that_is_not_known_to_be_there() -> None:
+def test_nothing_is_repeated_for_an_absent_page() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)
@@ -95,7 +95,7 @@ def test_nothing_is_repeated_for_a_page_that_is_not_known_to_be_there() -> None:
     assert flown.goes_on(60.0) == [], "silent: to the proxy, too"
 
 
-def test_a_page_that_is_heard_goes_on_and_nothing_from_before_its_silence_does() -> None:
+def test_a_returning_page_continues_without_its_earlier_commands() -> None:
     flown = Flown()
     flown.hold(5)
     for _ in range(10):
@@ -136,7 +136,7 @@ def test_what_a_person_ended_the_flight_with_in_the_silence_is_repeated_when_it_
     assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(action, False)}
 
 
-def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:
+def test_older_news_never_overrides_newer_news() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)
@@ -144,7 +144,7 @@ def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:
     assert flown.goes_on(1.5)
 
 
-def test_an_emergency_stop_goes_out_whoever_is_silent() -> None:
+def test_an_emergency_stop_is_sent_even_for_a_silent_page() -> None:
     flown = Flown()
     flown.hold(5)
     flown.goes_on(10.0)
@@ -152,7 +152,7 @@ def test_an_emergency_stop_goes_out_whoever_is_silent() -> None:
     assert flown.sent[-1].action == EmergencyStop()
 
 
-def test_control_that_ran_out_is_not_asked_for_again_by_itself() -> None:
+def test_expired_control_is_not_requested_again_automatically() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.disconnected()
@@ -168,7 +168,7 @@ def test_control_that_ran_out_is_not_asked_for_again_by_itself() -> None:
     assert flown.pilot.status.state == "none"
 
 
-def test_a_program_that_flies_itself_is_always_there() -> None:
+def test_a_program_always_counts_as_present() -> None:
     flown = Flown()
     flown.pilot._authority.renews = True
     flown.pilot._present_until_ns = None
@@ -181,7 +181,7 @@ def test_a_program_that_flies_itself_is_always_there() -> None:
 
 
 def quick(node: Node) -> None:
-    """As a lab may set it, and so that this test is quick."""
+    """As a lab may set it, and to keep this test quick."""
     with node.connect("lab", on_exit="hover") as lab:
         lab.config["authority.timeout_s"] = 0.3
         lab.config["failsafe.hover_after_s"] = 0.2
@@ -196,7 +196,7 @@ def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClien
             pilot.take_off()
             pilot.say("fly", forward=0.3)
             until(lambda: node.flyer.state is FlightState.FLYING)
-            until(lambda: node.flyer.state is FlightState.HOVERING)  # nothing more came by the sticks
+            until(lambda: node.flyer.state is FlightState.HOVERING)  # no more stick commands arrived
             time.sleep(0.6)  # longer than the proxy waits here
             assert watcher.feedback().lease, "a page that pings keeps control while it hovers"
         silent_s = time.monotonic()
@@ -210,7 +210,7 @@ def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClien
         assert not watcher.feedback().lease, "it does not come back by itself"
 
 
-def test_a_page_that_pings_and_hears_nothing_is_silent_too(client: TestClient, node: Node) -> None:
+def test_a_page_that_pings_without_receiving_is_silent_too(client: TestClient, node: Node) -> None:
     quick(node)
     with page(client) as pilot:
         pilot.take().take_off()

@@ -1,4 +1,4 @@
-"""Small video of many drones over one socket: encoded once per size, at a limited rate; a slow page holds nobody up."""
+"""Small video of many drones over one socket: encoded once per size, at a limited rate; slow pages delay no others."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def subscribed(drone: FakeDrone, count: int = 1) -> None:
 
 
 @pytest.mark.parametrize(("wish", "width"), [(0, 160), (160, 160), (161, 240), (250, 320), (480, 480), (5000, 480)])
-def test_a_wish_is_rounded_up_to_a_size_that_others_may_share(wish: int, width: int) -> None:
+def test_a_width_is_rounded_up_to_a_shared_size(wish: int, width: int) -> None:
     assert rounded_width(wish) == width
 
 
@@ -94,7 +94,7 @@ def test_each_frame_is_encoded_once_per_size(client: TestClient, drones: dict[st
         assert client.get("/api/statistics").json()["frames_encoded"] == 2
 
 
-def test_a_page_that_draws_nothing_gets_nothing_more_and_holds_nobody_up(
+def test_a_page_that_stops_drawing_gets_no_more_and_delays_no_others(
     client: TestClient, drones: dict[str, FakeDrone]
 ) -> None:
     alpha = drones["alpha"]
@@ -111,13 +111,13 @@ def test_a_page_that_draws_nothing_gets_nothing_more_and_holds_nobody_up(
             if not drawn:
                 head, (picture,) = unpack(slow.receive_bytes())
                 drawn = head["ack"]
-        slow.send_json({"ack": drawn + 7})  # of a message that it never got
+        slow.send_json({"ack": drawn + 7})  # for a message it never received
         slow.send_json({"ack": drawn})
         head, (picture,) = unpack(slow.receive_bytes())
         assert picture.mean() == pytest.approx(110, abs=2), "the newest, and none between"
 
 
-def test_what_is_out_of_sight_rests(client: TestClient, drones: dict[str, FakeDrone]) -> None:
+def test_hidden_cameras_are_not_encoded(client: TestClient, drones: dict[str, FakeDrone]) -> None:
     alpha, beta = drones.values()
     with video(client) as socket:
         for name, drone in drones.items():
@@ -130,7 +130,7 @@ def test_what_is_out_of_sight_rests(client: TestClient, drones: dict[str, FakeDr
     subscribed(beta, 0)
 
 
-def test_a_drone_that_is_not_there_yet_is_shown_when_it_comes(client: TestClient, drones: dict[str, FakeDrone]) -> None:
+def test_a_drone_appears_when_it_is_found(client: TestClient, drones: dict[str, FakeDrone]) -> None:
     with video(client) as socket:
         show(socket, "gamma")
         show(socket, "alpha", camera="none of that name")
@@ -141,7 +141,7 @@ def test_a_drone_that_is_not_there_yet_is_shown_when_it_comes(client: TestClient
 
 
 @pytest.mark.parametrize("message", ["", "[]", '{"show":3}', '{"show":{"drone":"a"}}', '{"look":1}', '{"ack":"x"}'])
-def test_what_makes_no_sense_ends_it(client: TestClient, message: str) -> None:
+def test_nonsense_ends_the_connection(client: TestClient, message: str) -> None:
     with video(client) as socket:
         socket.send_text(message)
         closed = socket.receive()
@@ -149,7 +149,7 @@ def test_what_makes_no_sense_ends_it(client: TestClient, message: str) -> None:
         assert "not understood" in closed["reason"]
 
 
-def test_a_page_shows_so_many_and_not_more(client: TestClient) -> None:
+def test_the_number_of_cameras_on_a_page_is_limited(client: TestClient) -> None:
     with video(client) as socket:
         for number in range(MAX_SHOWN + 1):
             show(socket, f"drone{number}")

@@ -1,4 +1,4 @@
-"""The emergency stop of a page: nothing that the page does besides can lose it, and "done" means that it shows."""
+"""A page's emergency stop: no other action of the page can lose it, and "done" means that the vehicle shows it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.testclient import TestClient
 
 @contextmanager
 def sticks_held(pilot: Page) -> Iterator[None]:
-    """As a gamepad's pilot presses it: the sticks stay where they are, twenty times a second."""
+    """Press like a gamepad's pilot: the sticks stay deflected, twenty times a second."""
     ended = threading.Event()
 
     def hold() -> None:
@@ -37,7 +37,7 @@ def sticks_held(pilot: Page) -> Iterator[None]:
 
 
 def test_a_stop_whose_first_packets_are_lost_comes_while_the_sticks_are_held(client: TestClient, node: Node) -> None:
-    """Sticks that are held took the place of the stop: one lost packet, and it flew on, told as done."""
+    """Held sticks replaced the stop: after one lost packet it flew on, while the page reported it as done."""
     with page(client) as pilot:
         pilot.take().take_off()
         with sticks_held(pilot):
@@ -57,7 +57,7 @@ def test_a_stop_whose_first_packets_are_lost_comes_while_the_sticks_are_held(cli
 def test_sticks_that_a_stop_overtakes_are_refused_and_the_stop_is_not(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A set-point under way was refused for the stop's sake, and the page was told that the stop was refused."""
+    """A set-point under way was refused because of the stop, and the page reported the stop as refused."""
     asked: list[int] = []
 
     def overtaken(pilot: PilotConnection, first: int) -> Outcome | None:
@@ -80,7 +80,7 @@ def test_sticks_that_a_stop_overtakes_are_refused_and_the_stop_is_not(
 def test_a_stop_that_does_not_show_is_never_done_and_the_drone_hovers(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The page said "done" of a stop of which nothing had come."""
+    """The page said "done" for a stop without any effect."""
     monkeypatch.setattr(station, "SHOWN_S", 0.5)
     with page(client) as pilot:
         pilot.take().take_off()
@@ -113,7 +113,7 @@ def test_a_stop_of_all_silences_the_sticks_of_every_page(client: TestClient, nod
     assert count(node, EmergencyStop()) >= 1
 
 
-def test_a_fault_in_what_a_page_flies_keeps_no_stop_away(
+def test_a_fault_in_a_session_does_not_prevent_a_stop(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(self: ControlSession, why: str) -> None:
@@ -128,7 +128,7 @@ def test_a_fault_in_what_a_page_flies_keeps_no_stop_away(
         assert node.flyer.state is FlightState.EMERGENCY
 
 
-def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(
+def test_a_stop_refused_by_the_vehicle_is_reported_with_its_reason(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(station, "SHOWN_S", 0.5)
@@ -149,7 +149,7 @@ def test_a_stop_that_the_vehicle_refuses_is_told_with_its_reason(
             pilot.wait("done", do="land")
 
 
-def test_a_stop_that_the_vehicle_cannot_do_is_told_at_once_and_the_drone_hovers(
+def test_an_unsupported_stop_is_reported_at_once_and_the_drone_hovers(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def cannot(_: object) -> bool:

@@ -1,4 +1,4 @@
-"""Asking for control before it is taken: pages on both sides, over a real proxy; and what is decided without one."""
+"""Asking for control before it is taken: pages on both sides, over a real proxy; and pure decisions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ S = 1_000_000_000
 
 @contextmanager
 def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) -> Iterator[Drone]:
-    """A program that asks for the drone and waits in line."""
+    """A program that asks for the drone and waits in the queue."""
     asking = Authority(priority=priority, takeover="ask", stay=True, **options)
     drone = open_drone(node.dial, app=app, authority=asking)
     try:
@@ -36,13 +36,13 @@ def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) 
 
 
 def question(pilot: Page) -> dict[str, Any]:
-    """The only one that the page is asked."""
+    """Return the page's only open question."""
     [asked] = pilot.wait("asked")["questions"]
     return dict(asked)
 
 
 def waits(pilot: Page, **values: Any) -> dict[str, Any]:
-    """What the page is told next of its place in the line, with these values."""
+    """Return the page's next message about its place in the queue with these values."""
     while True:
         line = pilot.wait("authority")["line"] or {}
         if values.items() <= line.items():
@@ -80,7 +80,7 @@ def test_a_page_that_flies_is_asked_and_hands_over(client: TestClient, node: Nod
         pilot.wait("authority", mine=True, line=None)  # the program has ended
 
 
-def test_a_page_keeps_it_and_says_why(client: TestClient, node: Node) -> None:
+def test_a_page_keeps_control_with_a_reason(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take(8)
         with asks(node) as drone:
@@ -93,13 +93,13 @@ def test_a_page_keeps_it_and_says_why(client: TestClient, node: Node) -> None:
             assert drone.authority.state == "queued"
         pilot.wait("asked", questions=[])  # it has left
         pilot.say("answer", id=drone.app_id, grant=True)
-        assert "nobody asks" in pilot.wait("refused", do="answer")["why"]
+        assert "no longer open" in pilot.wait("refused", do="answer")["why"]
         pilot.say("hover")
         pilot.wait("done", do="hover")
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_a_higher_priority_has_it_when_the_time_is_over(client: TestClient, node: Node, answers: bool) -> None:
+def test_a_higher_priority_gets_control_when_the_time_is_up(client: TestClient, node: Node, answers: bool) -> None:
     with page(client) as pilot:
         pilot.take(8).say("set", name="authority.ask_s", value=0.5)
         pilot.wait("done", do="set")
@@ -111,7 +111,7 @@ def test_a_higher_priority_has_it_when_the_time_is_over(client: TestClient, node
             assert {"type": "asked", "questions": []} in pilot.told
 
 
-def test_one_that_is_no_higher_asks_no_more_when_the_time_is_over(client: TestClient, node: Node) -> None:
+def test_an_equal_priority_stops_asking_when_the_time_is_up(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take(8).say("set", name="authority.ask_s", value=0.2)
         pilot.wait("done", do="set")
@@ -123,7 +123,7 @@ def test_one_that_is_no_higher_asks_no_more_when_the_time_is_over(client: TestCl
             assert drone.authority.state == "queued"
 
 
-def test_several_ask_and_the_first_in_line_has_it(client: TestClient, node: Node) -> None:
+def test_the_first_of_several_in_line_gets_control(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take(4)
         with asks(node, "late.py", priority=10) as late:
@@ -143,7 +143,7 @@ def test_only_who_has_control_can_answer(client: TestClient, node: Node) -> None
         assert drone.authority.state == "queued"
 
 
-def test_who_releases_is_asked_no_more(client: TestClient, node: Node) -> None:
+def test_a_release_withdraws_the_questions(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take(8)
         with asks(node) as drone:
@@ -153,10 +153,10 @@ def test_who_releases_is_asked_no_more(client: TestClient, node: Node) -> None:
             until(lambda: drone.authority.state == "held")
 
 
-def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
+def test_control_taken_after_a_failed_handover_counts_as_lost(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who is pre-empted was told, as of something that went well, to have handed control over."""
+    """A pre-empted pilot's page reported, as a success, that it had handed control over."""
     monkeypatch.setattr(PilotConnection, "answer_takeover", lambda *_: None)
     monkeypatch.setattr(takeover, "GIVEN_S", 0.0)
     with page(client) as pilot:
@@ -172,10 +172,10 @@ def test_control_that_was_offered_in_vain_and_taken_later_is_lost_all_the_same(
             assert not told["given"]
 
 
-def test_control_that_is_gone_before_the_answer_has_arrived_was_given(
+def test_control_that_leaves_before_the_answer_counts_as_handed_over(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One time in four the page that gave it was told that it had lost control."""
+    """One time in four the page that gave control away reported that it had lost it."""
     answer, gone = PilotConnection.answer_takeover, threading.Event()
 
     def late(pilot: PilotConnection, lease: int, app_id: int, grant: bool, reason: str) -> None:
@@ -195,10 +195,10 @@ def test_control_that_is_gone_before_the_answer_has_arrived_was_given(
 # Asking ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_page_asks_first_and_is_given_it(client: TestClient, node: Node) -> None:
+def test_a_page_asks_first_and_gets_control(client: TestClient, node: Node) -> None:
     with node.connect("demo") as demo, page(client) as pilot:
         demo.on_takeover(lambda request: request.by.startswith("cockpit") and request.priority == 20)
-        pilot.say("take", priority=20, ask=True)  # no higher than the holder's, which would be refused without asking
+        pilot.say("take", priority=20, ask=True)  # not higher than the holder's, which would be refused without asking
         assert pilot.wait("authority", mine=True)["line"] is None
         until(lambda: demo.authority.state == "preempted")
         pilot.say("release")
@@ -227,8 +227,8 @@ def test_a_page_that_asked_takes_over_when_it_can_wait_no_longer(client: TestCli
         pilot.take(8)
 
 
-def test_who_presses_take_control_in_line_stays_there_unless_it_has_it(client: TestClient, node: Node) -> None:
-    """The page left the line without a word: the press was refused, and with it went its connection."""
+def test_pressing_take_control_in_line_keeps_the_place(client: TestClient, node: Node) -> None:
+    """The page left the queue silently: the press was refused, and its connection closed with it."""
     with node.connect("demo", priority=4) as demo, page(client) as pilot:
         demo.on_takeover(lambda _: "measuring")
         pilot.say("take", priority=8, ask=True)
@@ -236,7 +236,7 @@ def test_who_presses_take_control_in_line_stays_there_unless_it_has_it(client: T
         pilot.say("take", priority=8)
         why = pilot.wait("refused", do="take")["why"]
         assert "demo has control with priority 4" in why
-        assert "you keep your place in line" in why
+        assert "you stay in the queue" in why
         pilot.say("ping")
         pilot.wait("pong")
         assert [told["state"] for told in pilot.told if told["type"] == "authority"][-1] == "queued"
@@ -256,7 +256,7 @@ def test_every_page_knows_which_pages_wait(client: TestClient, node: Node) -> No
             one.wait("authority", waiting=[])
 
 
-def test_a_page_that_dies_waits_no_more(client: TestClient, node: Node) -> None:
+def test_a_closed_page_leaves_the_line(client: TestClient, node: Node) -> None:
     with page(client) as first:
         first.take(8)
         with page(client) as second:
@@ -266,7 +266,7 @@ def test_a_page_that_dies_waits_no_more(client: TestClient, node: Node) -> None:
         first.wait("asked", questions=[])
 
 
-def test_a_free_drone_is_had_at_once(client: TestClient, node: Node) -> None:
+def test_a_free_drone_is_taken_at_once(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.say("take", priority=8, ask=True)
         pilot.wait("authority", mine=True)
@@ -282,7 +282,7 @@ def test_a_free_drone_is_had_at_once(client: TestClient, node: Node) -> None:
         '{"do":"answer","id":1,"grant":false,"reason":"' + "x" * 201 + '"}',
     ],
 )
-def test_what_makes_no_sense_is_no_order(text: str) -> None:
+def test_nonsense_is_not_a_command(text: str) -> None:
     with pytest.raises(DecodeError, match="not understood"):
         decode_command(text)
 
@@ -322,7 +322,7 @@ def test_questions_come_and_go() -> None:
     assert questions.to_json(20 * S) == {"type": "asked", "questions": []}
 
 
-def test_a_place_in_line_is_the_same_until_there_is_news() -> None:
+def test_a_place_in_line_is_stable_between_updates() -> None:
     line = QueueTracker()
     assert line.update(AuthorityStatus(), 0) is None
     line.request(ask=True)

@@ -1,4 +1,4 @@
-"""What pages are told, as pure functions."""
+"""The values for pages, as pure functions."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_numbers_are_finite_and_short(value: float) -> None:
     assert number(None) is None
 
 
-def test_what_is_not_known_is_null_and_not_zero() -> None:
+def test_unknown_values_are_null_not_zero() -> None:
     values = feedback_values(flying(), 1_000_000_001)
     assert (values["roll"], values["velocity"], values["position"]) == (None, None, None)
     assert values["age_s"] == 1.0
@@ -61,7 +61,7 @@ def test_what_is_not_known_is_null_and_not_zero() -> None:
     assert set(motion_values(None)) == set(motion)
 
 
-def test_every_number_has_a_name_of_its_own() -> None:
+def test_every_number_has_a_unique_name() -> None:
     feedback = flying(
         yaw_rad=1.0,
         velocity_m_s=(3.0, 4.0, 0.0),

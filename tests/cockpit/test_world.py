@@ -1,4 +1,4 @@
-"""What maps show around a drone: the world as a parameter, and as pages get it."""
+"""A drone's surroundings on maps: the world as a parameter, and as sent to pages."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def test_a_world_survives_its_text(name: str) -> None:
     assert decode_world(text) == world
 
 
-def test_a_replay_shows_what_stood_around_the_recorded_flight() -> None:
-    """Its map was empty: the recorded parameters have a prefix, and those without are of the replay's own proxy."""
+def test_a_replay_shows_the_surroundings_of_the_recorded_flight() -> None:
+    """Its map was empty: recorded parameters have a prefix, and those without belong to the replay's own proxy."""
     world = geometry_of(load_world("gates"))
     drone = drone_with(
         recorded__world__geometry=encode_world(world),
@@ -59,7 +59,7 @@ def test_a_replay_shows_what_stood_around_the_recorded_flight() -> None:
     assert values["limits"]["speed"] == 2.0
 
 
-def test_a_world_that_is_too_large_says_what_is_missing() -> None:
+def test_a_truncated_world_names_the_missing_parts() -> None:
     solids = tuple(Solid(f"crate {number}", (1.0, 2.0, 0.5), (1.0, 1.0, 1.0)) for number in range(250))
     fitted = decode_world(encode_world(WorldGeometry("large", solids=solids)))
     assert 0 < len(fitted.solids) < 250
@@ -67,7 +67,7 @@ def test_a_world_that_is_too_large_says_what_is_missing() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"solids": [["a", [1, 2], [1, 1, 1]]]}', '{"low": [1e999, 0, 0]}'])
-def test_what_is_no_world_is_refused(text: str) -> None:
+def test_an_invalid_world_is_refused(text: str) -> None:
     with pytest.raises(msgspec.DecodeError):
         decode_world(text)
     assert world_values(drone_with(world__geometry=text), None)["source"] is None
@@ -90,7 +90,7 @@ def test_pages_get_the_world_and_where_it_may_fly() -> None:
     assert msgspec.json.encode(values)
 
 
-def test_the_cockpits_own_world_is_for_drones_that_know_none() -> None:
+def test_the_cockpits_world_is_for_drones_without_one() -> None:
     assert world_values(drone_with(), WorldGeometry("hall"))["source"] == "file"
     nothing = world_values(drone_with(safety__zones="a driver's own notion"), None)
     assert (nothing["source"], nothing["room"], nothing["zones"], nothing["box"]) == (None, None, [], None)
@@ -106,7 +106,7 @@ def test_the_cockpits_own_world_is_for_drones_that_know_none() -> None:
         ((0.0, 0.0, 9.0), "limits.altitude"),
     ],
 )
-def test_what_speaks_against_a_place(place: tuple[float, float, float], words: str) -> None:
+def test_reasons_against_a_place(place: tuple[float, float, float], words: str) -> None:
     drone = drone_with(safety__zones="cylinder 2 0 0.5 0 3", safety__box__y_high=4.0, limits__altitude=5.0)
     problem = way_values(drone, place)["problem"]
     assert words in problem
@@ -126,7 +126,7 @@ def test_where_a_camera_looks() -> None:
 
 
 @pytest.mark.parametrize("to", ["", "1,2", "1,2,x", "1,2,nan", "1,2,3,4", "inf,0,0"])
-def test_a_place_that_is_none_is_refused(to: str) -> None:
+def test_an_invalid_place_is_refused(to: str) -> None:
     with cockpit(fake_fleet({"alpha": FakeDrone()})) as client:
         answer = client.get(f"/api/drones/alpha/way?to={to}")
         assert answer.status_code == 400

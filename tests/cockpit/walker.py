@@ -1,4 +1,4 @@
-"""A person who walks away from a simulated drone, and where a page has to drag a box around them."""
+"""A person who walks away from a simulated drone, and the place for a page's box around them."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ path = { kind = "waypoints", points = [[-3, -0.4, 0], [6, -0.4, 0], [6, 0.6, 0],
 
 
 class Walker:
-    """The world in a file, its address, and the person's true place in it.
+    """Write the world file; return its address, and the person's true place in it.
 
     Args:
-        folder: Of the file.
-        seed: Of the world.
+        folder: The folder of the file.
+        seed: The seed of the world.
     """
 
     def __init__(self, folder: Path, seed: int = 1) -> None:
@@ -60,7 +60,7 @@ class Walker:
         self._tracks = [TargetTrack(one, world.seed, n) for n, one in enumerate(world.targets)]
 
     def box(self, state: Feedback) -> Box:
-        """The person's box in the picture that the front camera takes now: x, y, width, height [px]."""
+        """Return the person's box in the front camera's picture now: x, y, width, height [px]."""
         native: dict[str, Any] = dict(state.native or {})
         body = np.array([float(native[f"truth.{axis}"]) for axis in "xyz"])
         turn = rotation_from_euler(*(float(native[f"truth.{axis}"]) for axis in ("roll", "pitch", "yaw")))

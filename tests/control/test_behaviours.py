@@ -137,7 +137,7 @@ def test_how_a_landing_ended_is_judged_by_the_truth(script: ModuleType) -> None:
     assert end((flying, 0.0, 0.1, 0.3), (landed, 0.1, 0.06, 0.26)) == ""
     assert end((flying, 3.0, 0.3, 0.5), (landed, 3.0, -0.14, 0.06)) == "", "on the floor"
     assert end((FlightState.HOVERING, 20.0, 2.4, 2.6)) == ""
-    assert end((flying, 0.4, 0.2, 0.4)) == "flies on at 0.4 m"
+    assert end((flying, 0.4, 0.2, 0.4)) == "still flies at 0.4 m"
     assert end((landed, 0.1, 0.3, 0.5), (landed, 2.0, -0.14, 0.06)) == "stopped its motors in the air"
     assert end((landed, 0.5, 0.06, 0.26), (landed, 0.9, -0.14, 0.06)) == "fell off the platform"
     assert end((FlightState.EMERGENCY, 0.5, 0.06, 0.26), (landed, 0.5, 0.06, 0.26)) == "crashed"

@@ -47,7 +47,7 @@ def test_the_reference_has_each_command_with_its_options() -> None:
     assert set(COMMANDS) <= set(sections)
     assert ".. option:: --seconds N" in sections["demo"]
     assert ".. option:: --json" in sections["log recover"]
-    assert "asks before, except with ``--yes``" in sections["stop"]
+    assert "asks first, except with ``--yes``" in sections["stop"]
     assert "   skyloop land [OPTIONS] NAME..." in sections["land"]
     assert "Show this message" not in text
     assert str(Path.home()) not in text, "it is the same on each machine"

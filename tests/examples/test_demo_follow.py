@@ -70,7 +70,7 @@ def test_the_table_shows_known_and_unknown_figures() -> None:
         Console(file=text, width=160).print(report.table())
         return text.getvalue()
 
-    assert "nobody was found" in shown(FollowReport("detector", 4.0))
+    assert "no one was found" in shown(FollowReport("detector", 4.0))
     report = FollowReport("detector", 4.0, target="anna", frames=10, in_view=10, found=9, errors_m=[0.1, -0.3, 0.1])
     for words in ("anna, by detector", "100.0% of 10 frames", "90.0%", "median 4.10 m, wanted 4 m; off by 0.10 m"):
         assert words in shown(report)
@@ -114,7 +114,7 @@ def test_without_scipy_or_onnx_runtime_there_is_no_detector(monkeypatch: pytest.
 @pytest.mark.process
 def test_errors_are_reported_before_take_off() -> None:
     for words, said in (
-        (("--world", "empty"), "nobody walks about in the world 'empty'"),
+        (("--world", "empty"), "no one walks in the world 'empty'"),
         (("--world", "prak"), "did you mean 'park'"),
         (("--distance", "1"), "must be above nearest_m"),
     ):

@@ -11,7 +11,7 @@ from tests.host.fleet import Hosting
 
 @pytest.fixture(autouse=True)
 def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A directory of sockets and one of state of their own, with short paths."""
+    """Use separate directories for sockets and state, with short paths."""
     with TemporaryDirectory(prefix="skyloop-") as directory:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", f"{directory}/run")
         monkeypatch.setenv("XDG_STATE_HOME", f"{directory}/state")

@@ -1,4 +1,4 @@
-"""A host in this process whose vehicles can be made to hang and to raise, and pilots of them."""
+"""A host in this process whose vehicles can be made to hang and fail, and their pilots."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PATIENT: dict[str, Value] = {"failsafe.hover_after_s": 1.5, "authority.timeout_s
 
 
 class Vehicle(FakeDriver):
-    """Lands at once; hangs in the calls that are named, until it is let go."""
+    """Lands at once; hangs in the named calls until released."""
 
     def __init__(self) -> None:
         super().__init__(monotonic_ns)
@@ -60,7 +60,7 @@ class Vehicle(FakeDriver):
 
 
 class Hosting:
-    """A host, its drivers by name, and the applications that are connected to it."""
+    """A host, its drivers by name, and the applications connected to it."""
 
     def __init__(self) -> None:
         self.drivers: dict[str, Vehicle] = {}
@@ -78,7 +78,7 @@ class Hosting:
         for app in self._apps:
             app.end.close()
         until_s = time.monotonic() + 1.0
-        for thread in threading.enumerate():  # of what hung: it goes on now, and its folders are removed after this
+        for thread in threading.enumerate():  # hung threads continue now, before their directories are removed
             if thread.name == "skyloop-abandoned":
                 thread.join(max(0.0, until_s - time.monotonic()))
 
@@ -86,7 +86,7 @@ class Hosting:
         return self.drivers[address.place]
 
     def vehicle(self, name: str) -> Vehicle:
-        """A driver for a vehicle of this name, which is not served yet."""
+        """Return a driver for a vehicle of this name, not yet served."""
         return self.drivers.setdefault(name, Vehicle())
 
     def add(self, name: str) -> Vehicle:
@@ -100,14 +100,14 @@ class Hosting:
         return VehicleSettings(name, parse_uri(f"fake://{name}"), presets=PATIENT)
 
     def app(self, name: str, role: Role = Role.OBSERVER) -> App:
-        """An application at a vehicle."""
+        """Connect an application to a vehicle."""
         app = App(dial(name), monotonic_ns)
         self._apps.append(app)
         app.hello("pilot" if role is Role.PILOT else "witness", role)
         return app
 
     def airborne(self, name: str) -> App:
-        """A pilot whose vehicle hovers."""
+        """Connect a pilot whose vehicle hovers."""
         app = self.app(name, Role.PILOT)
         app.take_authority()
         app.command(Takeoff())
@@ -124,7 +124,7 @@ class Hosting:
 
 
 class Flight:
-    """Flies a vehicle with set-points at 32 Hz on a thread of its own, and notes what the proxy did by itself."""
+    """Flies a vehicle with set-points at 32 Hz on a thread, and records the proxy's own actions."""
 
     def __init__(self, hosting: Hosting, name: str) -> None:
         self.driver = hosting.drivers[name]
@@ -135,7 +135,7 @@ class Flight:
 
     def __enter__(self) -> Flight:
         self._thread.start()
-        wait_until(lambda: self.flown > 3, "it is flown")
+        wait_until(lambda: self.flown > 3, "it flies")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -144,7 +144,7 @@ class Flight:
 
     @property
     def flown(self) -> int:
-        """How many set-points the vehicle has got."""
+        """Return the number of set-points that the vehicle received."""
         return sum(isinstance(action, Velocity) for action in list(self.driver.told))
 
     @property
@@ -152,9 +152,9 @@ class Flight:
         return [event.text for event in self.pilot.events if event.kind is EventKind.FAILSAFE]
 
     def goes_on(self) -> None:
-        """Wait until it has got more set-points, none of them by a failsafe."""
+        """Wait until it has received more set-points, none of them from a failsafe."""
         before = self.flown
-        wait_until(lambda: self.flown > before + 10, "it is flown on")
+        wait_until(lambda: self.flown > before + 10, "it keeps flying")
         assert self.failsafes == []
         assert self.pilot.feedback[-1].failsafe is Failsafe.NONE
         assert self.pilot.closed_by.empty()
@@ -166,14 +166,14 @@ class Flight:
 
 
 def closing_reason(app: App) -> str:
-    """Wait until a proxy has ended, and return why as it published."""
-    wait_until(lambda: not app.closed_by.empty(), "its connection was ended")
+    """Wait until a proxy has ended, and return its published reason."""
+    wait_until(lambda: not app.closed_by.empty(), "its connection ended")
     (event,) = [event for event in app.events if event.kind is EventKind.PROXY_CLOSING]
     return event.text
 
 
 def in_time(call: Callable[[], object], seconds: float) -> float:
-    """Return how long a call took [s]; it must not take longer than so long."""
+    """Return how long a call took [s]; it must not exceed this limit."""
     began_s = time.monotonic()
     call()
     took_s = time.monotonic() - began_s

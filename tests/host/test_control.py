@@ -34,7 +34,7 @@ from tests.host.fleet import Hosting
 @pytest.fixture
 def served(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosting]:
     """A host whose control socket is named ``host``."""
-    monkeypatch.setattr("skyloop.host.fleet.driver_class", lambda scheme: scheme)  # there is no driver of fake://
+    monkeypatch.setattr("skyloop.host.fleet.driver_class", lambda scheme: scheme)  # fake:// has no driver
     server = ControlServer("host", Answering(hosting.host, Defaults(limits=FlightLimits(speed=0.5))))
     server.start()
     yield hosting
@@ -49,7 +49,7 @@ def skyloop(*words: str) -> int:
     return ended.value.code or 0
 
 
-def test_vehicles_come_and_go(served: Hosting) -> None:
+def test_vehicles_join_and_leave(served: Hosting) -> None:
     served.vehicle("alpha")
     (row,) = ask("host", AddNamed("alpha", "fake://alpha")).vehicles
     assert (row.name, row.condition, row.process) == ("alpha", "running", "shared")
@@ -65,13 +65,13 @@ def test_vehicles_come_and_go(served: Hosting) -> None:
     assert ask("host", AddNamed("alpha")).vehicles[0].condition == "running"
 
 
-def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
+def test_errors_are_raised_again_at_the_client(served: Hosting) -> None:
     served.add("alpha")
     with pytest.raises(UsageError, match="did you mean 'alpha'"):
         ask("host", Remove("alpa"))
-    with pytest.raises(UsageError, match="runs already"):
+    with pytest.raises(UsageError, match="is already running"):
         ask("host", AddNamed("alpha"))
-    with pytest.raises(NameTakenError, match="has a vehicle named 'alpha' already"):
+    with pytest.raises(NameTakenError, match="already has a vehicle named 'alpha'"):
         ask("host", AddNamed("alpha", "fake://alpha"))
     with pytest.raises(UsageError, match="lower-case"):
         ask("host", AddNamed("Al Pha", "fake://alpha"))
@@ -81,13 +81,13 @@ def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
     assert refused.value.code == "flown"
 
 
-def test_garbage_and_callers_who_ask_nothing_do_no_harm(served: Hosting) -> None:
+def test_garbage_and_silent_callers_do_no_harm(served: Hosting) -> None:
     for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * serve.MAX_PACKET):
         sock = connect(find_directory(None, HOST).socket_path("host"))
         if packet:
             sock.send(packet)
             answer = msgspec.json.decode(sock.recv(1 << 16), type=Answer)
-            assert "not understood" in answer.error
+            assert "malformed request" in answer.error
         sock.hang_up()
     assert ask("host", Status()).vehicles == ()
 
@@ -99,13 +99,13 @@ def test_a_large_answer_arrives_whole(served: Hosting) -> None:
     assert len(ask("host", Status()).vehicles) == 600
 
 
-def test_others_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_users_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serve, "may_connect", lambda sock, gid: False)
     with pytest.raises(RefusedError, match=f"pid {os.getpid()}.*may not use the host"):
         ask("host", Remove("alpha"))
 
 
-def test_a_host_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_host_reports_that(monkeypatch: pytest.MonkeyPatch) -> None:
     def answering(_: serve.Request) -> Answer:
         raise RuntimeError("on purpose")
 
@@ -120,7 +120,7 @@ def test_a_host_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
         ask("host", Status())
 
 
-def test_one_that_ends_before_it_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_ends_before_it_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ControlServer, "_answer", lambda self, sock: None)
     server = ControlServer("host", lambda _: Answer())
     server.start()
@@ -129,7 +129,7 @@ def test_one_that_ends_before_it_answers(monkeypatch: pytest.MonkeyPatch) -> Non
     server.stop()
 
 
-def test_the_host_that_is_meant_is_found() -> None:
+def test_the_intended_host_is_found() -> None:
     with pytest.raises(UsageError, match=r"skyloop host fleet\.toml"):
         chosen_host()
     servers = [ControlServer(name, lambda _: Answer()) for name in ("one", "two")]
@@ -146,7 +146,7 @@ def test_the_host_that_is_meant_is_found() -> None:
         server.stop()
 
 
-def test_the_commands_show_what_happens(served: Hosting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_commands_print_what_happens(served: Hosting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert skyloop("host", "status") == 0
     assert "Add one: skyloop host add NAME ADDRESS" in capsys.readouterr().out
     served.vehicle("alpha")
@@ -211,8 +211,8 @@ def test_a_large_fleet_is_added_in_one_request(served: Hosting) -> None:
         server.stop()
 
 
-def test_without_descriptors_the_control_socket_does_not_take_the_processor() -> None:
-    """It tried to accept again at once, all the time, and took a whole core."""
+def test_without_descriptors_the_control_socket_uses_little_cpu() -> None:
+    """It used to retry accept at once, without end, and took a whole core."""
 
     class Full:
         tries = 0

@@ -1,4 +1,4 @@
-"""The file of a host's vehicles: what it means, and what it says about mistakes."""
+"""The vehicle file of a host: its meaning, and its errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skyloop.messages import Value
 ALPHA = '[[vehicle]]\nname = "alpha"\naddress = "sim://"\n'
 
 
-def test_defaults_hold_for_what_says_nothing_else() -> None:
+def test_defaults_apply_where_nothing_else_is_set() -> None:
     fleet = parse_fleet(
         """
         name = "lab"
@@ -62,7 +62,7 @@ def test_defaults_hold_for_what_says_nothing_else() -> None:
     )
 
 
-def test_an_empty_file_is_a_host_to_which_vehicles_are_added() -> None:
+def test_an_empty_file_is_a_host_to_add_vehicles_to() -> None:
     assert parse_fleet("", "fleet.toml").vehicles == ()
 
 
@@ -94,26 +94,26 @@ def test_an_empty_file_is_a_host_to_which_vehicles_are_added() -> None:
         ("[defaults]\nname = 'x'", ["[defaults]", "'name'", "unknown key"]),
         (
             "".join(f'[[vehicle]]\nname = "{name}"\naddress = "tello://192.168.10.1"\n' for name in "ab"),
-            ["vehicle 'b'", "'address'", "address of 'a' too"],
+            ["vehicle 'b'", "'address'", "also the address of 'a'"],
         ),
         ("[[vehicle", ["not valid TOML"]),
     ],
 )
-def test_mistakes_are_named_with_their_place_and_what_is_allowed(text: str, words: list[str]) -> None:
+def test_errors_name_the_place_and_valid_values(text: str, words: list[str]) -> None:
     with pytest.raises(FileFormatError) as error:
         parse_fleet(text, "fleet.toml")
     for word in ["fleet.toml", *words]:
         assert word in str(error.value)
 
 
-def test_folders_of_keys_are_beside_the_file(tmp_path: Path) -> None:
+def test_key_folders_are_relative_to_the_file(tmp_path: Path) -> None:
     (tmp_path / "fleet.toml").write_text("[defaults]\nnetwork = 'multicast'\nkeys = 'lab'\n" + ALPHA)
     fleet = read_fleet(tmp_path / "fleet.toml")
     assert [vehicle.keys for vehicle in fleet.vehicles] == [str(tmp_path / "lab")]
     assert fleet.defaults.keys == str(tmp_path / "lab")
 
 
-def test_a_file_that_can_not_be_read_is_named(tmp_path: Path) -> None:
+def test_an_unreadable_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"fleet.toml can't be read"):
         read_fleet(tmp_path / "fleet.toml")
     (tmp_path / "fleet.toml").write_bytes(b"\xff")

@@ -1,4 +1,4 @@
-"""A vehicle whose driver hangs or raises ends alone: the others are flown on, with no failsafe."""
+"""A vehicle whose driver hangs or raises ends alone: the others fly on, without a failsafe."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from tests.host.fleet import Flight, Hosting, closing_reason
 from tests.support.proxy_bench import WAIT_S, FakeDriver
 
 
-def test_one_that_is_removed_the_moment_before_it_starts_does_not_go_on_to_serve(hosting: Hosting) -> None:
-    """It was taken for ended, and served then without anybody who knew of it."""
+def test_a_vehicle_removed_just_before_it_starts_is_not_served(hosting: Hosting) -> None:
+    """It counted as ended, and was then served without the host's knowledge."""
     hosting.vehicle("a")
     vehicle = hosting.host._make(hosting.settings("a"), None)
-    vehicle.condition = vehicles.Condition.STARTING  # as the host has it before it calls start()
+    vehicle.condition = vehicles.Condition.STARTING  # the host's state before it calls start()
     ending = threading.Thread(target=vehicle.end, args=(0.0, "it was removed"))
     ending.start()
     ending.join(0.1)
@@ -58,10 +58,10 @@ def test_a_driver_that_blocks_in_a_command_ends_only_its_own_vehicle(hosting: Ho
         pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
         assert stuck.stuck.wait(10.0)
         flight.goes_on()
-        wait_until(lambda: hosting.condition("stuck") == "failed", "it was given up")
+        wait_until(lambda: hosting.condition("stuck") == "failed", "it was dropped")
         assert "its driver hangs" in closing_reason(witness)
         flight.goes_on()
-        late = hosting.app("good")  # whoever comes is served, and requests are answered
+        late = hosting.app("good")  # late subscribers are served, and requests answered
         late.sync()
     stalls = [event for event in witness.events if event.kind is EventKind.DRIVER_ERROR]
     assert [event.data["where"] for event in stalls] == ["host"]
@@ -74,14 +74,14 @@ def test_a_driver_that_blocks_in_a_command_ends_only_its_own_vehicle(hosting: Ho
     stuck.let_go.set()
 
 
-def test_a_driver_that_blocks_for_a_moment_goes_on_beside_the_others(hosting: Hosting) -> None:
+def test_a_driver_that_blocks_for_a_moment_continues_beside_the_others(hosting: Hosting) -> None:
     slow = hosting.add("slow")
     hosting.add("good")
     pilot = hosting.airborne("slow")
     with Flight(hosting, "good") as flight:
         slow.hangs = {"velocity"}
         pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
-        wait_until(lambda: any("has blocked" in line for line in hosting.lines), "it was noticed")
+        wait_until(lambda: any("has been blocking" in line for line in hosting.lines), "the stall is reported")
         slow.hangs = set()
         slow.let_go.set()
         pilot.sync()
@@ -91,48 +91,48 @@ def test_a_driver_that_blocks_for_a_moment_goes_on_beside_the_others(hosting: Ho
 
 
 def test_a_driver_that_blocks_in_a_failsafe_ends_only_its_own_vehicle(hosting: Hosting) -> None:
-    """It is called by the ticker that all vehicles share."""
+    """The ticker shared by all vehicles calls it."""
     stuck = hosting.add("stuck")
     hosting.add("good")
     hosting.airborne("stuck")
     witness = hosting.app("stuck")
     with Flight(hosting, "good") as flight:
-        stuck.hangs = {"hover"}  # for want of commands
+        stuck.hangs = {"hover"}  # for lack of commands
         assert stuck.stuck.wait(10.0)
         flight.goes_on()
         assert "its driver hangs" in closing_reason(witness)
         assert hosting.condition("stuck") == "failed"
         flight.goes_on()
-    silent = flight.pilot  # the failsafes of the others are there
-    wait_until(lambda: any(f.failsafe is Failsafe.HOVER for f in silent.feedback), "the good one hovers unflown")
+    silent = flight.pilot  # the others' failsafes work
+    wait_until(lambda: any(f.failsafe is Failsafe.HOVER for f in silent.feedback), "the good one hovers")
 
 
-def test_a_driver_that_raises_in_each_tick_ends_only_its_own_vehicle(hosting: Hosting) -> None:
+def test_a_driver_that_fails_at_each_tick_ends_only_its_own_vehicle(hosting: Hosting) -> None:
     bad = hosting.add("bad")
     hosting.add("good")
     witness = hosting.app("bad")
     with Flight(hosting, "good") as flight:
         bad.fail = {"left_to"}
         assert "left_to is broken" in closing_reason(witness)
-        wait_until(lambda: hosting.condition("bad") == "failed", "it was given up")
+        wait_until(lambda: hosting.condition("bad") == "failed", "it was dropped")
         flight.goes_on()
     first = next(event for event in witness.events if event.kind is EventKind.DRIVER_ERROR)
     assert first.data["where"] == "tick"
     assert bad.closed
 
 
-def test_a_tick_that_raises_now_and_then_ends_nothing(hosting: Hosting) -> None:
+def test_a_tick_that_fails_now_and_then_ends_nothing(hosting: Hosting) -> None:
     bad = hosting.add("bad")
     witness = hosting.app("bad")
     bad.fail = {"left_to"}
-    wait_until(lambda: any(event.kind is EventKind.DRIVER_ERROR for event in witness.events), "it raised")
+    wait_until(lambda: any(event.kind is EventKind.DRIVER_ERROR for event in witness.events), "it failed")
     bad.fail = set()
     count = len(witness.feedback)
-    wait_until(lambda: len(witness.feedback) > count + 3, "it is kept alive by its ticks")
+    wait_until(lambda: len(witness.feedback) > count + 3, "its ticks continue")
     assert hosting.condition("bad") == "running"
 
 
-def test_a_driver_that_raises_in_a_command_is_reported_and_flown_on(hosting: Hosting) -> None:
+def test_a_driver_that_fails_in_a_command_is_reported_and_flies_on(hosting: Hosting) -> None:
     bad = hosting.add("bad")
     pilot = hosting.airborne("bad")
     bad.fail = {"apply"}
@@ -143,7 +143,7 @@ def test_a_driver_that_raises_in_a_command_is_reported_and_flown_on(hosting: Hos
     assert isinstance(bad.told[-1], Velocity)
 
 
-def test_one_that_does_not_open_keeps_nobody_waiting(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_does_not_open_delays_no_other(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicles, "OPEN_S", 2.0)  # the others are open by then, on any machine
     hosting.vehicle("stuck").hangs = {"open"}
     hosting.vehicle("broken").fail = {"open"}
@@ -157,7 +157,7 @@ def test_one_that_does_not_open_keeps_nobody_waiting(hosting: Hosting, monkeypat
     assert any(line.startswith("failed stuck: ") for line in hosting.lines)
 
 
-def test_one_that_does_not_close_keeps_nobody_waiting(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_does_not_close_delays_no_other(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(vehicles, "OPEN_S", 2.0)  # the others are open by then, on any machine
     hosting.add("stuck").hangs = {"close"}
     hosting.add("good")
@@ -166,7 +166,7 @@ def test_one_that_does_not_close_keeps_nobody_waiting(hosting: Hosting, monkeypa
     assert [row.name for row in hosting.host.status() if row.condition == "running"] == ["good"]
 
 
-def test_a_request_that_hangs_holds_up_its_own_vehicle_only(hosting: Hosting) -> None:
+def test_a_request_that_hangs_delays_only_its_own_vehicle(hosting: Hosting) -> None:
     stuck = hosting.vehicle("stuck")
     stuck.native = [Parameter("gain", ParameterType.FLOAT, 1.0)]
     stuck.hangs = {"set_parameter"}
@@ -178,12 +178,12 @@ def test_a_request_that_hangs_holds_up_its_own_vehicle_only(hosting: Hosting) ->
     other = hosting.app("good")
     for _ in range(10):
         other.ask(ListParameters(0))
-    pilot.command(Velocity(0.1, 0.0, 0.0, 0.0))  # it is flown all the same
+    pilot.command(Velocity(0.1, 0.0, 0.0, 0.0))  # it can still be flown
     stuck.let_go.set()
     assert isinstance(pilot.answer(number), ParameterValue)
 
 
-def test_names_that_are_taken_are_refused_and_the_others_start(hosting: Hosting) -> None:
+def test_names_in_use_are_refused_and_the_others_start(hosting: Hosting) -> None:
     lone = Proxy(FakeDriver(lambda: 0), LocalServer("taken"), name="taken")
     with lone:
         for name in ("taken", "good"):
@@ -198,7 +198,7 @@ def test_names_that_are_taken_are_refused_and_the_others_start(hosting: Hosting)
     assert hosting.condition("taken") == "running"
 
 
-def test_one_that_flies_under_a_lease_is_not_removed_without_being_told_so(hosting: Hosting) -> None:
+def test_a_vehicle_that_flies_under_a_lease_is_removed_only_on_request(hosting: Hosting) -> None:
     driver = hosting.add("alpha")
     pilot = hosting.airborne("alpha")
     pilot.command(Hover())
@@ -213,10 +213,10 @@ def test_one_that_flies_under_a_lease_is_not_removed_without_being_told_so(hosti
     assert "removed from its host" in closing_reason(pilot)
     assert hosting.host.vehicles == {}
     assert list_names() == []
-    assert hosting.condition("alpha") == "stopped"  # it can be added again by its name
+    assert hosting.condition("alpha") == "stopped"  # its name can be added again
 
 
-def test_one_that_does_not_land_stays(hosting: Hosting) -> None:
+def test_a_vehicle_that_does_not_land_stays(hosting: Hosting) -> None:
     driver = hosting.add("alpha")
     hosting.airborne("alpha")
     driver.lands = False
@@ -242,12 +242,12 @@ def test_all_land_at_the_end_though_one_hangs(hosting: Hosting) -> None:
     for name in ("one", "two"):
         wait_until(partial(hosting.drivers[name].told.__contains__, Land()), "it lands")
     landing.join(20.0)
-    assert not landing.is_alive(), "it must not wait for the one that hangs once that is given up"
-    with pytest.raises(RefusedError, match="ending"):
+    assert not landing.is_alive(), "it must not wait for a hanging vehicle that was dropped"
+    with pytest.raises(RefusedError, match="shutting down"):
         hosting.add("late")
 
 
-def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
+def test_presets_are_in_force_from_the_start(hosting: Hosting) -> None:
     driver = hosting.vehicle("alpha")
 
     def tilt(value: float) -> list[Parameter]:
@@ -270,7 +270,7 @@ def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
     assert flown.forward == pytest.approx(0.5)
 
 
-def test_a_vehicle_that_can_not_be_made_is_listed_as_failed(hosting: Hosting) -> None:
+def test_a_vehicle_that_can_not_be_created_is_listed_as_failed(hosting: Hosting) -> None:
     with pytest.raises(RefusedError, match="KeyError"):
         hosting.host.add(VehicleSettings("nobody", parse_uri("fake://nobody")))
     assert hosting.condition("nobody") == "failed"
@@ -290,7 +290,7 @@ def test_nothing_is_left_behind() -> None:
     wait_until(lambda: not left(), "all have ended")
 
 
-def test_one_overview_shows_all_vehicles_of_the_host_and_no_more_who_has_failed(hosting: Hosting) -> None:
+def test_an_overview_shows_all_vehicles_of_the_host_but_no_failed_one(hosting: Hosting) -> None:
     for name in ("one", "two", "three"):
         hosting.add(name)
     witness = hosting.app("one")
@@ -305,13 +305,13 @@ def test_one_overview_shows_all_vehicles_of_the_host_and_no_more_who_has_failed(
     pilot = hosting.airborne("two")
     stuck.hangs = {"velocity"}
     pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
-    wait_until(lambda: hosting.condition("two") == "failed", "it was given up")
-    wait_until(lambda: names() == ["one", "three"], "it is shown no longer")
+    wait_until(lambda: hosting.condition("two") == "failed", "it was dropped")
+    wait_until(lambda: names() == ["one", "three"], "it is no longer shown")
     stuck.let_go.set()
 
 
-def test_one_that_is_removed_while_it_starts_leaves_no_proxy_that_nobody_ticks(hosting: Hosting) -> None:
-    """It went on to serve, and a dead pilot's drone was never landed."""
+def test_a_vehicle_removed_while_it_starts_leaves_no_proxy_without_ticks(hosting: Hosting) -> None:
+    """It kept serving, and a dead pilot's drone was never landed."""
     driver = hosting.vehicle("alpha")
     driver.hangs = {"open"}
     adding = threading.Thread(target=hosting.host.add, args=(hosting.settings("alpha"),))
@@ -332,8 +332,8 @@ def test_one_that_is_removed_while_it_starts_leaves_no_proxy_that_nobody_ticks(h
     assert hosting.condition("alpha") == "running"
 
 
-def test_a_vehicle_that_blocks_again_and_again_keeps_its_one_loop(hosting: Hosting) -> None:
-    """Each further stall left an empty loop behind, with a thread and two descriptors, until there were none left."""
+def test_a_vehicle_that_blocks_repeatedly_keeps_its_one_loop(hosting: Hosting) -> None:
+    """Each further stall left an empty loop behind, with a thread and two descriptors, until none were left."""
     hosting.add("alpha")
     hosting.add("bravo")
     host, proxy = hosting.host, hosting.shared("alpha").proxy
@@ -345,6 +345,6 @@ def test_a_vehicle_that_blocks_again_and_again_keeps_its_one_loop(hosting: Hosti
         host._on_stall(loops[0], proxy)
         counts.append(len(host._loops))
     assert counts == [4] * 5
-    assert sum("has blocked" in line for line in hosting.lines) == 1
+    assert sum("has been blocking" in line for line in hosting.lines) == 1
     host.remove("alpha")
-    assert len(host._loops) == 3, "what was its own is closed with it"
+    assert len(host._loops) == 3, "its own loop closes with it"

@@ -1,4 +1,4 @@
-"""Links that share a thread: each is served when it can read or is due, and one that fails harms no other."""
+"""Links that share a thread: each is served when readable or due, and a failing one harms no other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAR_NS = 3600 * 10**9
 
 
 class Link:
-    """Counts how often it is served; it is woken by :meth:`wake`."""
+    """Counts how often it is served; :meth:`wake` makes it readable."""
 
     def __init__(self) -> None:
         self.far, self.near = socket.socketpair()
@@ -57,7 +57,7 @@ class Link:
 def threads(*links: Link) -> Iterator[LinkThread]:
     thread = LinkThread({link: link for link in links})
     try:
-        wait_until(lambda: all(link.served for link in links), "each was served once")
+        wait_until(lambda: all(link.served for link in links), "each is served once")
         yield thread
     finally:
         for link in links:
@@ -69,34 +69,34 @@ def threads(*links: Link) -> Iterator[LinkThread]:
         thread.close()
 
 
-def test_a_link_is_served_when_it_can_read_and_when_it_is_due() -> None:
+def test_a_link_is_served_when_readable_and_when_due() -> None:
     one, two = Link(), Link()
     two.period_ns = 1_000_000
     with threads(one, two):
-        wait_until(lambda: two.served > 5, "that which is due soon is served again")
+        wait_until(lambda: two.served > 5, "the link due soon is served again")
         assert one.served == 1
         one.wake()
-        wait_until(lambda: one.served == 2, "that which can read is served")
+        wait_until(lambda: one.served == 2, "the readable link is served")
 
 
-def test_a_link_that_ends_is_served_no_more() -> None:
+def test_a_link_that_ends_is_no_longer_served() -> None:
     one, two = Link(), Link()
     with threads(one, two):
         one.stopping = True
         one.wake()
         assert one.ended.wait(5.0)
         two.wake()
-        wait_until(lambda: two.served == 2, "the other goes on")
+        wait_until(lambda: two.served == 2, "the other continues")
 
 
-def test_one_that_raises_is_tried_again_after_pauses_beside_the_others() -> None:
+def test_a_failing_link_is_retried_after_pauses_beside_the_others() -> None:
     one, two = Link(), Link()
     with threads(one, two):
         one.raises = True
         begun = time.monotonic()
-        one.wake()  # and nobody reads it
-        wait_until(lambda: one.served >= 5, "it is tried again")
-        assert time.monotonic() - begun > 0.05, "not all the time"
+        one.wake()  # and never read it
+        wait_until(lambda: one.served >= 5, "it is retried")
+        assert time.monotonic() - begun > 0.05, "not continuously"
         two.wake()
         wait_until(lambda: two.served == 2, "the other is served")
         one.raises = False
@@ -104,7 +104,7 @@ def test_one_that_raises_is_tried_again_after_pauses_beside_the_others() -> None
         wait_until(lambda: one.served > count, "it is served again")
 
 
-def test_one_that_hangs_keeps_its_thread_and_the_others_get_another() -> None:
+def test_a_link_that_hangs_keeps_its_thread_and_the_others_get_a_new_one() -> None:
     one, two = Link(), Link()
     with threads(one, two) as thread:
         one.hangs.clear()
@@ -116,7 +116,7 @@ def test_one_that_hangs_keeps_its_thread_and_the_others_get_another() -> None:
         wait_until(lambda: two.served >= 2, "the other is served by the new thread")
         count = two.served
         one.hangs.set()
-        wait_until(lambda: thread.inside is None, "it comes back")
+        wait_until(lambda: thread.inside is None, "it returns")
         two.wake()
         wait_until(lambda: two.served > count, "the other is still the new thread's")
         two.stopping = True
@@ -146,7 +146,7 @@ def test_a_vehicle_whose_link_hangs_ends_alone(hosting: Hosting) -> None:
     witness = hosting.app("stuck")
     stuck.own_link.hangs.clear()
     stuck.own_link.wake()
-    wait_until(lambda: hosting.condition("stuck") == "failed", "it was given up")
+    wait_until(lambda: hosting.condition("stuck") == "failed", "it was dropped")
     assert "its driver hangs" in closing_reason(witness)
     count = good.own_link.served
     good.own_link.wake()

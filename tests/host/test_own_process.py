@@ -1,4 +1,4 @@
-"""A vehicle in a process of its own, with processes that do as the test wants."""
+"""A vehicle in a separate process, whose code the tests choose."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def say(**more):
 
 
 def vehicle(code: str, lines: list[str]) -> OwnProcessVehicle:
-    """One whose process runs this code."""
+    """Return a vehicle whose process runs this code."""
     settings = VehicleSettings("a", parse_uri("sim://"), own_process=True)
     return OwnProcessVehicle(settings, lines.append, (sys.executable, "-c", SAY + code))
 
 
-def test_one_that_can_not_serve_says_why() -> None:
+def test_a_process_that_can_not_serve_says_why() -> None:
     for code, words in (
         ("say(condition='failed', failed='no such thing'); sys.exit(1)", "no such thing"),
         ("print('words of a driver'); sys.exit(3)", "exit code 3"),
@@ -43,7 +43,7 @@ def test_one_that_can_not_serve_says_why() -> None:
             vehicle(code, []).start()
 
 
-def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses(
+def test_a_process_that_keeps_dying_restarts_after_longer_pauses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pauses: list[int] = []
@@ -63,8 +63,8 @@ def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses
     assert len(pauses) == count
 
 
-def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_process, "SILENT_LOOKS", 2)
+def test_a_process_that_stops_reporting_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_process, "SILENT_CHECKS", 2)
     monkeypatch.setattr("skyloop.child_process._LOOK_S", 0.05)
     lines: list[str] = []
     hung = vehicle("say(); time.sleep(60)", lines)
@@ -73,7 +73,7 @@ def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyP
     hung.end(0.0, "it is enough")
 
 
-def test_it_lands_at_sigterm_and_is_not_started_again(tmp_path: Path) -> None:
+def test_it_lands_at_sigterm_and_is_not_restarted(tmp_path: Path) -> None:
     lines: list[str] = []
     landing = vehicle(
         f"""
@@ -97,8 +97,8 @@ time.sleep(60)
     assert landing.end(0.0, "it was removed", unless_flying=True)
 
 
-def test_in_a_hurry_one_that_goes_on_to_land_is_not_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle that does not hover by itself lands all the same: killed after 8 s its process let it fall."""
+def test_in_a_hurry_a_process_that_still_lands_is_not_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vehicle that can't hover alone must still land: killed after 8 s, its process let it fall."""
     stop = RestartingChild.stop
     monkeypatch.setattr(RestartingChild, "stop", lambda runner: stop(runner, 0.05, 0.05))
     landing = vehicle(
@@ -117,7 +117,7 @@ open({str(tmp_path / "landed")!r}, "w").close()
     assert (tmp_path / "landed").exists()
 
 
-def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:
+def test_a_process_that_does_not_land_is_ended(tmp_path: Path) -> None:
     stubborn = vehicle("import signal; signal.signal(signal.SIGTERM, lambda *_: None); say(); sys.stdin.read()", [])
     stubborn.start()
     assert not stubborn.end(0.05, "it was removed", unless_flying=True)
@@ -125,7 +125,7 @@ def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:
     assert stubborn.status().condition == "stopped"
 
 
-def test_a_grandchild_that_keeps_the_pipe_open_holds_up_neither_the_restart_nor_the_end() -> None:
+def test_a_grandchild_that_keeps_the_pipe_open_delays_neither_restart_nor_end() -> None:
     lines: list[str] = []
     code = """
 import signal, subprocess
@@ -136,13 +136,13 @@ os.kill(os.getpid(), signal.SIGKILL)
     dying = vehicle(code, lines)
     began_s = time.monotonic()
     dying.start()
-    wait_until(lambda: dying.status().restarts >= 1, "it was started again")
+    wait_until(lambda: dying.status().restarts >= 1, "it was restarted")
     dying.end(0.0, "it is enough")
     assert time.monotonic() - began_s < 15.0
 
 
-def test_no_process_is_left_if_it_ends_while_it_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process died, and the vehicle is removed in the very moment in which the next one begins."""
+def test_no_process_is_left_if_it_ends_during_a_restart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process died, and the vehicle is removed at the moment when the next one starts."""
     monkeypatch.setattr(own_process, "pause_s", lambda _: 0.0)
     begun: list[ChildProcess] = []
     dying = vehicle("say(); sys.stdin.read(1)", [])
@@ -164,7 +164,7 @@ def test_no_process_is_left_if_it_ends_while_it_is_started_again(monkeypatch: py
     assert dying.status().condition == "stopped"
 
 
-def test_one_that_lands_after_its_removal_timed_out_is_shown_as_stopped() -> None:
+def test_a_process_that_lands_after_its_removal_timed_out_is_shown_as_stopped() -> None:
     landing = vehicle(
         """
 import signal, threading
@@ -180,7 +180,7 @@ sys.stdin.read(1)
     assert not landing.end(0.05, "it is removed", unless_flying=True), "it takes its time"
     child = landing._runner.child
     assert child is not None
-    child.part()  # landed: it ends by itself
+    child.part()  # landed: it ends
     wait_until(lambda: landing.status().condition == "stopped", "it is shown as ended")
     row = landing.status()
     assert (row.airborne, row.pilot, row.state) == (False, None, "")

@@ -1,4 +1,4 @@
-"""The parts of a host by themselves: watchdog, ticker, workers."""
+"""Units of a host: watchdog, ticker, workers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import cast
 
 from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
 from skyloop.host.threads import (
-    HANG_LOOKS,
+    CHECK_S,
+    HANG_CHECKS,
     IDLE_THREADS,
-    LOOK_S,
     MAX_THREADS,
-    STALL_LOOKS,
+    STALL_CHECKS,
     WHOLE_ROUNDS,
     RequestWorkers,
     SharedLoop,
@@ -35,7 +35,7 @@ class Loop:
 
 
 class Watched:
-    """A watchdog that is told the time."""
+    """A watchdog with a manual clock."""
 
     def __init__(self) -> None:
         self.loop = Loop()
@@ -48,54 +48,54 @@ class Watched:
             lambda _, inside: self.stalls.append(inside),
             lambda _, inside: self.hangs.append(inside),
         )
-        self.look(2)
+        self.check(2)
 
-    def look(self, times: int = 1, apart_s: float = LOOK_S) -> None:
+    def check(self, times: int = 1, apart_s: float = CHECK_S) -> None:
         for _ in range(times):
             self.now_s += apart_s
-            self.watchdog.look(self.now_s)
+            self.watchdog.check(self.now_s)
 
 
-def test_a_call_that_does_not_return_is_noticed_twice() -> None:
+def test_a_call_that_does_not_return_is_reported_twice() -> None:
     watched = Watched()
     watched.loop.inside, watched.loop.entries = "x", 7
-    watched.look(STALL_LOOKS)
+    watched.check(STALL_CHECKS)
     assert watched.stalls == []
-    watched.look()
+    watched.check()
     assert watched.stalls == ["x"]
-    watched.look(HANG_LOOKS - STALL_LOOKS - 1)
+    watched.check(HANG_CHECKS - STALL_CHECKS - 1)
     assert watched.hangs == []
-    watched.look(5)
+    watched.check(5)
     assert (watched.stalls, watched.hangs) == (["x"], ["x"])
 
 
-def test_calls_that_return_are_no_stall_however_many_there_are() -> None:
+def test_any_number_of_calls_that_return_is_no_stall() -> None:
     watched = Watched()
-    for number in range(3 * HANG_LOOKS):
+    for number in range(3 * HANG_CHECKS):
         watched.loop.inside, watched.loop.entries = "x", number
-        watched.look()
+        watched.check()
     watched.loop.inside = None
-    watched.look(3 * HANG_LOOKS)
+    watched.check(3 * HANG_CHECKS)
     assert watched.stalls == watched.hangs == []
 
 
-def test_a_process_that_stood_still_has_no_stall() -> None:
-    """It looks late: the loop had no more time than the watchdog."""
+def test_a_suspended_process_has_no_stall() -> None:
+    """The check is late: the loop had no more time than the watchdog."""
     watched = Watched()
     watched.loop.inside, watched.loop.entries = "x", 1
-    watched.look(3 * HANG_LOOKS, apart_s=10.0)
+    watched.check(3 * HANG_CHECKS, apart_s=10.0)
     assert watched.stalls == watched.hangs == []
 
 
-def test_each_call_that_stalls_is_noticed() -> None:
+def test_each_stalling_call_is_reported() -> None:
     watched = Watched()
     for number, inside in enumerate("xy"):
         watched.loop.inside, watched.loop.entries = inside, number + 1
-        watched.look(STALL_LOOKS + 2)
+        watched.check(STALL_CHECKS + 2)
     assert watched.stalls == ["x", "y"]
 
 
-def test_what_is_done_about_a_stall_may_fail() -> None:
+def test_handling_a_stall_may_fail() -> None:
     loop = Loop("x", 1)
     hangs: list[object] = []
 
@@ -103,12 +103,12 @@ def test_what_is_done_about_a_stall_may_fail() -> None:
         raise RuntimeError("on purpose")
 
     watchdog = Watchdog(lambda: [loop], fail, lambda _, inside: hangs.append(inside))
-    for number in range(HANG_LOOKS + 5):
-        watchdog.look(1.0 + number * LOOK_S)
+    for number in range(HANG_CHECKS + 5):
+        watchdog.check(1.0 + number * CHECK_S)
     assert hangs == ["x"]
 
 
-def test_a_ticker_that_is_split_goes_on_with_its_one_proxy() -> None:
+def test_a_split_ticker_keeps_its_one_proxy() -> None:
     ticks: dict[str, list[str]] = {"one": [], "two": []}
     with Bench() as one, Bench() as two:
         for name, bench in (("one", one), ("two", two)):
@@ -122,13 +122,13 @@ def test_a_ticker_that_is_split_goes_on_with_its_one_proxy() -> None:
         assert new.remove(two.proxy)
         new.close()
         count = len(ticks["two"])
-        wait_until(lambda: len(ticks["one"]) > counts["one"] + 10, "the other one goes on")
+        wait_until(lambda: len(ticks["one"]) > counts["one"] + 10, "the other one continues")
         assert len(ticks["two"]) == count
         ticker.close()
 
 
 class Ticked:
-    """Stands in for a proxy, and keeps how it was ticked."""
+    """Stands in for a proxy, and records its ticks."""
 
     name = "ticked"
 
@@ -146,10 +146,10 @@ class Ticked:
         self.ticks.append("flight")
 
 
-def test_a_vehicle_at_rest_has_a_fifth_of_the_ticks_of_one_that_flies() -> None:
+def test_a_resting_vehicle_gets_a_fifth_of_a_flying_ones_ticks() -> None:
     flies, rests = Ticked(at_rest=False), Ticked(at_rest=True)
     ticker = Ticker(lambda *_: None, cast(list[Proxy], [flies, rests]))
-    wait_until(lambda: len(flies.ticks) >= 4 * WHOLE_ROUNDS, "there were four rounds of each")
+    wait_until(lambda: len(flies.ticks) >= 4 * WHOLE_ROUNDS, "each had four rounds")
     ticker.close()
     whole = [number for number, tick in enumerate(flies.ticks) if tick == "whole"]
     assert [later - number for number, later in pairwise(whole)] == [WHOLE_ROUNDS] * (len(whole) - 1)
@@ -157,7 +157,7 @@ def test_a_vehicle_at_rest_has_a_fifth_of_the_ticks_of_one_that_flies() -> None:
     assert abs(len(rests.ticks) - len(whole)) <= 1
 
 
-def test_one_that_rests_has_all_ticks_as_soon_as_somebody_takes_it() -> None:
+def test_a_resting_vehicle_gets_all_ticks_as_soon_as_a_pilot_takes_it() -> None:
     rests = Ticked(at_rest=True)
     ticker = Ticker(lambda *_: None, cast(list[Proxy], [rests]))
     wait_until(lambda: bool(rests.ticks), "it is ticked")
@@ -166,33 +166,33 @@ def test_one_that_rests_has_all_ticks_as_soon_as_somebody_takes_it() -> None:
     ticker.close()
 
 
-def test_the_jobs_of_a_lane_are_done_in_order_and_one_at_a_time() -> None:
+def test_a_queues_jobs_run_in_order_one_at_a_time() -> None:
     workers = RequestWorkers()
-    lanes = [workers.lane() for _ in range(5)]
+    queues = [workers.queue() for _ in range(5)]
     done: list[tuple[int, int]] = []
-    inside = [0] * len(lanes)
+    inside = [0] * len(queues)
 
-    def job(lane: int, number: int) -> None:
-        inside[lane] += 1
-        assert inside[lane] == 1
-        done.append((lane, number))
-        inside[lane] -= 1
+    def job(queue: int, number: int) -> None:
+        inside[queue] += 1
+        assert inside[queue] == 1
+        done.append((queue, number))
+        inside[queue] -= 1
 
     for number in range(50):
-        for index, lane in enumerate(lanes):
-            lane.put(lambda index=index, number=number: job(index, number))  # type: ignore[misc]
+        for index, queue in enumerate(queues):
+            queue.put(lambda index=index, number=number: job(index, number))  # type: ignore[misc]
     wait_until(lambda: len(done) == 250, "all are done")
-    for index in range(len(lanes)):
-        assert [number for lane, number in done if lane == index] == list(range(50))
+    for index in range(len(queues)):
+        assert [number for queue, number in done if queue == index] == list(range(50))
     workers.close()
 
 
-def test_a_lane_that_hangs_holds_up_no_other_and_stops_in_time() -> None:
+def test_a_hanging_queue_delays_no_other_and_stops_in_time() -> None:
     workers = RequestWorkers()
     gate, reached = threading.Event(), threading.Event()
-    stuck, other = workers.lane(), workers.lane()
-    for lane in (stuck, other):
-        lane.start()
+    stuck, other = workers.queue(), workers.queue()
+    for queue in (stuck, other):
+        queue.start()
     stuck.put(lambda: (reached.set(), gate.wait(30.0))[0])  # type: ignore[func-returns-value]
     assert reached.wait(10.0)
     stuck.put(lambda: reached.clear())
@@ -204,15 +204,15 @@ def test_a_lane_that_hangs_holds_up_no_other_and_stops_in_time() -> None:
     gate.set()
     other.stop(1.0)
     workers.close()
-    assert reached.is_set(), "what waited was dropped"
+    assert reached.is_set(), "the waiting job was dropped"
 
 
-def test_there_is_an_end_to_the_threads() -> None:
+def test_the_threads_end() -> None:
     workers = RequestWorkers()
     gate = threading.Event()
     others = set(threading.enumerate())
     for _ in range(2 * MAX_THREADS):
-        workers.lane().put(lambda: (gate.wait(30.0), None)[1])
+        workers.queue().put(lambda: (gate.wait(30.0), None)[1])
     before = [thread for thread in threading.enumerate() if thread not in others]
     assert len(before) <= MAX_THREADS
     gate.set()
@@ -221,7 +221,7 @@ def test_there_is_an_end_to_the_threads() -> None:
     assert IDLE_THREADS < MAX_THREADS
 
 
-def test_pauses_before_a_process_is_started_again_grow_up_to_a_limit() -> None:
+def test_pauses_before_a_restart_grow_up_to_a_limit() -> None:
     pauses = [pause_s(deaths) for deaths in range(1, 40)]
     assert pauses[0] == FIRST_PAUSE_S
     assert pauses == sorted(pauses)

@@ -1,4 +1,4 @@
-"""Somebody with Zenoh and nothing else."""
+"""A stranger with nothing but Zenoh."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import zenoh
 
 
 def stranger(**sections: list[str]) -> zenoh.Session:
-    """Somebody with Zenoh and nothing else."""
+    """Return the Zenoh session of a stranger."""
     config = zenoh.Config()
     wishes: dict[str, Any] = {"mode": "peer", "scouting/multicast/enabled": False, "listen/endpoints": []}
     for key, value in {**wishes, **{f"{name}/endpoints": value for name, value in sections.items()}}.items():

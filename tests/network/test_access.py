@@ -1,6 +1,6 @@
-"""Zenoh's access control as it is made from a roster: who may say and hear what, by Zenoh's own key expressions.
+"""Zenoh's access control as generated from a roster: each role's rights, checked with Zenoh's own key expressions.
 
-What Zenoh makes of it is tried in tests/promises/security.
+Zenoh's enforcement is tested in tests/promises/security.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CONTROL = access_control(LAB)
 
 
 def allowed(who: str, flow: str, message: str, key: str) -> bool:
-    """What Zenoh does: some rule of the subject's policy has a key expression that includes this one."""
+    """Decide like Zenoh: some rule of the subject's policy has a key expression that includes this one."""
     subjects = {subject["id"] for subject in CONTROL["subjects"] if who in subject["cert_common_names"]}
     rules = {rule["id"]: rule for rule in CONTROL["rules"]}
     mine = [
@@ -43,8 +43,8 @@ def allowed(who: str, flow: str, message: str, key: str) -> bool:
     )
 
 
-def deeds() -> Iterator[tuple[str, str, str]]:
-    """All that our own ends do at ``alpha``, ``alpha7``, ``bravo`` and ``charlie``, as somebody called WHO."""
+def operations() -> Iterator[tuple[str, str, str]]:
+    """Yield everything that our own ends do at ``alpha``, ``alpha7``, ``bravo`` and ``charlie``, under the name WHO."""
     for name in ("alpha", "alpha7", "bravo", "charlie"):
         for who in ("jane", "olga"):
             for way in (layout.ASK, layout.ORDER, layout.COMMAND):
@@ -74,7 +74,7 @@ def deeds() -> Iterator[tuple[str, str, str]]:
 
 
 def permitted(who: str, flow: str) -> set[str]:
-    return {what for what, message, key in deeds() if allowed(who, flow, message, key)}
+    return {what for what, message, key in operations() if allowed(who, flow, message, key)}
 
 
 ANYBODY = {
@@ -121,23 +121,23 @@ EVERY = ["alpha", "alpha7", "bravo", "charlie"]
         ("stranger", set()),
     ],
 )
-def test_what_each_may_say(who: str, may: set[str]) -> None:
+def test_each_role_may_send_what_it_needs(who: str, may: set[str]) -> None:
     assert permitted(who, INGRESS) == may
 
 
-def test_a_router_carries_all_that_is_skyloops_and_nothing_else() -> None:
-    every = {what for what, _, _ in deeds()} - {"everything", "another's keys", "administration"}
+def test_a_router_carries_only_skyloops_keys() -> None:
+    every = {what for what, _, _ in operations()} - {"everything", "another's keys", "administration"}
     assert permitted("hub", INGRESS) == permitted("hub", EGRESS) == every
 
 
 @pytest.mark.parametrize(("speaker", "hearer"), [("jane", "hangar"), ("olga", "hangar")])
-def test_proxies_hear_what_applications_may_say_to_them(speaker: str, hearer: str) -> None:
+def test_proxies_receive_what_applications_may_send(speaker: str, hearer: str) -> None:
     served = {what for what in permitted(speaker, INGRESS) if "charlie" not in what} | {"query info charlie"}
     assert served - permitted(hearer, EGRESS) == set()
 
 
 @pytest.mark.parametrize("hearer", ["jane", "olga"])
-def test_applications_hear_what_a_proxy_may_say_to_them(hearer: str) -> None:
+def test_applications_receive_what_a_proxy_may_send(hearer: str) -> None:
     lost = permitted("hangar", INGRESS) - permitted(hearer, EGRESS)
     seen = ["alpha", "bravo"] if hearer == "olga" else EVERY
     flown = ["alpha", "alpha7"] if hearer == "jane" else []
@@ -147,7 +147,7 @@ def test_applications_hear_what_a_proxy_may_say_to_them(hearer: str) -> None:
 
 
 @pytest.mark.parametrize("hearer", ["jane", "olga"])
-def test_applications_are_not_told_what_others_send_to_a_proxy(hearer: str) -> None:
+def test_applications_do_not_receive_others_packets_to_a_proxy(hearer: str) -> None:
     heard = permitted(hearer, EGRESS)
     assert not any(what.startswith(("ask", "order", "command", "live at")) for what in heard)
 
@@ -159,14 +159,14 @@ def test_without_identities_nothing_passes() -> None:
     assert control["rules"] == control["subjects"] == control["policies"] == []
 
 
-def test_every_rule_has_a_name_of_its_own_and_belongs_to_one_subject() -> None:
+def test_every_rule_has_a_unique_name_and_one_subject() -> None:
     names = [rule["id"] for rule in CONTROL["rules"]]
     assert len(names) == len(set(names))
     assert sorted(name for policy in CONTROL["policies"] for name in policy["rules"]) == sorted(names)
     assert all(rule["key_exprs"] and rule["messages"] and rule["flows"] for rule in CONTROL["rules"])
 
 
-def test_a_key_turns_settings_into_secured_ones(tmp_path: Path) -> None:
+def test_a_key_secures_the_settings(tmp_path: Path) -> None:
     lab = Lab.make(tmp_path / "lab")
     lab.issue(make_identity("jane", "pilot", "alpha*"))
     lab.issue(make_identity("eve", "pilot"))

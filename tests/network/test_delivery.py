@@ -1,4 +1,4 @@
-"""Numbered packets of the fabric transport arrive once each and in order; and what waits for a handler takes turns."""
+"""Numbered packets of the fabric transport arrive exactly once and in order; queued items take turns."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from skyloop.network.registry import STALLED_S
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_packets_arrive_once_and_in_order_whatever_is_lost_repeated_and_reordered(seed: int) -> None:
+def test_packets_arrive_once_in_order_despite_loss_repeats_and_reordering(seed: int) -> None:
     rng = random.Random(seed)
     sent = [rng.randbytes(rng.choice((1, 40, 60_000))) for _ in range(150)]
     outgoing, incoming = Outgoing(), Incoming()
@@ -30,7 +30,7 @@ def test_packets_arrive_once_and_in_order_whatever_is_lost_repeated_and_reordere
     now = 0.0
     while len(arrived) < len(sent) or outgoing.under_way:
         now += 0.05
-        assert now < 600.0, "it takes for ever"
+        assert now < 600.0, "it takes too long"
         while waiting and outgoing.put(waiting[0]):
             waiting.pop(0)
         flying = [(number, packet) for number, packet, _ in outgoing.due(now) for _ in range(rng.choice((0, 1, 1, 2)))]
@@ -43,7 +43,7 @@ def test_packets_arrive_once_and_in_order_whatever_is_lost_repeated_and_reordere
     assert outgoing.due(now + 10.0) == []
 
 
-def test_few_are_on_the_way_at_once_and_what_is_not_taken_comes_again_later_and_later() -> None:
+def test_few_are_in_flight_and_unacknowledged_ones_are_resent_ever_later() -> None:
     outgoing = Outgoing()
     for number in range(ON_THE_WAY + 5):
         assert outgoing.put(bytes([number]), "way")
@@ -62,7 +62,7 @@ def test_few_are_on_the_way_at_once_and_what_is_not_taken_comes_again_later_and_
     outgoing.taken(3, now)
     assert outgoing.stalled_s(now) == 0.0
     assert outgoing.due(now) == [(ON_THE_WAY + n, bytes([ON_THE_WAY + n - 1]), "way") for n in (1, 2, 3)]
-    outgoing.taken(10**6, now)  # never sent: it says nothing
+    outgoing.taken(10**6, now)  # never sent: no effect
     assert outgoing.under_way
     outgoing.taken(ON_THE_WAY + 3, now)
     outgoing.due(now)
@@ -71,16 +71,17 @@ def test_few_are_on_the_way_at_once_and_what_is_not_taken_comes_again_later_and_
     assert outgoing.stalled_s(now + 100.0) == 0.0
 
 
-def test_a_packet_is_sent_seven_times_before_who_does_not_take_it_is_let_go() -> None:
-    """So an application on a path that loses a third of the packets each way stays: each try arrives and is told of
-    with a chance of 4 / 9."""
+def test_a_packet_is_sent_seven_times_before_its_reader_is_dropped() -> None:
+    """Hence an application stays on a path that loses a third of the packets each way: each try arrives and is
+    acknowledged with a probability of 4 / 9.
+    """
     outgoing = Outgoing()
     outgoing.put(b"x")
     tries = [step for step in range(int(1000 * STALLED_S)) if outgoing.due(step / 1000.0)]
     assert len(tries) == 7
 
 
-def test_what_is_kept_is_bounded_in_packets_and_in_bytes() -> None:
+def test_kept_packets_are_limited_in_number_and_bytes() -> None:
     outgoing = Outgoing()
     assert sum(outgoing.put(b"x") for _ in range(2 * DEPTH)) == DEPTH
     outgoing = Outgoing()
@@ -89,7 +90,7 @@ def test_what_is_kept_is_bounded_in_packets_and_in_bytes() -> None:
     assert len(outgoing.due(0.0)) == 4
 
 
-def test_the_transports_own_packets_find_room_where_others_do_not() -> None:
+def test_the_transports_own_packets_have_reserved_room() -> None:
     outgoing = Outgoing()
     while outgoing.put(b"x"):
         pass
@@ -100,7 +101,7 @@ def test_the_transports_own_packets_find_room_where_others_do_not() -> None:
     assert outgoing.put(b"own", own=True)
 
 
-def test_what_comes_far_too_early_is_not_kept() -> None:
+def test_a_packet_far_too_early_is_not_kept() -> None:
     incoming = Incoming()
     for number in range(2, 10_000):
         assert incoming.take(number, b"early") == []
@@ -118,7 +119,7 @@ def test_commands_come_before_requests_and_connections_take_turns() -> None:
     assert [queue.get(0.0) for _ in range(7)] == ["command", "a0", "b0", "a1", "b1", "a2", None]
 
 
-def test_commands_without_end_do_not_keep_others_from_being_heard() -> None:
+def test_endless_commands_do_not_block_other_packets() -> None:
     queue: HandlerQueue[int] = HandlerQueue()
     for _ in range(3 * IN_A_ROW):
         queue.put("a", 1, urgent=True)
@@ -126,7 +127,7 @@ def test_commands_without_end_do_not_keep_others_from_being_heard() -> None:
     assert [queue.get(0.0) for _ in range(IN_A_ROW + 2)] == [*IN_A_ROW * [1], 2, 1]
 
 
-def test_so_many_of_one_connection_wait_and_no_more() -> None:
+def test_the_queue_of_one_connection_is_limited() -> None:
     queue: HandlerQueue[int] = HandlerQueue()
     assert [queue.put("a", 1, at_most=2) for _ in range(4)] == [True, True, False, False]
     assert queue.put("b", 1, at_most=2)
@@ -134,7 +135,7 @@ def test_so_many_of_one_connection_wait_and_no_more() -> None:
     assert queue.waiting("a") == 2
 
 
-def test_an_inbox_that_ends_still_gives_what_it_has() -> None:
+def test_a_closed_queue_still_returns_its_items() -> None:
     queue: HandlerQueue[int] = HandlerQueue()
     got: list[int | None] = []
     thread = threading.Thread(target=lambda: got.append(queue.get(60.0)))

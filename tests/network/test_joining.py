@@ -1,4 +1,4 @@
-"""Who answers an application that wants to join, and is not the proxy that it means."""
+"""Answers to an application that wants to join, from ends other than the intended proxy."""
 
 from __future__ import annotations
 
@@ -39,38 +39,38 @@ def session(*replies: Any) -> Session:
     return cast("Session", SimpleNamespace(settings=settings, zenoh=SimpleNamespace(get=lambda *_, **__: replies)))
 
 
-def test_what_does_not_come_from_the_proxy_that_is_meant_is_passed_over() -> None:
+def test_answers_of_others_are_skipped() -> None:
     strangers = (answered(b"\xc1 nonsense"), answered(bytes(packets.MAX_OWN + 1)), welcome(OTHER))
     with pytest.raises(NoAnswerError, match="found on the network but did not answer"):
         join(session(*strangers), "alpha", RUN, layout.new_id())
     assert join(session(*strangers, welcome(RUN)), "alpha", RUN, layout.new_id()) is not None
 
 
-def test_a_refusal_is_told_with_its_reason() -> None:
+def test_a_refusal_is_raised_with_its_reason() -> None:
     refused = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"it is full")), ok=None)
-    with pytest.raises(LinkError, match="does not let us in: it is full"):
+    with pytest.raises(LinkError, match="does not admit us: it is full"):
         join(session(refused), "alpha", RUN, layout.new_id())
 
 
-def test_an_answer_that_did_not_come_in_time_is_no_refusal() -> None:
-    """A router answers a question that has timed out with an error; the application must ask again."""
+def test_a_timed_out_answer_is_no_refusal() -> None:
+    """A router answers a timed-out query with an error; the application must ask again."""
     late = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"Timeout")), ok=None)
     with pytest.raises(NoAnswerError, match="found on the network but did not answer"):
         join(session(late), "alpha", RUN, layout.new_id())
     assert join(session(late, welcome(RUN)), "alpha", RUN, layout.new_id()) is not None
 
 
-def test_somebody_who_answers_in_its_place_is_named_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_impostor_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def accept(_request: JoinRequest, _welcome: packets.Welcome) -> None:
         raise LinkError("its proof is wrong")
 
     monkeypatch.setattr(JoinRequest, "accept", accept)
-    with pytest.raises(LinkError, match="who answers as the proxy 'alpha' is not it: its proof is wrong"):
+    with pytest.raises(LinkError, match="an impostor answers as the proxy 'alpha': its proof is wrong"):
         join(session(welcome(RUN)), "alpha", RUN, layout.new_id())
 
 
 @pytest.mark.parametrize(("complete", "error"), [(True, UnknownNameError), (False, NoAnswerError)])
-def test_nobody_of_that_name_is_another_thing_than_no_list(
+def test_an_unknown_name_differs_from_an_incomplete_list(
     complete: bool, error: type[LinkError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[float] = []
@@ -87,7 +87,7 @@ def test_nobody_of_that_name_is_another_thing_than_no_list(
 
 
 @pytest.mark.parametrize("runs", [{RUN}, {OTHER}, {RUN, OTHER}])
-def test_who_is_known_is_not_asked_again_unless_there_is_a_choice(
+def test_a_known_proxy_is_not_asked_again_unless_there_is_a_choice(
     runs: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
@@ -104,7 +104,7 @@ def test_who_is_known_is_not_asked_again_unless_there_is_a_choice(
     assert bool(asked) == (runs != {RUN})
 
 
-def test_who_tells_nothing_is_given_another_session_soon_and_more_time_each_turn(
+def test_a_silent_node_soon_gets_another_session_and_more_time_each_turn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     given: list[float] = []
@@ -115,9 +115,9 @@ def test_who_tells_nothing_is_given_another_session_soon_and_more_time_each_turn
         session: Session, _name: str, _handler: object, _find_s: float, list_s: float, known: packets.ProxyInfo | None
     ) -> Any:
         given.append(list_s)
-        assert known == (ABOUT if len(given) > 1 else None), "it is not asked again who it is"
+        assert known == (ABOUT if len(given) > 1 else None), "it is not asked for its description again"
         if not reached:
-            raise NoAnswerError("nobody said")
+            raise NoAnswerError("no answer")
         return SimpleNamespace(parted=True, session=session, about=ABOUT if len(given) == 1 else None)
 
     monkeypatch.setattr(client, "FabricClient", connection)

@@ -1,4 +1,4 @@
-"""By which key a packet travels, and what is answered where there is no right to it."""
+"""The key by which a packet travels, and the answer where the right is missing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HOVER = encode(Command(1, 1, 1, 1, Hover()))
 @pytest.mark.parametrize(
     ("body", "way"), [(Ping(1), ASK), (RequestAuthority(3), ORDER)], ids=["a question", "an order"]
 )
-def test_questions_and_orders_go_by_keys_of_their_own(body: AnyRequest, way: str) -> None:
+def test_questions_and_orders_have_separate_keys(body: AnyRequest, way: str) -> None:
     assert way_of(encode(Request(1, body))) == way
 
 
@@ -38,7 +38,7 @@ def test_a_command_has_its_own_and_garbage_is_left_to_the_proxy() -> None:
     assert way_of(b"no packet") == ASK
 
 
-def test_what_is_late_of_no_use_is_told_apart() -> None:
+def test_packets_useless_when_late_are_recognised() -> None:
     report = encode(StreamReport("stream/front?kbit_s=500", 3))
     assert layout.is_report(report)
     assert way_of(report) == ASK
@@ -46,7 +46,7 @@ def test_what_is_late_of_no_use_is_told_apart() -> None:
     assert not layout.is_report(encode(Request(1, Ping(1))))
 
 
-def test_an_order_without_the_right_to_it_is_answered_with_whose_keys_these_are() -> None:
+def test_an_order_without_the_right_is_answered_with_the_keys_identity() -> None:
     packet = refusal_reply(encode(Request(7, RequestAuthority(3))), OLGA, "alpha")
     assert packet is not None
     answer = decode(packet)

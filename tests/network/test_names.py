@@ -48,7 +48,7 @@ def serving(name: str, at: str, *, knows: tuple[str, ...] = ()) -> Iterator[tupl
         server.stop()
 
 
-def test_all_proxies_are_listed_with_what_they_are() -> None:
+def test_all_proxies_are_listed_with_their_descriptions() -> None:
     one, two = place(), place()
     with serving("bravo", one), serving("alpha", two):
         found = list_proxies(calling(one, two))
@@ -61,7 +61,7 @@ def test_all_proxies_are_listed_with_what_they_are() -> None:
     assert list_proxies(calling(one, two)) == []
 
 
-def test_a_name_that_is_taken_on_the_network_is_refused_with_who_has_it() -> None:
+def test_a_name_in_use_on_the_network_is_refused_with_its_owner() -> None:
     at = place()
     with serving("alpha", at):
         second = FabricServer("alpha", FabricSettings(listen=(place(),), connect=(at,), multicast=False))
@@ -69,11 +69,11 @@ def test_a_name_that_is_taken_on_the_network_is_refused_with_who_has_it() -> Non
             second.start(ServerLog())
         second.stop()
     with serving("alpha", at):
-        pass  # it is free again
+        pass  # free again
 
 
-def test_of_two_with_one_name_the_older_keeps_it() -> None:
-    """A network that was in two parts when they started."""
+def test_the_older_of_two_with_one_name_keeps_it() -> None:
+    """The network was split when they started."""
     one, two = place(), place()
     with serving("alpha", one) as (_, older), serving("alpha", two) as (_, younger):
         assert [about.address for about in discovery.ask(calling(one, two), "alpha")] == [
@@ -82,14 +82,14 @@ def test_of_two_with_one_name_the_older_keeps_it() -> None:
         ]
         log = ClientLog()
         client = dial("alpha", calling(two, one))(log)
-        wait_until(lambda: older.joined, "the older one was joined")
+        wait_until(lambda: older.joined, "it joined the older one")
         assert client.send(b"x")
-        wait_until(lambda: older.packets, "it came there")
+        wait_until(lambda: older.packets, "it arrived there")
         assert younger.joined == []
         client.close()
 
 
-def test_an_unknown_name_says_where_was_looked_and_what_is_there() -> None:
+def test_an_unknown_name_is_reported_with_the_searched_network_and_the_known_names() -> None:
     at = place()
     said = rf"named 'alfa' on the network \({at}\); did you mean 'alpha'"
     with serving("alpha", at), pytest.raises(UnknownNameError, match=said):
@@ -100,7 +100,7 @@ def test_an_unknown_name_says_where_was_looked_and_what_is_there() -> None:
         FabricServer("a/b")
 
 
-def test_a_proxy_that_appears_while_it_is_looked_for_is_found() -> None:
+def test_a_proxy_that_appears_during_the_search_is_found() -> None:
     at = place()
     with ExitStack() as ends:
         dialer = dial("alpha", calling(at), find_s=5.0)
@@ -113,27 +113,27 @@ def test_a_proxy_that_appears_while_it_is_looked_for_is_found() -> None:
         assert "fabric:alpha on" in client.address
 
 
-def test_a_proxy_that_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_proxy_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.network.registry.MAX_CLIENTS", 1)
     at = place()
     with serving("alpha", at) as (_, log):
         dialer: Dialer = dial("alpha", calling(at))
         client = dialer(ClientLog())
         wait_until(lambda: log.joined, "the first is in")
-        with pytest.raises(LinkError, match="has 1 connections already"):
+        with pytest.raises(LinkError, match="already has its maximum of 1 connections"):
             dialer(ClientLog())
         client.close()
         wait_until(lambda: log.left, "it left")
         dialer(ClientLog()).close()
 
 
-def test_an_application_has_so_many_subscriptions_at_most() -> None:
+def test_an_applications_subscriptions_are_limited() -> None:
     at = place()
     with serving("alpha", at) as (server, log):
         client = dial("alpha", calling(at))(ClientLog())
         for number in range(70):
             client.subscribe(f"topic {number}")
-        wait_until(lambda: len(log.complaints) == 6, "what is too much is refused as garbage is")
+        wait_until(lambda: len(log.complaints) == 6, "further ones are refused like garbage")
         assert server.subscribers("topic 63") == 1
         assert server.subscribers("topic 64") == 0
         client.close()
@@ -144,7 +144,7 @@ def test_a_server_is_started_once() -> None:
         server.start(log)
 
 
-def test_an_address_that_is_in_use_is_a_link_error() -> None:
+def test_an_address_in_use_is_a_link_error() -> None:
     at = place()
     with serving("alpha", at), pytest.raises(LinkError, match="cannot join the network"):
         FabricServer("bravo", FabricSettings(listen=(at, place()), multicast=False)).start(ServerLog())
@@ -156,7 +156,7 @@ def test_several_proxies_of_one_process_share_an_address() -> None:
         assert [about.name for about in list_proxies(calling(at))] == ["alpha", "bravo"]
 
 
-def test_sessions_are_shared_and_end_when_nobody_uses_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_are_shared_and_end_without_users(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(session, "LINGER_S", 0.05)
     settings = calling(place())
     one, two = session.acquire(settings, Part.APP), session.acquire(settings, Part.APP)
@@ -164,19 +164,19 @@ def test_sessions_are_shared_and_end_when_nobody_uses_them(monkeypatch: pytest.M
     session.retire(one)
     fresh = session.acquire(settings, Part.APP)
     assert fresh is not one
-    assert renew(fresh) is False, "there is no multicast to search by"
+    assert renew(fresh) is False, "there is no multicast to search with"
     for each in (one, two, fresh):
         session.release(each)
     wait_until(one.zenoh.is_closed, "the retired one ended")
     wait_until(fresh.zenoh.is_closed, "the other one ended after a while")
 
 
-def test_a_connection_is_told_when_its_proxy_stops_and_made_anew() -> None:
+def test_a_connection_is_notified_when_its_proxy_stops_and_can_be_made_again() -> None:
     at = place()
     log = ClientLog()
     with serving("alpha", at):
         client = dial("alpha", calling(at))(log)
-    wait_until(lambda: log.closings, "it was told")
+    wait_until(lambda: log.closings, "it was notified")
     assert log.closings == ["the proxy stopped"]
     assert not client.send(b"x")
     with serving("alpha", at) as (server, _):
@@ -189,8 +189,8 @@ def test_a_connection_is_told_when_its_proxy_stops_and_made_anew() -> None:
         client.close()
 
 
-def test_answers_that_make_no_sense_are_no_proxies() -> None:
-    """Somebody else on the network answers for proxies, and is alive as what no proxy is."""
+def test_invalid_answers_are_no_proxies() -> None:
+    """Another node on the network answers for proxies, with a token that no proxy has."""
     at, lair = place(), place()
     about = packets.ProxyInfo("bravo", layout.new_id(), 1, "there", 1, "fake://bravo", "nowhere")
     with serving("alpha", at), ExitStack() as ends:
@@ -205,7 +205,7 @@ def test_answers_that_make_no_sense_are_no_proxies() -> None:
             query.reply_err(b"no")
 
         answer("charlie", b"\xc1 no MessagePack")
-        answer("delta", packets.encode_own(about))  # of another name
+        answer("delta", packets.encode_own(about))  # with another name
         ends.callback(other.declare_queryable(layout.info("echo"), refuse).undeclare)
         for rest in ("alpha/alive/zz", "-/alive/0123456789abcdef"):
             ends.callback(other.liveliness().declare_token(f"{layout.ROOT}/{rest}").undeclare)

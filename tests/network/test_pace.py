@@ -1,4 +1,4 @@
-"""A subscriber of which nothing is heard is sent little of what only the newest counts of."""
+"""A silent subscriber gets few packets of a topic whose newest packet alone counts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PERIOD_S = 1 / 32
 
 
 class Scene:
-    """A publisher, its clock, and what was sent; a subscriber hears it while its path carries, 50 ms later."""
+    """A publisher, its clock and sent packets; a subscriber that gets them 50 ms later while its path carries them."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -63,7 +63,7 @@ class Scene:
         return len(self.sent) - before
 
 
-def test_while_the_path_stands_still_little_is_sent_and_at_once_all_of_it_after() -> None:
+def test_on_a_stalled_path_few_packets_are_sent_and_afterwards_all_at_once() -> None:
     scene = Scene()
     pilot = scene.subscriber(1)
     assert scene.go(10.0) == 320
@@ -73,10 +73,10 @@ def test_while_the_path_stands_still_little_is_sent_and_at_once_all_of_it_after(
     assert scene.publisher.held_back == 128 - in_silence
     scene.standing.clear()
     assert scene.go(1.0) >= 31
-    assert [number for _, number in scene.sent] == list(range(1, len(scene.sent) + 1)), "none seems lost on the way"
+    assert [number for _, number in scene.sent] == list(range(1, len(scene.sent) + 1)), "none seems lost in transit"
 
 
-def test_what_is_held_back_counts_as_missed_by_each() -> None:
+def test_skipped_packets_count_as_missed_by_each_subscriber() -> None:
     scene = Scene()
     scene.standing |= {scene.subscriber(1), scene.subscriber(2)}
     for connection in scene.standing:
@@ -90,14 +90,14 @@ def test_what_is_held_back_counts_as_missed_by_each() -> None:
     assert scene.publisher.publish(FEEDBACK, b"x") == 2
 
 
-def test_one_that_is_heard_is_enough() -> None:
+def test_one_responsive_subscriber_is_enough() -> None:
     scene = Scene()
     scene.subscriber(1)
     scene.standing.add(scene.subscriber(2))
     assert scene.go(5.0) == 160
 
 
-def test_who_acknowledges_seldom_as_earlier_versions_do_is_sent_all() -> None:
+def test_a_subscriber_that_acknowledges_rarely_as_earlier_versions_do_gets_all() -> None:
     scene = Scene()
     pilot = scene.subscriber(1, every_s=1e9)
     scene.go(10.0)
@@ -105,19 +105,19 @@ def test_who_acknowledges_seldom_as_earlier_versions_do_is_sent_all() -> None:
     assert scene.go(4.0) == 128
 
 
-def test_other_topics_are_sent_as_they_come() -> None:
+def test_other_topics_are_not_paced() -> None:
     scene = Scene()
     scene.standing.add(scene.subscriber(1, topic=EVENTS))
     assert scene.go(5.0, EVENTS) == 160
 
 
-def test_who_is_sent_little_is_not_taken_for_silent() -> None:
+def test_a_paced_subscriber_does_not_count_as_silent() -> None:
     pace, now_s = Pace(), 0.0
     for number in range(1, 20):
         assert pace.may_send(now_s)
         pace.sent(number, now_s)
         pace.taken(number, now_s + 0.05)
-        now_s += 5.0  # nothing is under way meanwhile
+        now_s += 5.0  # nothing is in flight meanwhile
     pace.sent(20, now_s)
     assert pace.may_send(now_s + STANDS_S)
     pace.sent(21, now_s + STANDS_S)
@@ -128,7 +128,7 @@ def test_who_is_sent_little_is_not_taken_for_silent() -> None:
     assert pace.may_send(now_s + STANDS_S + 0.2)
 
 
-def test_one_acknowledgement_says_nothing_of_how_often_they_come() -> None:
+def test_one_acknowledgement_does_not_show_their_rate() -> None:
     pace = Pace()
     pace.sent(1, 0.0)
     pace.sent(ACKNOWLEDGE_AFTER, 1.0)

@@ -88,7 +88,7 @@ def test_the_keys() -> None:
         "skyloop/1/alpha/ask/anna/0123456789abcdef/x",
     ],
 )
-def test_keys_of_nobody(key: str) -> None:
+def test_keys_without_an_owner(key: str) -> None:
     with pytest.raises(DecodeError):
         layout.parse_sender(key)
     with pytest.raises(DecodeError):
@@ -96,7 +96,7 @@ def test_keys_of_nobody(key: str) -> None:
 
 
 @pytest.mark.parametrize("who", ["", "a/b", "*", "-x", "ä", "x" * 65])
-def test_what_cannot_be_an_identity(who: str) -> None:
+def test_invalid_identities(who: str) -> None:
     with pytest.raises(UsageError, match="cannot be an identity"):
         FabricSettings(tls=TLS, who=who)
 
@@ -105,7 +105,7 @@ def test_what_cannot_be_an_identity(who: str) -> None:
 
 
 @given(st.binary(max_size=80))
-def test_parsing_anything_gives_a_message_or_a_decode_error(data: bytes) -> None:
+def test_parsing_any_bytes_gives_a_message_or_a_decode_error(data: bytes) -> None:
     for parse in (packets.parse, packets.parse_number, packets.parse_published, packets.parse_frame):
         for attempt in (data, b"SKYL\x01\x51\0\0" + len(data).to_bytes(4, "little") + data):
             try:
@@ -115,7 +115,7 @@ def test_parsing_anything_gives_a_message_or_a_decode_error(data: bytes) -> None
 
 
 @given(TOPICS, st.booleans(), st.integers(0, 2**64 - 1))
-def test_packets_come_back_as_they_were(topic: str, on: bool, number: int) -> None:
+def test_packets_round_trip(topic: str, on: bool, number: int) -> None:
     assert packets.parse(packets.subscribe(topic, on)) == packets.Subscribe(topic, on)
     assert packets.parse(packets.taken(topic, number)) == packets.Taken(topic, number)
     assert packets.parse(packets.taken("", number)) == packets.Taken("", number)
@@ -129,7 +129,7 @@ def test_packets_come_back_as_they_were(topic: str, on: bool, number: int) -> No
     )
 
 
-def test_a_long_reason_is_cut() -> None:
+def test_a_long_reason_is_truncated() -> None:
     message = packets.parse(packets.bye("é" * 1000))
     assert isinstance(message, packets.Bye)
     assert 100 < len(message.reason) <= packets.MAX_REASON
@@ -147,7 +147,7 @@ BODIES: list[tuple[AnyRequest, str]] = [
 
 
 @pytest.mark.parametrize(("body", "way"), BODIES)
-def test_requests_need_what_they_do(body: AnyRequest, way: str) -> None:
+def test_requests_need_the_right_for_their_effect(body: AnyRequest, way: str) -> None:
     packet = encode(Request(1, body))
     assert layout.way_of(packet) == way
     assert layout.allows(way, packet)
@@ -158,7 +158,7 @@ def test_requests_need_what_they_do(body: AnyRequest, way: str) -> None:
 TAKEOFF = encode(Command(1, 1, 1, 1, Takeoff()))
 
 
-def test_other_packets_need_what_they_are() -> None:
+def test_other_packets_need_the_right_for_their_kind() -> None:
     assert layout.way_of(TAKEOFF) == layout.COMMAND
     assert layout.way_of(encode(Annotation("me", "front", 1, 32, 24))) == layout.ASK
     assert layout.way_of(encode(LogEntry("me", "", 1, text="x"))) == layout.ASK
@@ -174,13 +174,13 @@ def test_garbage_needs_no_right_unless_it_looks_like_a_command_or_a_pose(data: b
 # --- windows ---
 
 
-def test_taking_is_told_now_and_then() -> None:
+def test_acknowledgements_are_sent_now_and_then() -> None:
     policy = AckPolicy()
     told = [number for number in range(1, 101) if policy.count(number, 1)]
     assert told == [ACKNOWLEDGE_AFTER * n for n in range(1, 100 // ACKNOWLEDGE_AFTER + 1)]
 
 
-def test_of_what_only_the_newest_counts_taking_is_told_as_time_passes_too() -> None:
+def test_on_topics_where_the_newest_counts_acknowledgements_also_follow_the_time() -> None:
     policy = AckPolicy(ACKNOWLEDGE_EVERY_S)
     assert [ms for ms in range(0, 600, 31) if policy.count(ms // 31 + 1, 0, ms / 1000)] == [0, 155, 310, 465]
     assert [number for number in range(21, 101) if policy.count(number, 0, 0.5)] == [48, 80], "many at once"
@@ -189,7 +189,7 @@ def test_of_what_only_the_newest_counts_taking_is_told_as_time_passes_too() -> N
 # --- configuration ---
 
 
-def test_an_application_with_one_address_waits_for_its_proxy_and_for_nothing_else() -> None:
+def test_an_application_with_one_address_waits_only_for_its_proxy() -> None:
     given = FabricSettings(connect=("10.0.0.5",), multicast=False)
 
     def delay_ms(settings: FabricSettings, part: Part) -> int:
@@ -202,7 +202,7 @@ def test_an_application_with_one_address_waits_for_its_proxy_and_for_nothing_els
     assert delay_ms(FabricSettings(), Part.APP) == delay_ms(given, Part.PROXY) == config.SETTLE_MS
 
 
-def test_an_address_stands_for_two_links_without_keys_and_one_with() -> None:
+def test_an_address_means_two_links_without_keys_and_one_with_keys() -> None:
     plain, secured = FabricSettings(), FabricSettings(tls=TLS, who="anna")
     assert config.endpoints_of(["10.0.0.5:1"], plain) == ["tcp/10.0.0.5:1?rel=1", "udp/10.0.0.5:1?rel=0"]
     assert config.endpoints_of(["10.0.0.5"], secured) == ["quic/10.0.0.5:7447?mixed_rel=1"]
@@ -212,12 +212,12 @@ def test_an_address_stands_for_two_links_without_keys_and_one_with() -> None:
 
 
 @pytest.mark.parametrize("address", ["", ":1", "host:", "host:x", "host:70000", "::1", "[::1", "a:b:1"])
-def test_what_is_no_address(address: str) -> None:
-    with pytest.raises(UsageError, match="is no network address"):
+def test_invalid_addresses(address: str) -> None:
+    with pytest.raises(UsageError, match="is not a network address"):
         config.endpoints_of([address], FabricSettings())
 
 
-def test_with_keys_nothing_that_is_not_encrypted_is_taken() -> None:
+def test_with_keys_unencrypted_addresses_are_refused() -> None:
     settings = FabricSettings(tls=TLS, who="anna", access_control={"enabled": True})
     made = config.make(settings, Part.PROXY, ["quic/0.0.0.0:1?mixed_rel=1"])
     assert made["transport"]["link"]["protocols"] == ["quic"]
@@ -227,7 +227,7 @@ def test_with_keys_nothing_that_is_not_encrypted_is_taken() -> None:
     assert made["access_control"] == {"enabled": True}
 
 
-def test_only_applications_call_proxies() -> None:
+def test_only_applications_connect_to_proxies() -> None:
     def called(part: Part) -> Any:
         return config.make(FabricSettings(), part)["scouting"]["multicast"]["autoconnect"]["peer"]
 
@@ -236,7 +236,7 @@ def test_only_applications_call_proxies() -> None:
     assert config.make(FabricSettings(), Part.ROUTER)["mode"] == "router"
 
 
-def test_a_free_port_is_chosen_instead_of_port_0() -> None:
+def test_a_free_port_replaces_port_0() -> None:
     (address,) = config.listening(FabricSettings(listen=("127.0.0.1:0",)))
     host, _, port = address.rpartition(":")
     assert host == "127.0.0.1"
@@ -254,10 +254,10 @@ def test_an_identity_needs_its_files() -> None:
         FabricSettings(who="anna")
 
 
-# --- whether to take part at all ---
+# --- choice of the network ---
 
 
-def test_without_being_asked_a_process_stays_on_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_by_default_a_process_stays_on_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
     monkeypatch.delenv("SKYLOOP_KEYS", raising=False)
     assert config.choose() is None
@@ -270,7 +270,7 @@ def test_without_being_asked_a_process_stays_on_its_host(monkeypatch: pytest.Mon
         config.choose(keys="/somewhere")
 
 
-def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_environment_may_choose_the_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_NETWORK", "multicast")
     assert config.choose() == FabricSettings()
     monkeypatch.setenv("SKYLOOP_NETWORK", "10.0.0.5:7447, lab.local")
@@ -278,11 +278,11 @@ def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     assert config.choose("10.0.0.5,multicast") == FabricSettings(connect=("10.0.0.5",))
     given_ = FabricSettings(connect=("1.2.3.4",))
     assert config.choose(given_) is given_
-    with pytest.raises(UsageError, match="is no network address"):
+    with pytest.raises(UsageError, match="is not a network address"):
         config.choose("10.0.0.5:port")
 
 
-def test_an_address_that_was_given_is_waited_for_longer_than_one_that_was_found() -> None:
+def test_a_given_address_gets_more_time_than_a_discovered_one() -> None:
     def open_ms(*connect: str) -> int:
         made = config.make(FabricSettings(connect=connect), Part.APP)
         return int(made["transport"]["unicast"]["open_timeout"])
@@ -290,7 +290,7 @@ def test_an_address_that_was_given_is_waited_for_longer_than_one_that_was_found(
     assert open_ms("10.0.0.5") > open_ms()
 
 
-def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_others_wait_for_an_end_for_its_own_lease(monkeypatch: pytest.MonkeyPatch) -> None:
     def lease_ms() -> object:
         settings = config.choose(network=True)
         assert settings is not None
@@ -306,23 +306,23 @@ def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.Monke
             lease_ms()
 
 
-def test_where_is_looked_is_told_in_words() -> None:
+def test_the_searched_network_is_described_in_words() -> None:
     assert FabricSettings().reach == "multicast"
     assert FabricSettings(connect=("10.0.0.5",), multicast=False).reach == "10.0.0.5"
     assert FabricSettings(multicast=False).reach == "nowhere"
 
 
-def test_without_zenoh_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_zenoh_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
     for use in (lambda: dial("alpha"), lambda: FabricServer("alpha")):
         with pytest.raises(MissingExtraError, match=r"skyloop install network"):
             use()
 
 
-# --- whom to try again ---
+# --- peers to retry ---
 
 
-def test_somebody_new_is_tried_once_until_somebody_was_reached() -> None:
+def test_a_new_peer_is_tried_once_until_a_proxy_was_reached() -> None:
     unreachable = UnreachablePeers()
     assert unreachable.any_new({"a"}, set(), 0.0)
     assert not unreachable.any_new({"a"}, set(), 1.0)
@@ -347,7 +347,7 @@ REQUESTS = st.builds(
 
 
 @given(REQUESTS)
-def test_a_request_and_its_topic_are_the_same_thing(request: VideoRequest) -> None:
+def test_a_request_and_its_topic_are_equivalent(request: VideoRequest) -> None:
     assert VideoRequest.parse(request.topic) == request
     assert VideoRequest.parse(request.plain.topic) == VideoRequest(request.camera)
 
@@ -376,7 +376,7 @@ def test_the_canonical_text() -> None:
         "video/front?&",
     ],
 )
-def test_what_is_no_request(topic: str) -> None:
+def test_invalid_requests(topic: str) -> None:
     with pytest.raises(UsageError):
         VideoRequest.parse(topic)
 
@@ -394,14 +394,14 @@ def test_a_filter_keeps_to_the_rate_and_uses_it(max_fps: float, fps: float, coun
         assert len(kept) >= (times[-1] / 1e9) * max_fps / 2 - 1
 
 
-def test_a_filter_starts_anew_with_a_camera_that_does() -> None:
+def test_a_filter_restarts_with_its_camera() -> None:
     chosen = FrameFilter(VideoRequest("front", max_fps=1.0))
     assert chosen.wants(0, 10**12)
     assert not chosen.wants(1, 10**12 + 10**8)
     assert chosen.wants(0, 5)
 
 
-def test_what_comes_twice_is_told_from_what_is_sent_twice() -> None:
+def test_repeated_packets_are_distinguished_from_equal_ones() -> None:
     recent = RecentPackets(depth=2)
     assert [recent.is_new(*packet) for packet in ((1, b"a"), (1, b"a"), (2, b"a"), (0, b"b"), (1, b"a"))] == [
         *(True, False, True, True),
@@ -409,8 +409,8 @@ def test_what_comes_twice_is_told_from_what_is_sent_twice() -> None:
     ]
 
 
-def test_a_router_passes_on_between_proxies_and_applications() -> None:
-    """Zenoh takes those of one region to reach one another without it."""
+def test_a_router_forwards_between_proxies_and_applications() -> None:
+    """Zenoh assumes that the nodes of one region reach one another without it."""
     settings = FabricSettings(listen=("10.0.0.5",))
     regions = [config.make(settings, part)["region_name"] for part in (Part.PROXY, Part.APP)]
     filters = [south["filters"] for south in config.make(settings, Part.ROUTER)["gateway"]["south"]]
@@ -430,16 +430,16 @@ def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch:
     discovery.proxy_reached()
     try:
         assert discovery.renew(session)
-        assert not discovery.renew(session), "a new session was opened for that node already"
+        assert not discovery.renew(session), "a session was already opened for that node"
         assert retired == [session]
         session.opened = time.monotonic()
         answered.add("another")
-        assert not discovery.renew(session), "a young session searches by itself"
+        assert not discovery.renew(session), "a young session searches anyway"
     finally:
         discovery.proxy_reached()
 
 
-def test_the_end_of_the_process_waits_for_a_session_that_is_being_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_exit_of_the_process_waits_for_a_session_to_close(monkeypatch: pytest.MonkeyPatch) -> None:
     closing, may_end = threading.Event(), threading.Event()
 
     def close() -> None:
@@ -452,20 +452,20 @@ def test_the_end_of_the_process_waits_for_a_session_that_is_being_closed(monkeyp
     pool = _Pool()
     pool._sessions.append(one)  # type: ignore[arg-type]
     pool.release(one)  # type: ignore[arg-type]
-    assert closing.wait(10.0), "it is closed by the thread of the pool"
+    assert closing.wait(10.0), "the pool's thread closes it"
     ending = threading.Thread(target=pool.close_all)
     ending.start()
     assert ending.is_alive()
     may_end.set()
     ending.join(10.0)
     assert not ending.is_alive()
-    with pytest.raises(LinkError, match="process is ending"):
+    with pytest.raises(LinkError, match="process is exiting"):
         pool.acquire(FabricSettings(), Part.APP)
 
 
 @pytest.mark.process
 @pytest.mark.daily
-def test_a_process_may_end_while_a_session_is_being_closed() -> None:
+def test_a_process_may_exit_while_a_session_closes() -> None:
     """``skyloop watch`` ended with exit code 134 and "FATAL: exception not rethrown" (issue 28, C11)."""
     pytest.importorskip("zenoh", reason="needs the extra network: skyloop install network")
     program = (

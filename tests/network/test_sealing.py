@@ -1,4 +1,4 @@
-"""Sealed packets: opened once, by whom they are for, and only as they were sent."""
+"""Sealed packets: opened once, only by their receiver, and only unchanged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ WHERE = "skyloop/1/alpha/command/jane/0123456789abcdef"
 
 
 @given(data=st.binary(max_size=300), attachment=st.binary(max_size=40))
-def test_what_is_sealed_is_opened_once(data: bytes, attachment: bytes) -> None:
+def test_a_sealed_packet_opens_once(data: bytes, attachment: bytes) -> None:
     seal, opener = Seal(KEY), Open().use(KEY)
     payload, longer = seal.seal(WHERE, attachment, data)
     assert len(payload) == len(data) + TAG
@@ -38,7 +38,7 @@ def test_what_is_sealed_is_opened_once(data: bytes, attachment: bytes) -> None:
 
 
 @pytest.mark.parametrize("part", ["where", "attachment", "payload", "key", "moved"])
-def test_whatever_is_changed_on_the_way_does_not_open(part: str) -> None:
+def test_a_packet_changed_on_the_way_does_not_open(part: str) -> None:
     payload, attachment = Seal(KEY).seal(WHERE, bytes(8), b"take off")
     where, key = WHERE, KEY
     if part == "where":
@@ -58,11 +58,11 @@ def test_whatever_is_changed_on_the_way_does_not_open(part: str) -> None:
 @given(st.binary(max_size=60), st.binary(max_size=60))
 def test_garbage_does_not_open(attachment: bytes, payload: bytes) -> None:
     with contextlib.suppress(DecodeError):
-        assert Open().use(KEY).open(WHERE, attachment, payload) is None  # of a generation that is not here yet
+        assert Open().use(KEY).open(WHERE, attachment, payload) is None  # of a generation that has not arrived yet
 
 
 @given(st.lists(st.integers(1, 3 * WIDTH), max_size=80))
-def test_a_number_is_new_once_and_never_when_it_is_too_far_behind(numbers: list[int]) -> None:
+def test_a_number_is_new_once_and_never_when_too_far_behind(numbers: list[int]) -> None:
     window, seen, newest = ReplayWindow(), set[int](), 0
     for number in numbers:
         expected = number not in seen and number > newest - WIDTH
@@ -72,7 +72,7 @@ def test_a_number_is_new_once_and_never_when_it_is_too_far_behind(numbers: list[
 
 
 def test_each_key_expression_has_its_own_window() -> None:
-    """A picture may come long after feedback that was sent later."""
+    """An image may arrive long after feedback that was sent later."""
     seal, opener = Seal(KEY), Open().use(KEY)
     slow = seal.seal("skyloop/1/alpha/video/front/-", b"", b"a picture")
     for _ in range(2 * WIDTH):
@@ -81,7 +81,7 @@ def test_each_key_expression_has_its_own_window() -> None:
     assert opener.open("skyloop/1/alpha/video/front/-", slow[1], slow[0]) == (b"a picture", b"")
 
 
-def test_a_new_key_of_topics_is_in_use_when_it_has_had_time_to_arrive() -> None:
+def test_a_new_topic_key_is_used_once_it_has_had_time_to_arrive() -> None:
     now = [0.0]
     topics = TopicSeal(clock=lambda: now[0])
     before = Open().use(topics.newest.key, topics.newest.generation)
@@ -90,11 +90,11 @@ def test_a_new_key_of_topics_is_in_use_when_it_has_had_time_to_arrive() -> None:
     assert before.open(WHERE, attachment, payload) is not None
     now[0] = SWITCH_S
     payload, attachment = topics.seal(WHERE, b"", b"with the new one")
-    assert before.open(WHERE, attachment, payload) is None, "the key is not here"
+    assert before.open(WHERE, attachment, payload) is None, "the key has not arrived"
     assert before.use(topics.newest.key, topics.newest.generation).open(WHERE, attachment, payload) is not None
 
 
-def test_further_revocations_do_not_put_off_the_switch_for_who_was_shut_out_first() -> None:
+def test_further_revocations_do_not_delay_the_first_switch() -> None:
     now = [0.0]
     topics = TopicSeal(clock=lambda: now[0])
     revoked = Open().use(topics.newest.key, topics.newest.generation)
@@ -115,7 +115,7 @@ def test_old_generations_are_forgotten() -> None:
     payload, attachment = seals[-1].seal(WHERE, b"", b"x")
     assert opener.open(WHERE, attachment, payload) is not None
     payload, attachment = seals[0].seal(WHERE, b"", b"x")
-    with pytest.raises(DecodeError, match="not in use any more"):
+    with pytest.raises(DecodeError, match="an outdated key"):
         opener.open(WHERE, attachment, payload)
 
 

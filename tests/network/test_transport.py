@@ -1,4 +1,4 @@
-"""The fabric transport keeps the contract of all transports, over TCP and UDP on the loopback interface."""
+"""The transport contract, checked for the fabric transport over TCP and UDP on the loopback interface."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class TestFabric(TransportSuite):
         return dial(self.name, FabricSettings(connect=(self.place,), multicast=False))
 
 
-def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
-    """The old one may be half forgotten at the other end, and then finds nobody or gets no answers."""
+def test_after_an_unannounced_end_another_session_is_used() -> None:
+    """The old one may be half forgotten at the other end, and then finds no proxy or gets no answers."""
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
     dialer = dial("alpha", FabricSettings(connect=settings.listen, multicast=False))
 
@@ -51,7 +51,7 @@ def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
             client.close()
             client = dialer(log)
             assert isinstance(client, FabricClient)
-            assert client.session is first, "an end that both know of is none"
+            assert client.session is first, "an announced end does not count"
             found = server._session
             assert found is not None
             found.close()  # as the network would
@@ -63,8 +63,8 @@ def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
     serve_once(serve_once(None))
 
 
-def test_a_start_that_fails_leaves_neither_session_nor_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The network refused a declaration: the session stayed open, and its threads with it."""
+def test_a_failed_start_leaves_neither_session_nor_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network refused a declaration, and the session stayed open with its threads."""
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
     released: list[Session] = []
 
@@ -89,13 +89,13 @@ def test_a_start_that_fails_leaves_neither_session_nor_threads(monkeypatch: pyte
     assert not [thread.name for thread in threading.enumerate() if "leaky" in thread.name]
     assert server._session is None
     assert server._declared == []
-    again = FabricServer("leaky", settings)  # the port is free, and so is the name
+    again = FabricServer("leaky", settings)  # port and name are free
     again.start(ServerLog())
     again.stop()
 
 
-def test_names_of_forms_are_forgotten_with_their_last_reader() -> None:
-    """Each new size of a camera's pictures left a topic behind, for as long as the proxy ran."""
+def test_form_names_are_forgotten_with_their_last_reader() -> None:
+    """Each new size of a camera's images left a topic behind for the life of the proxy."""
     publisher = Publisher("alpha", "0" * 16, PLAIN)
     publisher.video.topic_problem = lambda _: ""
     connection = SimpleNamespace(
@@ -110,7 +110,7 @@ def test_names_of_forms_are_forgotten_with_their_last_reader() -> None:
     publisher.video.end()
 
 
-def test_a_subscription_arrives_where_much_waits_before_it() -> None:
+def test_a_subscription_arrives_despite_a_backlog() -> None:
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
     server = FabricServer("alpha", settings)
     server.start(ServerLog())
@@ -121,10 +121,10 @@ def test_a_subscription_arrives_where_much_waits_before_it() -> None:
             while client._outgoing.put(encode(LogEntry("app", "height", 0, number=1.0)), layout.ASK):
                 pass
         client.subscribe(FEEDBACK)
-        wait_until(lambda: server.subscribers(FEEDBACK) == 1, "the proxy knows of it")
+        wait_until(lambda: server.subscribers(FEEDBACK) == 1, "the proxy has it")
         client._outgoing = Outgoing(depth=0)
         client.subscribe(FEEDBACK, False)
-        wait_until(lambda: bool(log.closings), "a connection that can't tell the proxy has ended")
+        wait_until(lambda: bool(log.closings), "a connection that can't send it has ended")
         assert "the subscription to 'feedback' can't be sent" in log.closings[0]
         client.close()
     finally:

@@ -1,4 +1,4 @@
-"""The transport server's video: what is encoded, for whom, and what a reader that can't keep up is sent."""
+"""The transport server's video: encoding, receivers, and slow readers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ JPEG = VideoRequest("front", encoding="jpeg").topic
 
 
 class Network:
-    """What was sent: of which topic, which frame, to whom (None: all)."""
+    """Records sends: topic, frame, and receivers (None: all)."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, int, tuple[Hashable, ...] | None]] = []
@@ -58,7 +58,7 @@ def network() -> Iterator[Network]:
     made.video.end()
 
 
-def test_nobody_there(network: Network) -> None:
+def test_without_readers_nothing_is_sent(network: Network) -> None:
     assert network.publish(1) == 0
     assert network.video.readers("front") == 0
     assert not network.video.subscribe("a", "video/front?scale=7")
@@ -74,7 +74,7 @@ def test_one_send_serves_all_readers_of_one_form(network: Network) -> None:
     assert network.sends(1) == [(PLAIN, 1, None)]
 
 
-def test_a_slow_reader_is_left_out_while_the_others_go_on_and_gets_the_newest(network: Network) -> None:
+def test_a_slow_reader_misses_frames_while_others_continue_and_gets_the_newest(network: Network) -> None:
     network.video.subscribe("fast", PLAIN)
     network.video.subscribe("slow", PLAIN)
     for seq in range(WINDOW):
@@ -89,17 +89,17 @@ def test_a_slow_reader_is_left_out_while_the_others_go_on_and_gets_the_newest(ne
     assert network.sends(6)[-1] == (PLAIN, 4, ("slow",))
 
 
-def test_the_newest_takes_the_place_of_one_that_still_waits(network: Network) -> None:
-    network.gate.clear()  # it takes long to encode and send
+def test_the_newest_replaces_a_waiting_one(network: Network) -> None:
+    network.gate.clear()  # encoding and sending take long
     network.video.subscribe("a", PLAIN)
     assert network.publish(0) == 0
-    wait_until(lambda: not network.video._variants["front"][PLAIN].readers["a"].due, "it was taken up")
+    wait_until(lambda: not network.video._variants["front"][PLAIN].readers["a"].due, "it is being sent")
     assert [network.publish(seq) for seq in range(1, 10)] == [0] * (WINDOW - 1) + [1] * (10 - WINDOW)
     network.gate.set()
     assert network.sends(2) == [(PLAIN, 0, None), (PLAIN, 9, None)]
 
 
-def test_a_frame_of_which_nothing_is_heard_is_taken_for_lost(network: Network) -> None:
+def test_an_unacknowledged_frame_counts_as_lost(network: Network) -> None:
     network.video.subscribe("a", PLAIN)
     for seq in range(WINDOW):
         network.publish(seq)
@@ -110,7 +110,7 @@ def test_a_frame_of_which_nothing_is_heard_is_taken_for_lost(network: Network) -
     assert network.sends(WINDOW + 1)[-1] == (PLAIN, WINDOW + 1, None)
 
 
-def test_each_form_is_made_once_and_those_who_leave_cost_nothing(network: Network) -> None:
+def test_each_form_is_encoded_once_and_readers_that_leave_cost_nothing(network: Network) -> None:
     for key in "ab":
         network.video.subscribe(key, SMALL)
         network.video.subscribe(key, JPEG)
@@ -124,7 +124,7 @@ def test_each_form_is_made_once_and_those_who_leave_cost_nothing(network: Networ
     assert network.sends(3)[2:] == [(JPEG, 2, None)]
 
 
-def test_without_what_encodes_frames_go_as_they_are_and_that_is_said_once(
+def test_without_an_encoder_frames_are_sent_unencoded_and_that_is_logged_once(
     network: Network, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(__import__("sys").modules, "cv2", None)
@@ -134,10 +134,10 @@ def test_without_what_encodes_frames_go_as_they_are_and_that_is_said_once(
         network.sends(seq + 1)
         assert network.headers[-1].encoding is Encoding.BGR8
         network.video.taken("a", JPEG, network.numbers[-1])
-    assert len([record for record in caplog.records if "is sent as it is" in record.getMessage()]) == 1
+    assert len([record for record in caplog.records if "is sent unencoded" in record.getMessage()]) == 1
 
 
-def test_a_send_that_fails_costs_one_frame(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failed_send_costs_one_frame(caplog: pytest.LogCaptureFixture) -> None:
     sent: list[int] = []
 
     def send(variant: Variant, number: int, head: FrameHeader, data: bytes, to: object) -> None:
@@ -149,13 +149,13 @@ def test_a_send_that_fails_costs_one_frame(caplog: pytest.LogCaptureFixture) -> 
     video.subscribe("a", PLAIN)
     for seq in range(2):
         video.publish(header(seq), picture(header(seq)))
-        wait_until(lambda: not video._variants["front"][PLAIN].readers["a"].due, "it was taken up")
+        wait_until(lambda: not video._variants["front"][PLAIN].readers["a"].due, "it is being sent")
     wait_until(lambda: sent == [1], "the next one was sent")
     video.end()
     assert "could not be sent" in caplog.text
 
 
-# --- pictures ---
+# --- images ---
 
 
 def test_jpeg_of_each_encoding() -> None:
@@ -180,7 +180,7 @@ def test_jpeg_of_each_encoding() -> None:
         assert np.abs(shown.astype(int) - expected).max() < 24
 
 
-def test_quality_is_a_choice_and_jpeg_is_not_encoded_again() -> None:
+def test_quality_is_selectable_and_jpeg_is_not_encoded_again() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
     head = FrameHeader("front", 1, 1, 1, 64, 48, Encoding.BGR8, noise.size)
     sizes = [

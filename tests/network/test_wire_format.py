@@ -1,4 +1,4 @@
-"""The page about the bytes on a network says what the fabric transport does."""
+"""The page on the wire format matches the fabric transport."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def test_golden_packets(name: str) -> None:
     assert {path.stem for path in (PACKETS / "fabric").glob("*.bin")} == set(GOLDEN)
 
 
-def test_the_packet_that_is_shown_byte_by_byte() -> None:
+def test_the_packet_shown_byte_by_byte() -> None:
     rows = re.findall(r"^\| \d+ \| \d+ \| `([0-9A-F ]+)` \|$", FABRIC, re.MULTILINE)
     assert bytes.fromhex("".join(rows)) == packets.taken("feedback", 9)
 
 
-def test_the_fields_of_what_begins_a_connection() -> None:
+def test_the_fields_of_the_first_packets() -> None:
     for struct in (packets.Join, packets.Welcome, packets.ProxyInfo):
         (row,) = re.findall(rf"^\| {struct.__name__} \| (.*) \|$", FABRIC, re.MULTILINE)
         assert re.findall(r"`(\w+)`", row) == [field.name for field in msgspec.structs.fields(struct)]

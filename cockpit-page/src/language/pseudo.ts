@@ -1,5 +1,5 @@
-// A language for tests: English with accents, in brackets. What is read without them on the page was not taken from the
-// language file. Chosen by the setting `language`, "pseudo", which no menu offers.
+// A language for tests: English with accents, in brackets. Text on the page without them does not come from the language
+// file. Selected by the setting `language`, "pseudo", which no menu offers.
 
 import type { Language } from "./index.js";
 

@@ -22,9 +22,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def interrupt_by_signals(numbers: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM)) -> None:
-    """Raise KeyboardInterrupt on SIGINT, which shells ignore for what they run in the background, and on SIGTERM.
+    """Raise KeyboardInterrupt on SIGTERM, and on SIGINT, which shells ignore for background jobs.
 
-    Does nothing on another thread than the main one.
+    Does nothing on threads other than the main one.
     """
 
     def interrupt(*_: object) -> NoReturn:

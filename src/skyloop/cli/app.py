@@ -1,4 +1,4 @@
-"""Puts the commands together, with help as plain text, and turns Skyloop's own errors into one clear line."""
+"""Assembles the commands, with plain-text help, and prints Skyloop's own errors as one clear line."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from skyloop.cli.text import WordError, coloured, error_text, make_printable, us
 from skyloop.errors import MissingExtraError, ParameterError, SkyloopError, install_command
 
 _log = logging.getLogger(__name__)
-VERBOSE: Final = "--verbose"  #: works before and behind any command
+VERBOSE: Final = "--verbose"  #: accepted before and after any command
 FAILED: Final = 1
 USAGE_ERROR: Final = 2
 _WIDEST: Final = 80
 _NARROWEST: Final = 34
-_COLUMN: Final = 30  #: of the options; a longer one has its text on the next line
+_COLUMN: Final = 30  #: of the options; longer ones have their text on the next line
 _NARROW_COLUMN: Final = 8
 _KINDS: Final = (
     (re.compile(r"<(?:float|int)(?: range)?>"), "N"),
@@ -42,7 +42,7 @@ _RANGES: Final = (
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """Return the command line. Only the modules of these commands are imported now; others when they are asked for."""
+    """Return the command line. Only the modules of these commands are imported now, others on demand."""
     app = typer.Typer(
         name="skyloop",
         cls=ByTask,
@@ -59,7 +59,7 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
             "short_help": entry.summary,
             "epilog": f"Example: skyloop {entry.example}",
         }
-        if isinstance(function, typer.Typer):  # a command with commands of its own
+        if isinstance(function, typer.Typer):  # a command with subcommands
             for info in function.registered_commands:
                 info.cls = Command
             app.add_typer(function, name=name, cls=Group, **shown)
@@ -70,12 +70,12 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 
 def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
-    """Return the class of a command that these take the place of, where they are its first word."""
+    """Return a command class that hands over to one of these if it is the first word."""
     return type("Behaviours", (WithBehaviours,), {"behaviours": {n: _alone(n, each) for n, each in entries.items()}})
 
 
 def _alone(name: str, entry: Entry) -> Any:
-    """Return one command, of a command line of its own."""
+    """Return one command from a separate command line."""
     own = typer.Typer(add_completion=False, rich_markup_mode=None)
     function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
     own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
@@ -83,7 +83,7 @@ def _alone(name: str, entry: Entry) -> Any:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit: with 2 for a wrong word or value, 1 for what failed, 0 for what worked."""
+    """Run the command line and exit: 0 on success, 1 on failure, 2 for a wrong word or value."""
     given = with_place(sys.argv[1:] if arguments is None else arguments)
     if VERBOSE in given:
         given.remove(VERBOSE)
@@ -92,7 +92,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
-    """Run a command line under its name, and exit as :func:`main` does."""
+    """Run a command line under its name, and exit like :func:`main`."""
     make_printable()
     try:
         code = app(arguments, prog_name=name, standalone_mode=False)
@@ -106,7 +106,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
         sys.exit(USAGE_ERROR)
     except SkyloopError as error:
         _fail(error, arguments, name)
-    except ImportError as error:  # of a part that none of Skyloop's modules looked for
+    except ImportError as error:  # of a part that no module of Skyloop checks for
         from skyloop.cli.install import missing
 
         entry = entry_of(arguments)
@@ -120,7 +120,7 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
 def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
     _log.debug("the command failed", exc_info=error)
     told, entry = error_text(error), entry_of(arguments)
-    if entry is not None and install_command("") in told:  # its own, or of a proxy that it started
+    if entry is not None and install_command("") in told:  # its own error, or that of a proxy it started
         from skyloop.cli.install import with_all_missing
 
         told = with_all_missing(told, entry.extras)
@@ -129,7 +129,7 @@ def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
 
 
 def log_to_stderr() -> None:
-    """Log all that Skyloop reports of itself to standard error, with the time and the thread."""
+    """Log Skyloop's own messages to standard error, with time and thread."""
     logging.basicConfig(
         level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s [%(threadName)s] %(message)s", stream=sys.stderr
     )
@@ -149,24 +149,24 @@ def _skyloop(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option(VERBOSE, help="Log details to standard error; also behind any command.")
+        bool, typer.Option(VERBOSE, help="Log details to standard error; also accepted after any command.")
     ] = False,
 ) -> None:
-    """Fly small drones by their cameras: simulated ones, real ones, several at once.
+    """Fly small drones by their cameras: simulated or real, one or several.
 
-    skyloop COMMAND --help shows more about a command, with an example.
+    skyloop COMMAND --help describes a command, with an example.
     """
 
 
 def width() -> int:
-    """Return how many columns help may take: those of the terminal, at most 80."""
+    """Return the width of help in columns: the terminal's, at most 80."""
     return max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns) - 2)
 
 
 class Command(TyperCommand):
-    """A command whose help names its arguments as they are typed: ``NAME``, ``[NAME]`` where it may be left out.
+    """A command whose help shows its arguments as typed: ``NAME``, or ``[NAME]`` if optional.
 
-    An argument's ``metavar`` is shown as it is: NAME is optional for Typer, as ``--drone`` may take its place.
+    The ``metavar`` of an argument is shown verbatim: NAME is optional for Typer, because ``--drone`` may replace it.
     """
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -179,16 +179,16 @@ class Command(TyperCommand):
 
 
 class WithBehaviours(Command):
-    """A command whose first word may be the name of another one, with options of its own: ``skyloop fly follow``.
+    """A command whose first word may name another command with its own options: ``skyloop fly follow``.
 
     Attributes:
-        behaviours: These commands by name.
+        behaviours: The other commands, by name.
     """
 
     behaviours: ClassVar[Mapping[str, Any]] = {}
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse the words of whichever command they are for."""
+        """Parse the words for the command that they name."""
         other = self.behaviours.get(args[0]) if args else None
         if other is None:
             return super().make_context(info_name, args, parent, **extra)
@@ -196,7 +196,7 @@ class WithBehaviours(Command):
 
 
 class Group(TyperGroup):
-    """A command with commands of its own, listed each with its whole summary, wrapped where it does not fit."""
+    """A command with subcommands, listed with their whole summaries, wrapped if necessary."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
@@ -215,16 +215,16 @@ class Group(TyperGroup):
 
 
 class ByTask(Group):
-    """All commands of the table in its order; each is made when it is asked for."""
+    """All commands in the order of the table; each is created on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
         """Return the names of the commands in the order of the help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, which is made now if it was not before; None for an unknown one."""
+        """Return a command, creating it if necessary; None for an unknown one."""
         if cmd_name not in COMMANDS:
-            for name in COMMANDS:  # among which Typer looks for the one that was meant
+            for name in COMMANDS:  # Typer looks for similar names among these
                 self.get_command(ctx, name)
         elif cmd_name not in self.commands:
             made: Any = typer.main.get_command(build([cmd_name]))
@@ -232,14 +232,14 @@ class ByTask(Group):
         return self.commands.get(cmd_name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
-        """Write the list of commands, of which none is made for that."""
+        """Write the list of commands without creating any."""
         write_sections(
             formatter, {task: [(n, e.summary) for n, e in COMMANDS.items() if e.task is task] for task in Task}
         )
 
 
 def write_sections(formatter: Any, sections: Mapping[str, list[tuple[str, str]]]) -> None:
-    """Write commands and their summaries under titles, all in the same columns."""
+    """Write commands and their summaries under titles, in the same columns."""
     longest = max((len(name) for rows in sections.values() for name, _ in rows), default=0)
     for title, rows in sections.items():
         with formatter.section(title):
@@ -247,7 +247,7 @@ def write_sections(formatter: Any, sections: Mapping[str, list[tuple[str, str]]]
 
 
 def argument_words(command: Any, ctx: Any) -> list[str]:
-    """Return a command's arguments as its usage line shows them."""
+    """Return a command's arguments as shown in its usage line."""
     words = []
     for param in command.get_params(ctx):
         if param.param_type_name != "argument" or getattr(param, "hidden", False):
@@ -258,7 +258,7 @@ def argument_words(command: Any, ctx: Any) -> list[str]:
 
 
 def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
-    """Return the words that a command takes, and what each means, as ``Arguments`` and ``Options`` if there are any."""
+    """Return a command's words with their meanings, as ``Arguments`` and ``Options`` if there are any."""
     arguments, options = [], []
     for param in command.get_params(ctx):
         if param.param_type_name == "argument":
@@ -270,7 +270,7 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write arguments by their words alone, and options with what they take."""
+    """Write arguments as their words only, and options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

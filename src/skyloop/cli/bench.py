@@ -1,4 +1,4 @@
-"""``skyloop bench``: this machine's delays beside those of a bare hand-over, and the speed of the simulator on it."""
+"""``skyloop bench``: measures this machine's delays beside those of a bare hand-over, and the simulator's speed."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ _SMALL: Final = (320, 240)
 def bench(
     what: Annotated[
         What,
-        typer.Argument(help="delays: of the three channels, beside a bare hand-over of the same bytes; sim: simulator"),
+        typer.Argument(help="delays: the channels, beside a bare hand-over of the same bytes; sim: the simulator"),
     ],
-    seconds: Annotated[float, typer.Option(min=LEAST_S, help="How long to measure; delays: each of the two")] = 30.0,
+    seconds: Annotated[float, typer.Option(min=LEAST_S, help="Duration; for delays, of each of the two")] = 30.0,
     sizes: Annotated[
-        str | None, typer.Option(help="delays: of the frames, such as 320x240,640x480 [default: 320x240]")
+        str | None, typer.Option(help="delays: frame sizes, such as 320x240,640x480 [default: 320x240]")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: the figures as one JSON object")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the figures as one JSON object")] = False,
 ) -> None:
-    """Measure delays on this machine, as medians and 99th percentiles, or how fast the simulator is.
+    """Measure delays on this machine, as medians and 99th percentiles, or the speed of the simulator.
 
-    Nothing else should run meanwhile.
+    Close all other programs first.
     """
     if sizes is not None and what is not What.DELAYS:
         raise UsageError(f"--sizes is for bench delays, not for bench {what.value}")
@@ -65,20 +65,20 @@ def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> li
     """Parse sizes of frames such as ``320x240,640x480``.
 
     Raises:
-        UsageError: The text is anything else.
+        UsageError: The text is not a list of sizes.
     """
     sizes = []
     for word in text.split(",") if text is not None else ["x".join(map(str, _SMALL))]:
         width, _, height = word.strip().replace("×", "x").partition("x")
         size = (int(width), int(height)) if width.isdecimal() and height.isdecimal() else (0, 0)
         if not 0 < size[0] * size[1] <= largest[0] * largest[1]:
-            raise UsageError(f"{word!r} is no size of frames: give such as 320x240, at most {largest[0]}x{largest[1]}")
+            raise UsageError(f"{word!r} is not a frame size: give e.g. 320x240, at most {largest[0]}x{largest[1]}")
         sizes.append(size)
     return list(dict.fromkeys(sizes))
 
 
 def delay_table(results: DelayResults) -> Table:
-    """Return the delays beside the bare hand-over's."""
+    """Return a table of the delays beside those of the bare hand-over."""
     rows = [
         (
             f"{row.channel} {row.size}" if row.channel == "video" else row.channel,
@@ -95,7 +95,7 @@ def delay_table(results: DelayResults) -> Table:
 
 
 def physics_table(results: SimResults) -> Table:
-    """Return the figures of flying without pictures."""
+    """Return a table for flying without pictures."""
     rows = [
         (
             str(row.drones),
@@ -111,7 +111,7 @@ def physics_table(results: SimResults) -> Table:
 
 
 def drawing_table(results: SimResults) -> Table:
-    """Return the figures of pictures with the flaws of the sensor."""
+    """Return a table for pictures with the sensor's flaws."""
     rows = [
         (
             row.cameras,

@@ -1,4 +1,4 @@
-"""``skyloop camera``: prints boards, calibrates cameras by them, and lists those of this machine."""
+"""``skyloop camera``: prints calibration boards, calibrates cameras with them, and lists this machine's cameras."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
     from skyloop.calibration import Calibration
     from skyloop.vision.calibrating import Board, BoardFinder, BoardView, Collector
 
-    Picture = tuple[str, NDArray[np.uint8]]  # its name, and its pixels
+    Picture = tuple[str, NDArray[np.uint8]]  # name and pixels
 
 camera = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop camera "
-_MAX_BYTES: Final = 256 << 20  #: of a picture's file
+_MAX_BYTES: Final = 256 << 20  #: of an image file
 _PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _GOOD_COVERAGE: Final = 0.5
 _GOOD_RMS_PX: Final = 1.0
-_PATIENCE_S: Final = 10.0  # without a picture
+_PATIENCE_S: Final = 10.0  # without a frame
 
 
 class Kind(StrEnum):
@@ -47,20 +47,20 @@ class Lens(StrEnum):
 
 Columns = Annotated[int, typer.Option(metavar="N", help="Squares across")]
 Rows = Annotated[int, typer.Option(metavar="N", help="Squares down")]
-SquareMm = Annotated[float, typer.Option(metavar="MM", help="Side of a square; measure it once it is printed")]
-KindOption = Annotated[Kind, typer.Option(help="A ChArUco board may be seen in part, a chessboard as a whole")]
-Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco board's markers")]
+SquareMm = Annotated[float, typer.Option(metavar="MM", help="Side of a square; measure it after printing")]
+KindOption = Annotated[Kind, typer.Option(help="A ChArUco board may be partly visible, a chessboard must be whole")]
+Dictionary = Annotated[str, typer.Option(metavar="NAME", help="The markers of a ChArUco board")]
 
 
 @camera.callback()
 def _camera() -> None:
-    """Print a board, calibrate a camera by pictures of it, and list the cameras of this machine.
+    """Print a board, calibrate a camera with pictures of it, and list this machine's cameras.
 
-    skyloop camera COMMAND --help shows more about each.
+    skyloop camera COMMAND --help describes each.
     """
 
 
-@camera.command(short_help="Write a board to be printed", epilog=f"{_EXAMPLE}board -o board.pdf")
+@camera.command(short_help="Write a board to print", epilog=f"{_EXAMPLE}board -o board.pdf")
 def board(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A .pdf or .png")] = Path("board.pdf"),
     columns: Columns = 7,
@@ -68,16 +68,16 @@ def board(
     square_mm: SquareMm = 33.0,
     kind: KindOption = Kind.CHARUCO,
     dictionary: Dictionary = "4x4_50",
-    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Of the picture")] = 300,
+    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Resolution of a picture")] = 300,
 ) -> None:
-    """Write a board for calibration; the standard one fits A4. Print it at 100 %, and glue it onto something flat."""
+    """Write a calibration board; the default fits A4. Print it at 100 %, and glue it onto something flat."""
     made = _board(columns, rows, square_mm, kind, dictionary)
     made.save(output, dpi)
     size = f"{(columns + 1) * square_mm:g} × {(rows + 1) * square_mm:g} mm"
     typer.echo(f"wrote {output}: {columns} × {rows} squares of {square_mm:g} mm, {size} with its margin")
 
 
-@camera.command(short_help="Calibrate by images of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
+@camera.command(short_help="Calibrate with images of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
 def calibrate(
     source: Annotated[
         list[str] | None,
@@ -88,24 +88,24 @@ def calibrate(
     drone: DroneOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
     camera: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of the vehicle's cameras [default: the first]")
+        str | None, typer.Option(metavar="NAME", help="The vehicle's camera [default: the first]")
     ] = None,
-    model: Annotated[Lens, typer.Option(help="Of the lens; a fisheye sees more than about 100° across")] = Lens.PINHOLE,
-    views: Annotated[int, typer.Option(min=6, max=200, help="How many to take from a vehicle or a video")] = 25,
-    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="How long to look for them at most")] = 180.0,
+    model: Annotated[Lens, typer.Option(help="Lens model; a fisheye sees more than about 100° across")] = Lens.PINHOLE,
+    views: Annotated[int, typer.Option(min=6, max=200, help="Number of views to take from a vehicle or a video")] = 25,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="Longest search for them")] = 180.0,
     columns: Columns = 7,
     rows: Rows = 5,
     square_mm: SquareMm = 33.0,
     kind: KindOption = Kind.CHARUCO,
     dictionary: Dictionary = "4x4_50",
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over an existing file")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
     """Find a camera's focal length, principal point and distortion, and write them as JSON.
 
-    Show the board near and far, in all corners of the picture, and tilted. Views that differ are taken by
-    themselves; Ctrl-C ends that early.
+    Show the board near and far, in all corners of the picture, and tilted. Views that differ are taken
+    automatically; Ctrl-C ends that early.
     """
     from skyloop.vision.calibrating import BoardFinder
     from skyloop.vision.calibrating import calibrate as fit
@@ -113,7 +113,7 @@ def calibrate(
     join_network(network, keys)
     named = source or [one_drone(None, drone)]
     if output.exists() and not overwrite:
-        raise UsageError(f"{output} exists: give another name, or --overwrite")
+        raise UsageError(f"{output} exists: choose another name, or give --overwrite")
     search = _Search(BoardFinder(_board(columns, rows, square_mm, kind, dictionary)), views)
     if _are_files(named):
         search.every = all(_is_picture(name) for name in named)
@@ -121,12 +121,12 @@ def calibrate(
     else:
         with _Vehicle(named[0], camera, seconds) as vehicle:
             tell(
-                f"looking for a board of {columns} × {rows} squares for {seconds:g} s at most; Ctrl-C ends that earlier"
+                f"looking for a board of {columns} × {rows} squares for at most {seconds:g} s; Ctrl-C ends that earlier"
             )
             search.run(vehicle.pictures(), vehicle.draw)
     collector = search.collector
     if collector is None:
-        raise UsageError("no frame came")
+        raise UsageError("no frame arrived")
     tell(f"{search.looked} images searched, {len(collector.views)} views of the board taken")
     found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
     found.save(output)
@@ -135,7 +135,7 @@ def calibrate(
 
 @camera.command("list", short_help="List the cameras of this machine", epilog=f"{_EXAMPLE}list")
 def list_cameras() -> None:
-    """List the cameras of this machine: their addresses, formats, sizes, rates, exposure and gain."""
+    """List this machine's cameras: addresses, formats, sizes, rates, exposure and gain."""
     from skyloop.vehicles.video.v4l2 import cameras, described, listed
 
     found = cameras()
@@ -146,17 +146,17 @@ def list_cameras() -> None:
 
 
 class _Search:
-    """Looks for the board in one picture after the other."""
+    """Searches one picture after another for the board."""
 
     def __init__(self, finder: BoardFinder, most: int) -> None:
-        self.every = False  #: whether each view is taken: of single pictures; of a stream those that differ are
+        self.every = False  #: take every view, as of single pictures; of a stream only differing views are taken
         self.collector: Collector | None = None
         self.looked = 0
         self._finder = finder
         self._most = most
 
     def run(self, pictures: Iterable[Picture], found: Callable[[Any, BoardView], None] | None = None) -> None:
-        """Until there are no more pictures, enough views, or Ctrl-C. Raises :class:`UsageError` for other sizes."""
+        """Search until the pictures end, enough views are found, or Ctrl-C. :class:`UsageError` for other sizes."""
         from skyloop.vision.calibrating import Collector
 
         try:
@@ -166,7 +166,7 @@ class _Search:
                 if self.collector is None:
                     self.collector = Collector(*size)
                 elif self.collector.size != size:
-                    raise UsageError(f"{name} is {_by(size)} pixels, and those before are {_by(self.collector.size)}")
+                    raise UsageError(f"{name} has {_by(size)} pixels, those before have {_by(self.collector.size)}")
                 view = self._finder.find(picture, name)
                 if view is not None and found is not None:
                     found(picture, view)
@@ -179,7 +179,7 @@ class _Search:
     def _take(self, collector: Collector, view: BoardView | None, name: str) -> None:
         if view is None:
             if self.every:
-                tell(f"{name}: the board is not seen, or too little of it")
+                tell(f"{name}: the board is not visible, or too little of it")
         elif self.every:
             collector.views.append(view)
         elif collector.offer(view):
@@ -195,7 +195,7 @@ def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: st
 
 def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None:
     for view in rejected:
-        tell(f"left out, as it does not fit the others: {view.name}")
+        tell(f"left out, because it does not fit the others: {view.name}")
     sure = "" if found.fx_deviation is None else f" ± {found.fx_deviation:.1f}"
     assert found.rms_px is not None
     assert found.coverage is not None
@@ -205,9 +205,9 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
     )
     typer.echo(f"reprojection error {found.rms_px:.3f} px RMS over {found.views} views, coverage {found.coverage:.0%}")
     if found.rms_px > _GOOD_RMS_PX:
-        tell("that error is large: is the board flat, and its size in squares as given?")
+        tell("that error is large: is the board flat, and its number of squares correct?")
     if found.coverage < _GOOD_COVERAGE:
-        tell("little of the image was covered: the distortion is known there only; show the board in the corners too")
+        tell("little of the image was covered: the distortion is only known there; also show the board in the corners")
     typer.echo(f"wrote {output}")
 
 
@@ -215,11 +215,11 @@ def _are_files(source: list[str]) -> bool:
     """Return whether the sources are files.
 
     Raises:
-        UsageError: Some are, others not.
+        UsageError: Only some of them are.
     """
     files = [Path(name).is_file() for name in source]
     if any(files) and not all(files):
-        raise UsageError(f"no file {source[files.index(False)]!r}: give files only, or one vehicle")
+        raise UsageError(f"no file {source[files.index(False)]!r}: give only files, or one vehicle")
     if not any(files) and len(source) > 1:
         raise UsageError(f"no file {source[0]!r}: give files, or one vehicle")
     return all(files)
@@ -249,7 +249,7 @@ def _from_picture(cv: Any, name: str) -> Any:
 
     content = read_bytes(name, "the picture", _MAX_BYTES)
     picture = None
-    if image_size(content) is None or not why_not_decoded(content):  # others are left to OpenCV's own limit
+    if image_size(content) is None or not why_not_decoded(content):  # OpenCV limits the others
         picture = cv.imdecode(np.frombuffer(content, np.uint8), cv.IMREAD_COLOR) if content else None
     if picture is None:
         raise UsageError(f"{name} can't be read as an image")
@@ -272,7 +272,7 @@ def _from_video(cv: Any, name: str) -> Iterator[Picture]:
 
 
 class _Vehicle:
-    """A camera of a vehicle, looked at for so long; a context manager."""
+    """A vehicle's camera, for a limited time; a context manager."""
 
     def __init__(self, source: str, camera: str | None, seconds: float) -> None:
         from skyloop.client import connect
@@ -291,7 +291,7 @@ class _Vehicle:
         self._drone.close()
 
     def pictures(self) -> Iterator[Picture]:
-        """The newest, until the time is over or no more come."""
+        """Yield the newest frames until the time is over or none arrive."""
         end = time.monotonic() + self._seconds
         try:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
@@ -303,7 +303,7 @@ class _Vehicle:
             tell(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
-        """Show in the cockpit what was found."""
+        """Show the found board in the cockpit."""
         from skyloop.messages import Points
 
         corners = tuple((float(x), float(y)) for x, y in view.pixels)

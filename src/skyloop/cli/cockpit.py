@@ -33,41 +33,37 @@ def cockpit(
     port: Annotated[
         int | None,
         typer.Option(
-            metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one [8420, or the next free one]"
+            metavar="PORT", min=0, max=65535, help="Port of the page; 0: any free one [8420, or the next free one]"
         ),
     ] = None,
     host: Annotated[
         str,
-        typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback --pair, tokens or certificates are needed"),
+        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback this needs --pair, tokens or certificates"),
     ] = "127.0.0.1",
     token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Who may come in: lines of ROLE TOKEN [NAME]")
+        Path | None, typer.Option(metavar="FILE", help="People to admit: lines of ROLE TOKEN [NAME]")
     ] = None,
     https: Annotated[
         bool,
-        typer.Option(
-            "--https", help="With a certificate that is made for this machine; browsers need it to decode H.264"
-        ),
+        typer.Option("--https", help="Use a certificate made for this machine; browsers need https to decode H.264"),
     ] = False,
     tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="The page's certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its key, PEM")] = None,
     client_ca: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Admit clients with a certificate of this authority; its OU is the role"),
+        typer.Option(metavar="FILE", help="Admit clients with a certificate from this authority; its OU is the role"),
     ] = None,
-    role: Annotated[Role, typer.Option(help="Of every client, without tokens or certificates")] = Role.PILOT,
+    role: Annotated[Role, typer.Option(help="Role of every client, without tokens or certificates")] = Role.PILOT,
     pair: Annotated[
-        bool, typer.Option("--pair", help="Let in, in --role, each browser that opens the shown link or QR code, once")
+        bool, typer.Option("--pair", help="Admit, in --role, the first browser that opens each link or QR code shown")
     ] = False,
     hostname: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="A name by which browsers reach this machine; repeatable")
+        list[str] | None, typer.Option(metavar="NAME", help="Name by which browsers reach this machine; repeatable")
     ] = None,
-    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Of recordings, made when needed")] = Path(
-        "recordings"
-    ),
+    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for recordings")] = Path("recordings"),
     world: Annotated[
         str | None,
-        typer.Option(metavar="FILE", help="World file of the room, for the maps of drones that don't know theirs"),
+        typer.Option(metavar="FILE", help="World file of the room, for maps of drones that don't report theirs"),
     ] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
@@ -75,7 +71,7 @@ def cockpit(
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
-    It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
+    It admits only programs of the same user on this machine, unless tokens or certificates admit others.
     """
     from skyloop.cockpit import Access, serve_cockpit, with_certificate
     from skyloop.network.config import choose

@@ -1,6 +1,6 @@
-"""The commands of ``skyloop``, by what one wants to do: a line for each. A new command is one more line here.
+"""The commands of ``skyloop``, grouped by task, a line for each. A new command is one more line here.
 
-Help and error messages are made of this table; the module of a command is imported when that command is used.
+Help and error messages come from this table; the module of a command is imported when the command is used.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 
 class Task(StrEnum):
-    """What one wants to do, in the order in which ``skyloop --help`` shows it."""
+    """A kind of task, in the order of ``skyloop --help``."""
 
     FLY = "Fly"
     SEE = "See"
@@ -22,24 +22,24 @@ class Task(StrEnum):
 
 
 class Entry(NamedTuple):
-    """One command: where its function is, its line in the list of commands, how it is called and what it needs."""
+    """One command: the place of its function, its line in the list of commands, an example and its requirements."""
 
     task: Task
     home: str  # module of skyloop.cli, and function
     summary: str  # up to 60 characters, so that the list fits into 80 columns
     example: str
-    extras: tuple[str, ...] = ()  # optional parts that it needs: who lacks one is told of all that are missing
+    extras: tuple[str, ...] = ()  # optional parts that it needs; an error names all that are missing
     settings: Mapping[str, Any] = {}
-    behaviours: Mapping[str, Entry] = {}  # commands that take its place where they are its first word
+    behaviours: Mapping[str, Entry] = {}  # commands that replace it if they are its first word
 
     @property
     def module(self) -> str:
-        """The module of its function, in ``skyloop.cli``."""
+        """The function's module in ``skyloop.cli``."""
         return self.home.partition(":")[0]
 
     @property
     def function(self) -> str:
-        """The name of its function, or of a :class:`typer.Typer` with commands of its own."""
+        """The name of the function, or of a :class:`typer.Typer` with subcommands."""
         return self.home.partition(":")[2]
 
 
@@ -68,7 +68,7 @@ COMMANDS: Final = {
             "follow": Entry(
                 Task.FLY,
                 "fly_follow:fly_follow",
-                "Follow what is in a box, or of a class",
+                "Follow the target in a box, or of a class",
                 "fly follow --class person --seconds 60",
                 ("vision", "detect"),
             )
@@ -77,32 +77,30 @@ COMMANDS: Final = {
     "route": Entry(
         Task.FLY, "route:route", "Check and fly routes of waypoints", "route fly tour.route.json --drone alpha"
     ),
-    "teleop": Entry(Task.FLY, "teleop:teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"),
+    "teleop": Entry(Task.FLY, "teleop:teleop", "Fly a drone with the terminal's keys", "teleop alpha --speed 0.5"),
     "land": Entry(Task.FLY, "ending:land", "Land a drone, or --all of them", "land alpha"),
     "return": Entry(
         Task.FLY, "ending:return_to_start", "Fly a drone, or --all, back to its start and land", "return alpha"
     ),
     "stop": Entry(Task.FLY, "ending:stop", "Emergency stop: cut a drone's motors, or --all", "stop alpha"),
-    "preflight": Entry(
-        Task.FLY, "doctor:preflight", "What speaks against a flight, and what to do about it", "preflight alpha"
-    ),
-    "list": Entry(Task.SEE, "listing:list_proxies", "The running proxies and who flies", "list"),
-    "watch": Entry(Task.SEE, "watch:watch", "What a drone does, live in the terminal", "watch alpha"),
+    "preflight": Entry(Task.FLY, "doctor:preflight", "Check that a drone is ready to fly", "preflight alpha"),
+    "list": Entry(Task.SEE, "listing:list_proxies", "List running proxies and their pilots", "list"),
+    "watch": Entry(Task.SEE, "watch:watch", "Watch a drone live in the terminal", "watch alpha"),
     "cockpit": Entry(
         Task.SEE,
         "cockpit:cockpit",
-        "A page in the browser to watch and fly drones",
+        "Serve a web page to watch and fly drones",
         "cockpit --port 8000",
         ("cockpit",),
     ),
     "view": Entry(Task.SEE, "record:view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
     "process": Entry(
-        Task.SEE, "process:process", "Run a class of yours on a drone's frames", "process detector.py --drone alpha"
+        Task.SEE, "process:process", "Run your own class on a drone's frames", "process detector.py --drone alpha"
     ),
     "detect": Entry(
         Task.SEE,
         "process:detect",
-        "Detect with your ONNX file in a drone's frames, drawn live",
+        "Run your ONNX detector on a drone's frames, drawn live",
         "detect my.onnx --on alpha",
         ("detect", "vision"),
     ),
@@ -113,9 +111,9 @@ COMMANDS: Final = {
         "Serve many vehicles from one process",
         "host fleet.toml",
         behaviours={
-            "status": Entry(Task.SHARE, "host:status", "The vehicles of a running host", "host status"),
+            "status": Entry(Task.SHARE, "host:status", "Show the vehicles of a running host", "host status"),
             "add": Entry(Task.SHARE, "host:add", "Serve one more vehicle", "host add delta tello://192.168.10.1"),
-            "remove": Entry(Task.SHARE, "host:remove", "Land a vehicle and serve it no longer", "host remove delta"),
+            "remove": Entry(Task.SHARE, "host:remove", "Land a vehicle and stop serving it", "host remove delta"),
         },
     ),
     "router": Entry(
@@ -128,12 +126,12 @@ COMMANDS: Final = {
     "keys": Entry(
         Task.SHARE,
         "network:keys",
-        "Who may join the network: make, issue, revoke keys",
+        "Make, issue and revoke the network's keys",
         "keys issue jane --role pilot",
         ("network",),
     ),
-    "ros": Entry(Task.SHARE, "ros:ros", "Drones as nodes of ROS 2", "ros --drone alpha --priority 16", ("ros",)),
-    "audit": Entry(Task.SHARE, "listing:audit", "Who flew which drone when", "audit alpha --last 20"),
+    "ros": Entry(Task.SHARE, "ros:ros", "Show drones as nodes of ROS 2", "ros --drone alpha --priority 16", ("ros",)),
+    "audit": Entry(Task.SHARE, "listing:audit", "Show who flew which drone when", "audit alpha --last 20"),
     "record": Entry(
         Task.RECORD, "record:record", "Record drones to an MCAP file", "record alpha -o flight.mcap", ("record",)
     ),
@@ -143,7 +141,7 @@ COMMANDS: Final = {
     "doctor": Entry(
         Task.SET_UP,
         "doctor:doctor",
-        "What of this machine works, what to install",
+        "Check this machine, or one vehicle",
         "doctor mavlink://tcp:127.0.0.1:5760",
     ),
     "install": Entry(Task.SET_UP, "install:install", "Install optional parts of Skyloop", "install sim vision cockpit"),
@@ -166,7 +164,7 @@ COMMANDS: Final = {
 
 
 def entry_of(words: Sequence[str]) -> Entry | None:
-    """Return the command that the words of a command line are for; None for no or an unknown one."""
+    """Return the command named by the words of a command line; None if there is none or it is unknown."""
     plain = [word for word in words if not word.startswith("-")]
     entry = COMMANDS.get(plain[0]) if plain else None
     return entry if entry is None or len(plain) < 2 else entry.behaviours.get(plain[1], entry)

@@ -1,4 +1,4 @@
-"""``skyloop demo``: a simulated drone finds a marker and follows it by its camera, and says how well."""
+"""``skyloop demo``: a simulated drone finds a marker and follows it by its camera, and reports how well."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
     from skyloop.control.follow import FollowMarker, FollowScore
 
-MARKER_ID = 7  #: on the board that is carried about the room
+MARKER_ID = 7  #: on the board carried around the room
 ENOUGH_IN_VIEW = 0.9
 _REFRESH_HZ = 4
 _FIRST_PICTURE_S: Final = 10.0
 
-#: Option of a demonstration.
+#: The port option of a demonstration.
 PagePort = Annotated[
-    int | None, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one [8420, or the next free one]")
+    int | None, typer.Option(min=0, max=65535, help="Port of the page; 0: any free one [8420, or the next free one]")
 ]
-#: Where a simulated vehicle's native telemetry has its own true place and that of the board, in world axes [m].
+#: Native telemetry with a simulated vehicle's true position and that of the board, in world axes [m].
 OWN_PLACE = ("truth.x", "truth.y", "truth.z")
 BOARD_PLACE = ("truth.target.x", "truth.target.y", "truth.target.z")
-SETTLING_S = 5.0  # after the first sighting the vehicle is still on its way to the marker
+SETTLING_S = 5.0  # after the first sighting the vehicle is still approaching the marker
 
 
 def demo(
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="How long to follow; until Ctrl-C if not given")
+        float | None, typer.Option(min=0.0, help="Duration of following [default: until Ctrl-C]")
     ] = None,
     headless: Annotated[
         bool, typer.Option("--headless", help="No page; exit code 1 if the marker was in view less than 90 %")
     ] = False,
-    world: Annotated[str, typer.Option(help="A world's name or file")] = "room",
-    seed: Annotated[int, typer.Option(min=0, help="Decides the marker's walk, the noise and the wind")] = 0,
+    world: Annotated[str, typer.Option(help="Name or file of a world")] = "room",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the marker's walk, the noise and the wind")] = 0,
     port: PagePort = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
-    name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
+    name: Annotated[str, typer.Option(help="Name of the pilot, as shown to others")] = "demo",
     json: Annotated[
-        bool, typer.Option("--json", help="For programs: the figures as one JSON object; the rest on standard error")
+        bool, typer.Option("--json", help="Print the figures as one JSON object; the rest goes to standard error")
     ] = False,
 ) -> None:
     """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands."""
@@ -88,7 +88,7 @@ class _Demo:
     _on_stop: Callable[[], None] | None = None
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
-        """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
+        """Fly it; ``port`` None: the default port of pages. Raises the errors of connecting and of take-off."""
         from skyloop.control.follow import FollowMarker
 
         report = DemoReport()
@@ -126,7 +126,7 @@ class _Demo:
             follower.run(seconds=self.seconds, until=lambda: self._stopped)
 
     def _stop(self) -> None:
-        """First Ctrl-C: end the flight in good order. The second one is the user's impatience, and Python's."""
+        """End the flight in good order on the first Ctrl-C. A second one interrupts Python as usual."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
@@ -140,7 +140,7 @@ def _page_counts(page: CockpitProcess) -> dict[str, Any] | None:
 
 
 def _status(drone: Drone, follower: FollowMarker) -> Text:
-    """The line that lives in the terminal."""
+    """Return the status line, updated in place."""
     feedback, score = drone.feedback(), follower.score
     frame = drone.frame()
     share = score.share_in_view
@@ -169,19 +169,19 @@ def drone_and_page(
     """Connect to a vehicle, wait for its first picture, and show the page.
 
     Args:
-        uri: The vehicle's.
-        console: To print on.
-        name: Who flies, for those who watch.
+        uri: The vehicle's address.
+        console: For the output.
+        name: Name of the pilot, as shown to others.
         stop: Called on the first Ctrl-C.
-        port: Of the page; None: the default one of pages.
+        port: The page's port; None: the default one.
         page_shown: Whether there is a page.
         browser: Whether to open it in the browser.
 
     Yields:
-        The drone, the page if there is one, and when the first picture had come (monotonic) [s].
+        The drone, the page if there is one, and the time of the first picture (monotonic) [s].
 
     Raises:
-        SkyloopError: Those of connecting.
+        SkyloopError: Any error of connecting.
     """
     from skyloop.client import connect
     from skyloop.cockpit.child import CockpitProcess
@@ -199,7 +199,7 @@ def drone_and_page(
 
 
 def _show(page: CockpitProcess, console: Console, browser: bool) -> None:
-    """Show the page's address, and open it; a demonstration goes on without its page."""
+    """Print the page's address, and open it; without the page a demonstration continues."""
     try:
         address = page.address()
     except LinkError as error:
@@ -211,10 +211,10 @@ def _show(page: CockpitProcess, console: Console, browser: bool) -> None:
 
 
 def land(drone: Drone, console: Console) -> None:
-    """Land, unless somebody else flies the drone."""
+    """Land, unless another application flies the drone."""
     status = drone.authority
     if status.state != "held":
-        console.print(f"[yellow]{status.holder or 'another application'} took over: the drone is left to it[/]")
+        console.print(f"[yellow]{status.holder or 'another application'} took over: leaving the drone to it[/]")
         return
     console.print("landing")
     drone.land()
@@ -222,7 +222,7 @@ def land(drone: Drone, console: Console) -> None:
 
 @contextmanager
 def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """Call ``stop`` on SIGINT and SIGTERM; a second one of either acts as it did before."""
+    """Call ``stop`` on SIGINT and SIGTERM; a second one has its previous effect."""
     before: dict[int, Any] = {}
 
     def put_back() -> None:
@@ -244,7 +244,7 @@ def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Errors of a range [m]."""
+    """Statistics of range errors [m]."""
 
     rms: float
     mean: float
@@ -253,7 +253,7 @@ class Spread:
 
     @classmethod
     def of(cls, errors: list[float]) -> Spread | None:
-        """None of none."""
+        """Return the statistics of errors; None if there are none."""
         if not errors:
             return None
         n = len(errors)
@@ -264,7 +264,7 @@ class Spread:
 
 
 def true_range(native: dict[str, Value] | None) -> float | None:
-    """Return the true distance from the vehicle's centre to the carried board's [m]; None where it is not known."""
+    """Return the true distance from the vehicle's centre to the carried board's [m]; None if unknown."""
     if native is None:
         return None
     places = [[native.get(name) for name in names] for names in (OWN_PLACE, BOARD_PLACE)]
@@ -273,15 +273,12 @@ def true_range(native: dict[str, Value] | None) -> float | None:
 
 
 class TruthMeter:
-    """Compares the true distance with the wanted one while the marker is followed.
-
-    It does so for as long as its ``with`` block lasts.
-    """
+    """Compares the true distance with the desired one while the marker is followed, within a ``with`` block."""
 
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:
         self.errors_m: list[float] = []
         self._follower = follower
-        self._listener = drone.on_feedback(self._look)
+        self._listener = drone.on_feedback(self._compare)
 
     def __enter__(self) -> Self:
         return self
@@ -291,7 +288,7 @@ class TruthMeter:
     ) -> None:
         self._listener.cancel()
 
-    def _look(self, feedback: Feedback) -> None:
+    def _compare(self, feedback: Feedback) -> None:
         first_ns = self._follower.score.first_seen_ns
         distance = true_range(feedback.native)
         if first_ns is None or distance is None or feedback.captured_ns - first_ns < nanoseconds(SETTLING_S):
@@ -301,7 +298,7 @@ class TruthMeter:
 
 @dataclass(slots=True)
 class DemoReport:
-    """The figures, and how they look."""
+    """The figures of a demonstration, and their table."""
 
     first_picture_s: float | None = None  #: from the start of the demo
     frames: int = 0  #: since the marker was first seen
@@ -313,7 +310,7 @@ class DemoReport:
     collisions: int = 0
 
     def take(self, drone: Drone, score: FollowScore, truth: TruthMeter, page: dict[str, Any] | None) -> None:
-        """Note everything that must be asked while the drone is connected."""
+        """Record everything that must be read while the drone is connected."""
         self.frames = score.frames
         self.share_in_view = score.share_in_view
         self.estimated = Spread.of(score.range_errors_m(SETTLING_S))
@@ -326,19 +323,19 @@ class DemoReport:
         return self.share_in_view is not None and self.share_in_view >= enough
 
     def verdict(self, enough: float) -> str:
-        """Return why it was not good."""
+        """Return the reason for a bad result."""
         if self.share_in_view is None:
             return "the marker was never seen"
         return f"the marker was in view in {self.share_in_view:.1%} of the frames, less than {enough:.0%}"
 
     def table(self) -> Table:
-        """Return the figures for the terminal."""
+        """Return the figures as a table for the terminal."""
         table = Table(title="The flight", title_justify="left", show_header=False, box=None)
         seen = "never seen" if self.share_in_view is None else f"{self.share_in_view:.1%} of {self.frames} frames"
         rows = [
             ("marker in view since first seen", seen),
             ("range error, by the camera", _spread_text(self.estimated)),
-            ("range error, truly", _spread_text(self.true)),
+            ("range error, true", _spread_text(self.true)),
             ("collisions", str(self.collisions)),
             ("first frame after", "–" if self.first_picture_s is None else f"{self.first_picture_s:.1f} s"),
         ]
@@ -346,18 +343,18 @@ class DemoReport:
             rows += channel_rows(name, channel)
         if self.page is not None:
             sent, skipped = self.page["frames_sent"], self.page["frames_skipped"]
-            rows.append(("page", f"{sent} frames sent, {skipped} left out for slower browsers"))
+            rows.append(("page", f"{sent} frames sent, {skipped} skipped for slower browsers"))
         for row in rows:
             table.add_row(*row)
         return table
 
 
 def _spread_text(spread: Spread | None) -> str:
-    return "not known" if spread is None else f"{spread} (after the first {SETTLING_S:g} s)"
+    return "unknown" if spread is None else f"{spread} (after the first {SETTLING_S:g} s)"
 
 
 def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
-    """Return the row of a channel; none for one that nothing came by."""
+    """Return the row of a channel; none for an unused one."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

@@ -1,7 +1,7 @@
-"""Check-ups: ``skyloop doctor`` of this machine or of one vehicle, ``skyloop preflight`` before a flight.
+"""Check-ups: ``skyloop doctor`` checks this machine or one vehicle, ``skyloop preflight`` a drone before a flight.
 
 ``skyloop doctor`` lists what works and what to install for the rest; ``skyloop doctor ADDRESS`` connects to one vehicle
-and lists which of its settings need attention. None of them flies anything.
+and lists the settings that need attention. None of them flies anything.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 IMPORT_BUDGET_S: Final = 0.3
 
-#: Ports that Skyloop listens at, or vehicles send to, and for what.
+#: Ports that Skyloop listens on or vehicles send to, with their purposes.
 PORTS: Final = (
     ("UDP", 14550, "MAVLink ground stations"),
     ("UDP", 14540, "PX4"),
@@ -47,14 +47,14 @@ PORTS: Final = (
     ("UDP", 5554, "AR.Drone's navdata"),
     ("TCP", 7447, "routers"),
 )
-ANSWER_S: Final = 3.5  #: for a vehicle to answer; the user gets a result within 5 s
-PATIENCE_S: Final = 40.0  #: for one that answers to be read
+ANSWER_S: Final = 3.5  #: for a vehicle to answer; chosen so that the user gets a result within 5 s
+PATIENCE_S: Final = 40.0  #: for reading a vehicle that answers
 FEEDBACK_S: Final = 3.0
 SETTLE_S: Final = 2.0  #: for faults that end with our first messages, such as a receiver without sticks
 LOOK_S: Final = 0.1
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
 STATE_S = 2.0
-VIDEO_S = 5.0  #: a vehicle that was just started, such as a Tello, sends its first picture after some seconds
+VIDEO_S = 5.0  #: a vehicle just started, such as a Tello, sends its first picture after some seconds
 
 
 class Health(StrEnum):
@@ -65,7 +65,7 @@ class Health(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One line of the report, and one of advice where there is any."""
+    """A line of the report, with a line of advice if there is any."""
 
     what: str
     health: Health
@@ -85,13 +85,13 @@ def as_text(finding: Finding) -> Text:
 
 def doctor(
     address: Annotated[
-        str, typer.Argument(metavar="[ADDRESS]", help="Of a vehicle to check instead; nothing is flown")
+        str, typer.Argument(metavar="[ADDRESS]", help="Vehicle to check instead; nothing is flown")
     ] = "",
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
     """Check Python, the local transport, every optional part, cameras, ports, drivers and proxies; or one vehicle.
 
-    Marks: ✓ works, – optional and not there, or a vehicle's safety net that is off, ✗ broken. The exit code is 1 if
+    Marks: ✓ works, – optional and missing, or a vehicle's safety net is off, ✗ broken. The exit code is 1 if
     something is broken.
     """
     console = Console(soft_wrap=True)
@@ -107,7 +107,7 @@ def doctor(
 
 
 def examine() -> Iterator[Finding]:
-    """All findings, in the order to be read. A check that breaks is a finding too."""
+    """Yield all findings in reading order. A check that breaks is a finding too."""
     from skyloop.errors import MissingExtraError
 
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
@@ -147,7 +147,7 @@ def _local_transport() -> Iterator[Finding]:
         yield Finding(
             "local transport",
             Health.BAD,
-            f"needs Linux, and this is {platform.system()}",
+            f"needs Linux, but this is {platform.system()}",
             "run proxies on Linux; programs elsewhere reach them over the network: SKYLOOP_NETWORK=multicast",
         )
         return
@@ -167,7 +167,7 @@ def _local_transport() -> Iterator[Finding]:
         directory.create()
     except OSError as error:
         detail = f"{directory.path} can't be made: {error.strerror}"
-        yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory of your own")
+        yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory that you own")
     else:
         yield Finding("local transport", Health.GOOD, f"sockets in {directory.path}")
 
@@ -180,7 +180,7 @@ def _import_time() -> Iterator[Finding]:
     subprocess.run([sys.executable, "-c", "import skyloop; skyloop.connect"], check=True)
     taken = time.perf_counter() - begin - bare
     slow = taken > IMPORT_BUDGET_S
-    advice = "a slow or busy machine, or a first start without compiled files: try again" if slow else ""
+    advice = "slow or busy machine, or first start without compiled files: try again" if slow else ""
     yield Finding("import skyloop", Health.GOOD, f"{taken:.2f} s", advice)
 
 
@@ -193,7 +193,7 @@ def _extras() -> Iterator[Finding]:
                 versions.append(f"{module} {getattr(importlib.import_module(module), '__version__', '')}".strip())
             except ModuleNotFoundError:
                 missing.append(module)
-            except ImportError as error:  # it is there, but something that it needs is not
+            except ImportError as error:  # it is installed, but one of its requirements is not
                 broken.append(f"{module}: {error}")
         if broken:
             yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --anew")
@@ -213,7 +213,7 @@ def _compiled_pictures() -> Iterator[Finding]:
     begin = time.perf_counter()
     compiler.start().join()
     if compiler.problem:
-        advice = "set NUMBA_CACHE_DIR to a directory that can be written; until then the simulator draws without"
+        advice = "set NUMBA_CACHE_DIR to a writable directory; until then the simulator draws without it"
         yield Finding("compiled pictures", Health.MISSING, compiler.problem, advice)
     else:
         yield Finding("compiled pictures", Health.GOOD, f"ready after {time.perf_counter() - begin:.1f} s")
@@ -246,16 +246,16 @@ def _browser() -> Iterator[Finding]:
 def _ports() -> Iterator[Finding]:
     taken = [f"{kind} {port} ({use})" for kind, port, use in PORTS if not _free(kind, port)]
     if taken:
-        advice = "fine if a proxy of yours has them; else end the other program, such as a ground station"
+        advice = "fine if your own proxy uses them; otherwise end the other program, such as a ground station"
         yield Finding("ports", Health.MISSING, f"in use: {', '.join(taken)}", advice)
     else:
         yield Finding("ports", Health.GOOD, f"free: {', '.join(f'{kind} {port}' for kind, port, _ in PORTS)}")
 
 
 def _free(kind: str, port: int) -> bool:
-    """Whether a program could listen there."""
+    """Return whether a program could listen there."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
-        if kind == "TCP":  # as servers do: a port that was just closed is free
+        if kind == "TCP":  # as servers do, so that a port just closed counts as free
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind(("", port))
@@ -270,7 +270,7 @@ def _drivers() -> Iterator[Finding]:
 
     schemes = known_schemes()
     if not schemes:
-        yield Finding("drivers", Health.BAD, "none is registered", "install Skyloop with pip, or once more")
+        yield Finding("drivers", Health.BAD, "none is registered", "install Skyloop with pip, again if necessary")
     for scheme in schemes:
         try:
             driver = driver_class(scheme)
@@ -299,10 +299,10 @@ def _proxies() -> Iterator[Finding]:
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """Return what is found, in the order to be read.
+    """Return the findings in reading order.
 
     Raises:
-        SkyloopError: The address is not valid.
+        SkyloopError: The address is invalid.
     """
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.drivers.registry import make_driver
@@ -344,7 +344,7 @@ def _settled(driver: Driver) -> list[Diagnostic]:
 
 
 def _unreachable(sink: RecordingSink) -> Finding:
-    state, reason = sink.links[-1] if sink.links else (LinkState.CONNECTING, "nothing is known")
+    state, reason = sink.links[-1] if sink.links else (LinkState.CONNECTING, "no state reported")
     advice = sink.remedy or "check power, cable, address"
     return Finding("vehicle", Health.BAD, f"its link is {state.value}: {reason}", advice)
 
@@ -353,13 +353,13 @@ def preflight(
     name: NameArgument = None,
     drone: DroneOption = None,
     folder: Annotated[
-        Path, typer.Option(metavar="FOLDER", help="Where recordings are to go, to see whether there is room")
+        Path, typer.Option(metavar="FOLDER", help="Folder for recordings, to check its free space")
     ] = Path("recordings"),
-    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON array of findings")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the findings as a JSON array")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Check a drone before it flies: link, battery, position, zones, video, its own failsafes. It flies nothing.
+    """Check a drone before a flight: link, battery, position, zones, video, its own failsafes. Flies nothing.
 
     Marks: ✓ as it should be, ! it can fly without, ✗ it would not fly, or not safely. The exit code is 1 with any ✗.
     """

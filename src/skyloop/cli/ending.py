@@ -1,4 +1,4 @@
-"""``skyloop land``, ``return`` and ``stop``: the end of a flight from any terminal, of one drone or of all."""
+"""``skyloop land``, ``return`` and ``stop``: end the flight of one drone or of all from any terminal."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from skyloop.extend import Known, connect_to_stop, let_go
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-FRESH_S: Final = 1.0  #: as old as a state may be that is believed
-LANDING_S: Final = 60.0  #: as long as a landing is waited for
-RETURN_S: Final = 600.0  #: as long as a return is waited for
-STOPPING_S: Final = 3.0  #: as long as a stop is repeated until the vehicle reports it
+FRESH_S: Final = 1.0  #: maximum age of a trusted state
+LANDING_S: Final = 60.0  #: longest wait for a landing
+RETURN_S: Final = 600.0  #: longest wait for a return
+STOPPING_S: Final = 3.0  #: how long a stop is repeated until the vehicle reports it
 _REPEAT_S: Final = 0.1
 LEAVE: Final = "take over with --priority 0, or ask them"
 
@@ -33,16 +33,16 @@ PriorityOption = Annotated[
     int | None,
     typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
 ]
-AllOption = Annotated[bool, typer.Option("--all", help="Every drone that runs here, or on the --network")]
-JsonOption = Annotated[bool, typer.Option("--json", help="For programs: one JSON array, once all have ended")]
+AllOption = Annotated[bool, typer.Option("--all", help="All drones on this host, or on the --network")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array once all have ended")]
 
 
 class Ending(msgspec.Struct, frozen=True):
-    """What became of the flight of one drone."""
+    """The outcome of ending one drone's flight."""
 
     name: str
     ok: bool
-    outcome: str  #: in words: how it ended, or why it did not
+    outcome: str  #: how it ended, or why it did not, in words
 
 
 def land(
@@ -56,8 +56,8 @@ def land(
 ) -> None:
     """Land drones, and wait until they have landed.
 
-    A drone that another application flies is left to it, and named, unless --priority is higher (a lower number). With
-    --all everything lands that does not fly with the highest priority itself. Exit code 1 if one has not landed.
+    A drone flown by another application is not touched, but named, unless --priority is higher (a lower number). With
+    --all everything lands except drones flown with the highest priority. Exit code 1 if one has not landed.
     """
     chosen = _chosen(names, drone, every, network, keys)
     wanted = _priority(priority, every)
@@ -71,7 +71,7 @@ def return_to_start(
     height: Annotated[
         float | None,
         typer.Option(
-            metavar="M", min=0.0, help="Metres above the start, at least, on the way [default: return.height]"
+            metavar="M", min=0.0, help="Minimum height above the start on the way [m] [default: return.height]"
         ),
     ] = None,
     priority: PriorityOption = None,
@@ -79,11 +79,11 @@ def return_to_start(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Fly drones back to where they took off, land there, and wait until they have landed.
+    """Fly drones back to their place of take-off, land there, and wait until they have landed.
 
-    Each climbs first, flies straight over its start and lands; with several, nothing keeps them apart on the way. A
-    drone that another application flies is left to it, and named, unless --priority is higher (a lower number). Exit
-    code 1 if one has not landed at its start: like all of them after Ctrl-C it hovers, and lands 5 s later if nobody
+    Each climbs first, flies straight over its start and lands; nothing keeps several apart on the way. A drone
+    flown by another application is not touched, but named, unless --priority is higher (a lower number). Exit code 1 if
+    one has not landed at its start: such a drone, and every one after Ctrl-C, hovers and lands 5 s later if nobody
     flies it.
     """
     chosen = _chosen(names, drone, every, network, keys)
@@ -106,20 +106,20 @@ def stop(
     names: NamesArgument = None,
     drone: DronesOption = None,
     every: AllOption = False,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: the motors are cut at once")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask: cut the motors at once")] = False,
     json: JsonOption = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
     """Emergency stop: cut the motors at once. The drones FALL.
 
-    It works whoever flies, and asks before, except with --yes. Exit code 1 if one has not confirmed it.
+    It works whoever flies, and asks first, except with --yes. Exit code 1 if a drone has not confirmed it.
     """
     chosen = _chosen(names, drone, every, network, keys)
     if not yes:
         if not sys.stdin.isatty():
-            raise UsageError("an emergency stop asks before: give --yes where nobody can answer")
-        typer.confirm(f"Cut the motors of {', '.join(chosen)}? What flies FALLS.", abort=True, err=True)
+            raise UsageError("an emergency stop asks first: give --yes if there is no terminal to answer on")
+        typer.confirm(f"Cut the motors of {', '.join(chosen)}? Flying drones FALL.", abort=True, err=True)
     _each(chosen, _stop, "NOT stopped", json)
 
 
@@ -136,14 +136,14 @@ def _chosen(
     if not every:
         return drones(names, others)
     if names or others:
-        raise UsageError("--all is every drone: give it alone, or names")
+        raise UsageError("--all means every drone: give either --all or names")
     from skyloop.cli.listing import none_runs
     from skyloop.client.connect import running_names
     from skyloop.network.config import choose
 
     found = running_names()
     if not found:
-        raise LinkError(f"no drone is found. {none_runs(choose())}")
+        raise LinkError(f"no drone found. {none_runs(choose())}")
     return found
 
 
@@ -154,9 +154,9 @@ def _each(
     json: bool,
     interrupted: Callable[[], None] = lambda: None,
 ) -> None:
-    """End all flights at the same time, and print a line for each as soon as it has ended, or all as JSON.
+    """End all flights in parallel, and print a line for each as soon as it has ended, or all as JSON.
 
-    ``interrupted`` is called on Ctrl-C, and has to bring about that each ``end`` returns or raises.
+    ``interrupted`` is called on Ctrl-C, and must make each ``end`` return or raise.
     """
 
     def attempt(name: str) -> Ending:
@@ -164,7 +164,7 @@ def _each(
             return Ending(name, True, end(name))
         except SkyloopError as error:
             return Ending(name, False, f"{failed}: {error_text(error)}")
-        except Exception as error:  # noqa: BLE001  what happens to one keeps nobody from hearing of the others
+        except Exception as error:  # noqa: BLE001  one failure must not hide the other results
             return Ending(name, False, f"{failed}: {error!r}")
 
     ended = []
@@ -202,7 +202,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether who flies it lands it already, as another ``skyloop land`` of the same priority; waits for it."""
+    """Return whether its pilot lands it, such as another ``skyloop land`` of the same priority; waits for it."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 
@@ -213,7 +213,7 @@ def _lands_for_others(name: str) -> bool:
 
 
 def _stay(drone: Drone) -> None:
-    """Hover, and begin no return any more."""
+    """Hover, and begin no more returns."""
     let_go(drone, "its return was interrupted", for_good=True)
 
 
@@ -227,14 +227,14 @@ def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]
     authority = Authority(priority=priority)
     with connect_pilot(name, LEAVE, name="skyloop return", authority=authority, on_exit="hover") as back:
         flown.append(back)
-        if interrupted.is_set():  # while it was connected to
+        if interrupted.is_set():  # while connecting
             _stay(back)
         back.return_to_start(height_m, land=True, timeout_s=RETURN_S)
     return "landed at its start"
 
 
 def _over_already(name: str, program: str) -> str:
-    """Return why there is no flight to end, for a person; empty if there is one."""
+    """Return in words why there is no flight to end; empty if there is one."""
     from skyloop.client import connect
 
     with connect(name, access="observe", name=program) as seen:
@@ -244,7 +244,7 @@ def _over_already(name: str, program: str) -> str:
 
 
 def _stop(name: str) -> str:
-    """Cut the motors. It needs no authority, and waits for no answer but that of the connection."""
+    """Cut the motors. Needs no authority, and waits only for the connection."""
     from skyloop.messages import FlightState
 
     with closing(connect_to_stop(name, "skyloop stop")) as drone:
@@ -258,11 +258,11 @@ def _stop(name: str) -> str:
                 return "motors off"
         if _on_the_ground(drone):
             return "motors off, on the ground"
-    raise NoAnswerError(f"sent for {STOPPING_S:g} s, and the vehicle has not confirmed it")
+    raise NoAnswerError(f"sent for {STOPPING_S:g} s, but the vehicle has not confirmed it")
 
 
 def _on_the_ground(drone: Drone) -> bool:
-    """Whether a state that is not old says so."""
+    """Return whether a recent state shows it on the ground."""
     from skyloop.messages import FlightState
 
     try:

@@ -1,4 +1,4 @@
-"""``skyloop fly``: flies a controller from a file, and says how the flight goes and what happens when it fails."""
+"""``skyloop fly``: flies a controller from a file, and reports its progress and errors."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 )
 Make = Callable[[type["Controller"]], "Controller"]
-_LOOK_S: Final = 0.1  #: how often a flight that waits for a mended file looks whether the drone is still there
+_LOOK_S: Final = 0.1  #: between checks that the drone is still there, while waiting for a corrected file
 REFRESH_HZ: Final = 4
-LINE_EVERY_S: Final = 5.0  #: where standard error is no terminal
+LINE_EVERY_S: Final = 5.0  #: if standard error is not a terminal
 
 
 def fly(
@@ -54,18 +54,18 @@ def fly(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="A Python file with a class derived from skyloop.Controller",
+            help="Python file with a class derived from skyloop.Controller",
             autocompletion=python_files,
         ),
     ],
     name: OptionalNameArgument = None,
     drone: DroneOption = None,
-    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # as it was named before
+    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # the former name
     class_name: Annotated[
-        str | None, typer.Option("--class", metavar="CLASS", help="Which one, if the file has several")
+        str | None, typer.Option("--class", metavar="CLASS", help="The class to fly, if the file has several")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
     ] = None,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
     wait: Annotated[
@@ -73,18 +73,18 @@ def fly(
     ] = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
-        bool, typer.Option("--reload", help="Reload the file when it is saved; after an error hover until then")
+        bool, typer.Option("--reload", help="Reload the file when saved; after an error, hover until then")
     ] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
-    With the word follow for FILE it follows a person, a car or what is in a box: skyloop fly follow --help.
+    With the word follow for FILE it follows a person, a car or the target in a box: skyloop fly follow --help.
 
-    One line on standard error shows how it goes, in a pipe one every 5 seconds.
+    A line on standard error shows the progress; in a pipe, a new one every 5 seconds.
 
-    Ctrl-C lands too, and so does an error in the controller without --reload.
+    Ctrl-C lands too, as does an error in the controller without --reload.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -92,7 +92,7 @@ def fly(
 
     join_network(network, keys)
     target = one_drone(name, drone or on, default="sim://")
-    if reload:  # a neighbour saved twice within a second would come from Python's cache
+    if reload:  # a module saved twice within a second would come from Python's cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
     reloader = Reloader(file, class_name) if reload else None
@@ -107,10 +107,10 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """Make the user's controller, and say which of its methods looks like a misspelt callback.
+    """Create the user's controller, and report methods that look like misspelt callbacks.
 
     Raises:
-        UsageError: The class can't be made as one is here.
+        UsageError: The class can't be created from a drone alone.
     """
     from skyloop.control.controller import misspelt
 
@@ -119,7 +119,7 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
         inspect.signature(controller_class).bind(drone)
     except TypeError as error:
         raise UsageError(
-            f"{name} can't be made as {name}(drone): {error}; give its other arguments default values"
+            f"{name} can't be created as {name}(drone): {error}; give its other arguments default values"
         ) from None
     controller = controller_class(drone)
     if getattr(controller, "drone", None) is not drone:
@@ -138,18 +138,18 @@ def run(
     takeoff: bool,
     progress: FlightProgress | None = None,
 ) -> bool:
-    """Take off if that is wanted, and fly.
+    """Take off if requested, and fly.
 
     Args:
-        flight: What flies.
+        flight: The flight to run.
         drone: Connected as a pilot.
-        seconds: For how long; None until it ends by itself, or Ctrl-C.
-        reloader: Of its file; None: it is not loaded again.
-        takeoff: Whether to take off what is on the ground.
-        progress: Shows how it goes; None: as of any flight.
+        seconds: The duration; None until it ends, or Ctrl-C.
+        reloader: Reloads its file; None: never reload.
+        takeoff: Whether to take off from the ground.
+        progress: Shows the progress; None: the default for flights.
 
     Returns:
-        Whether it ended as it should. Errors of the take-off come out; those of the controller are shown.
+        Whether it ended as intended. Errors of the take-off are raised; those of the controller are shown.
     """
     progress = progress or FlightProgress(drone)
     try:
@@ -168,11 +168,11 @@ def run(
 
 
 def land(drone: Drone) -> None:
-    """End the flight: land what is in the air and in our hands. Who interrupts that too leaves it to the proxy."""
+    """End the flight: land if it is in the air and under our control. A second interrupt leaves it to the proxy."""
     try:
         problem = end_flight(drone, say)
     except KeyboardInterrupt:
-        say("left in the air: its proxy lets it hover, then lands it")
+        say("left in the air: its proxy makes it hover, then lands it")
         raise
     if problem is not None:
         raise problem
@@ -184,7 +184,7 @@ def say(text: str) -> None:
 
 
 class Flight:
-    """Runs a connected drone's controller to its end, and what takes its place when its file is saved. Use once."""
+    """Runs a connected drone's controller to its end, and its replacements when the file is saved. Use once."""
 
     def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
         self._drone = drone
@@ -192,7 +192,7 @@ class Flight:
         self._report = report
 
     def run(self, seconds: float | None) -> bool:
-        """Run the controller for so long, or to its end. Return False after an error: it is shown, and it hovers."""
+        """Run the controller for this time, or to its end. Return False after an error; it then hovers."""
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -203,20 +203,20 @@ class Flight:
         return True
 
     def report_notes(self) -> None:
-        """Show what looks like a mistake in the run, for one that ended without a summary."""
+        """Show probable mistakes of a run that ended without a summary."""
         checks = self._controller._checks
         for note in () if checks is None else checks.notes():
             self._report(f"note: {note}")
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
-        """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again."""
+        """Run the controller; a saved file takes over in flight, and after a failure it hovers until the next save."""
         deadline = math.inf if seconds is None else time.monotonic() + seconds
         while True:
             try:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
-                self._cancel(Known(self._drone).listeners)  # they would fly on
+                self._cancel(Known(self._drone).listeners)  # they would continue to fly
                 let_go(self._drone, "the controller failed")
                 self._report(what_failed(error))
                 self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
@@ -227,10 +227,10 @@ class Flight:
                 self._report(str(summary))
                 return True
             if not self._take(reloader, make):
-                self._report("the saved file is not flown: the one before keeps flying")
+                self._report("the saved file is not used: the previous one keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
-        """Hover until a file was saved that can be flown; False if the time is over or the drone gone before."""
+        """Hover until a file that can be flown is saved; False if the time ends or the drone is gone first."""
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False
@@ -238,7 +238,7 @@ class Flight:
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Put what was loaded in the place of the present controller, if it can be; whichever goes commands no more."""
+        """Replace the present controller with the loaded one, if possible; the one that loses commands no more."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:
@@ -252,7 +252,7 @@ class Flight:
             return False
         self._cancel(older)
         self._controller = after
-        self._report(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
+        self._report(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after the save was detected")
         return True
 
     @staticmethod
@@ -262,9 +262,9 @@ class Flight:
 
 
 def what_failed(error: Exception) -> str:
-    """Return what a person needs to mend an error: their own line, then the traceback without Skyloop's lines.
+    """Return what a person needs to fix an error: their own line, then the traceback without Skyloop's lines.
 
-    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is shown in full.
+    An error raised by Skyloop on purpose, without a line of the user's, is one line; any other is shown in full.
     """
     home = str(Path(__file__).parents[1])
     trace = traceback.TracebackException.from_exception(error)
@@ -281,20 +281,20 @@ def what_failed(error: Exception) -> str:
 
 
 def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.FrameSummary:
-    """Return the innermost line that is neither Skyloop's nor a library's, or else the innermost not Skyloop's."""
+    """Return the innermost line outside of Skyloop and libraries, or else the innermost outside of Skyloop."""
     theirs = [line for line in stack if not line.filename.startswith(home)]
     libraries = tuple({sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")})
     return next((line for line in reversed(theirs) if not line.filename.startswith(libraries)), theirs[-1])
 
 
 class FlightProgress:
-    """Shows a flight's progress on standard error for as long as its ``with`` block lasts.
+    """Shows a flight's progress on standard error within a ``with`` block.
 
     Args:
-        drone: Who flies.
-        live: Whether to keep one line up to date; None: if standard error is a terminal.
-        what: Returns what comes first in the line: how that which flies goes.
-        every_s: How often to print a line where standard error is no terminal; None: :data:`LINE_EVERY_S`.
+        drone: The drone.
+        live: Whether to update one line in place; None: if standard error is a terminal.
+        what: Returns the beginning of the line: the state of the flight.
+        every_s: How often to print a line if standard error is not a terminal; None: :data:`LINE_EVERY_S`.
     """
 
     def __init__(
@@ -322,11 +322,11 @@ class FlightProgress:
                 console=Console(stderr=True),
                 refresh_per_second=REFRESH_HZ,
                 transient=True,
-                redirect_stdout=sys.stdout.isatty(),  # what the controller prints appears above the line
+                redirect_stdout=sys.stdout.isatty(),  # the controller's output appears above the line
             )
 
     def line(self) -> str:
-        """Return the progress now, what matters most first: a narrow terminal cuts the end."""
+        """Return the present progress, most important first: a narrow terminal cuts the end."""
         line = flight_line(self._drone, time.monotonic() - self._begun_s)
         return line if self._what is None else f"{self._what()}  {line}"
 
@@ -353,7 +353,7 @@ class FlightProgress:
 
 
 def flight_line(drone: Drone, flown_s: float) -> str:
-    """Return how a flight goes in one line."""
+    """Return a flight's progress in one line."""
     feedback, video = drone.feedback(), [value for name, value in drone.stats.items() if name.startswith("video")]
     rate, dropped = sum(channel.rate_hz for channel in video), sum(channel.dropped for channel in video)
     parts = [

@@ -1,4 +1,4 @@
-"""``skyloop fly follow``: follows what is in a box of the image, or whatever is of a class."""
+"""``skyloop fly follow``: follows the target in a box of the image, or one of a class."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from skyloop.vision.tracking import Box
 
 SIMULATED: Final = "sim://?world=park&cameras=front&fps=15"
-#: As seen from the target, counter-clockwise from where it moves to.
+#: As seen from the target, counter-clockwise from its direction of motion.
 SIDES: Final = {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
 _RESULT_WITHIN_S: Final = 3.0
 _FIRST_FRAME_S: Final = 10.0
@@ -32,7 +32,7 @@ def fly_follow(
         str | None,
         typer.Argument(
             metavar="[NAME]",
-            help="A running proxy's, or a vehicle's address; without: a simulated park",
+            help="A running proxy, or a vehicle's address; without: a simulated park",
             autocompletion=drone_names,
             show_default=False,
         ),
@@ -42,7 +42,7 @@ def fly_follow(
         str | None, typer.Option("--box", metavar="X,Y,W,H", help="The target in the first frame in the air, in pixels")
     ] = None,
     class_name: Annotated[
-        str | None, typer.Option("--class", metavar="CLASS", help="The largest thing of it, such as person or car")
+        str | None, typer.Option("--class", metavar="CLASS", help="Follow the largest of a class, such as person")
     ] = None,
     detector: Annotated[
         str | None,
@@ -53,17 +53,17 @@ def fly_follow(
         ),
     ] = None,
     mode: Annotated[str, typer.Option(metavar="MODE", help="follow, orbit or look")] = "follow",
-    distance: Annotated[float, typer.Option(metavar="M", help="To keep, in metres; above 2")] = 4.0,
+    distance: Annotated[float, typer.Option(metavar="M", help="Distance to keep; above 2")] = 4.0,
     side: Annotated[
         str | None,
-        typer.Option(metavar="SIDE", help="Of the target, to stay on: ahead, behind, left or right; any if not given"),
+        typer.Option(metavar="SIDE", help="Side of the target to stay on: ahead, behind, left or right [default: any]"),
     ] = None,
     leash: Annotated[
-        float | None, typer.Option(metavar="M", help="Farthest from where it began; no limit if not given")
+        float | None, typer.Option(metavar="M", help="Maximum distance from its start [default: no limit]")
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
     ] = None,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
     wait: Annotated[
@@ -77,18 +77,18 @@ def fly_follow(
 
     Give --class, --box, or both. It does not see walls and trees: fly it where there are none.
 
-    A line each second on standard error shows how it goes. Ctrl-C lands. Exit code 1 if the target was lost for good.
+    A line each second on standard error shows the progress. Ctrl-C lands. Exit code 1 if the target was lost for good.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
     from skyloop.control import ChaseSettings, FollowMode, FollowTarget
 
     if Path("follow").is_file():
-        say("follow is what to do, not the file of that name here: skyloop fly flies files that end in .py")
+        say("follow is the command here, not the file of that name: skyloop fly flies files that end in .py")
     join_network(network, keys)
     target = one_drone(name, drone, default=SIMULATED)
     if box is None and class_name is None:
-        raise UsageError("what to follow is not said: give --class CLASS, such as person, or --box X,Y,W,H")
+        raise UsageError("no target given: give --class CLASS, such as person, or --box X,Y,W,H")
     modes = [each.value for each in FollowMode]
     if mode not in modes:
         raise UnknownNameError("mode", mode, modes)
@@ -120,15 +120,15 @@ def _box(text: str) -> Box:
         x, y, width, height = (float(part) for part in text.split(","))
     except ValueError:
         raise UsageError(
-            f"--box is {text!r} and must be X,Y,W,H: left and upper edge, width and height in pixels"
+            f"--box must be X,Y,W,H: left and upper edge, width and height in pixels, got {text!r}"
         ) from None
     if not all(map(math.isfinite, (x, y, width, height))):
-        raise UsageError(f"--box is {text!r} and must be of finite numbers")
+        raise UsageError(f"--box must consist of finite numbers, got {text!r}")
     return x, y, width, height
 
 
 def _detector(given: str, class_name: str | None) -> OnnxDetector | str:
-    """Return the detector of a file, or the name of a processor."""
+    """Return the detector in a file, or the name of a processor."""
     from skyloop.vision import OnnxDetector
 
     if not given.endswith(".onnx") and "/" not in given and not Path(given).is_file():
@@ -143,7 +143,7 @@ def _packaged(drone: Drone, class_name: str | None) -> OnnxDetector:
 
     if drone.capabilities.vehicle != "sim":
         raise UsageError(
-            f"to follow any {class_name!r} a detector is needed, and Skyloop's own knows drawings only: give "
+            f"following a {class_name!r} needs a detector, and Skyloop's own only knows the simulator's figures: give "
             "--detector FILE.onnx, or the NAME of a running skyloop detect; or --box X,Y,W,H"
         )
     found = simulated_detector()
@@ -168,13 +168,13 @@ def _check(drone: Drone, camera: str | None, box: Box | None, detector: OnnxDete
             next(iter(drone.results(detector, timeout_s=_RESULT_WITHIN_S)))
         except NoAnswerError as error:
             raise LinkError(
-                f"no results of a processor named {detector!r} came within {_RESULT_WITHIN_S:g} s: start it with "
+                f"no results from a processor named {detector!r} within {_RESULT_WITHIN_S:g} s: start it with "
                 f"skyloop detect FILE.onnx --on {drone.name} --name {detector}, or give an ONNX file"
             ) from error
 
 
 def status_line(pilot: FollowTarget) -> str:
-    """Return how following goes in one line: what becomes of the target, where it is, how sure that is."""
+    """Return the state of following in one line: the target's phase, its place, and its certainty."""
     status = pilot.status
     parts = [
         status.phase,

@@ -1,4 +1,4 @@
-"""``skyloop proxy`` turns one vehicle into a node, ``skyloop host`` serves many from one process."""
+"""``skyloop proxy`` serves one vehicle as a node, ``skyloop host`` many from one process."""
 
 from __future__ import annotations
 
@@ -29,21 +29,19 @@ if TYPE_CHECKING:
     from skyloop.host.serve import Answer, Request
     from skyloop.host.vehicle import VehicleStatus
 
-FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The vehicles; docs/host.md shows such a file")]
-GroupOption = Annotated[
-    str | None, typer.Option(metavar="GROUP", help="A group of users whose members may do this too")
-]
+FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="File of vehicles; see docs/host.md")]
+GroupOption = Annotated[str | None, typer.Option(metavar="GROUP", help="Group of users whose members may also do this")]
 HostOption = Annotated[
-    str | None, typer.Option("--host", metavar="NAME", help="Which host, where several run [the one that runs]")
+    str | None, typer.Option("--host", metavar="NAME", help="Name of the host, if several run [the one that runs]")
 ]
-NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The vehicle's, as skyloop host status shows it")]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Vehicle, as shown by skyloop host status")]
 
 
 def proxy(
-    uri: Annotated[str, typer.Argument(metavar="URI", help="The vehicle, e.g. sim:// or video://flight.mp4")],
-    name: Annotated[str, typer.Option(metavar="NAME", help="What applications connect to")] = "alpha",
+    uri: Annotated[str, typer.Argument(metavar="URI", help="Vehicle, e.g. sim:// or video://flight.mp4")],
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name that applications connect to")] = "alpha",
     group: Annotated[
-        str | None, typer.Option(metavar="GROUP", help="A group of users whose members may connect too")
+        str | None, typer.Option(metavar="GROUP", help="Group of users whose members may also connect")
     ] = None,
     network: ServeOption = None,
     listen: ListenOption = None,
@@ -51,14 +49,15 @@ def proxy(
     multicast: MulticastOption = True,
     keys: KeysOption = None,
     audit: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where who flew when is written [the user's directory of state]")
+        Path | None,
+        typer.Option(metavar="FILE", help="File for the audit trail of flights [in the user's state directory]"),
     ] = None,
     metrics: MetricsOption = None,
     parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Serve one vehicle to applications, until Ctrl-C, which lands it first.
 
-    Applications are of this host, and with --network of others too.
+    Serves applications on this host, and with --network also on others.
     """
     from skyloop.child_process import handed_over
     from skyloop.drivers.uri import parse_uri
@@ -86,7 +85,7 @@ def proxy(
 def host(fleet: FleetArgument, group: GroupOption = None, metrics: MetricsOption = None) -> None:
     """Serve all vehicles of a file from one process, until Ctrl-C, which lands them first.
 
-    skyloop host status, add and remove show and change what it serves while it runs; each has its own --help.
+    skyloop host status, add and remove show and change its vehicles while it runs; each has its own --help.
     """
     from skyloop.host.fleet import read_fleet
     from skyloop.host.serve import serve
@@ -97,11 +96,11 @@ def host(fleet: FleetArgument, group: GroupOption = None, metrics: MetricsOption
 
 
 def status(
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Show the vehicles of a running host: in which state they are, who flies them, and why one failed."""
+    """Show the vehicles of a running host: their states, their pilots, and why one failed."""
     from skyloop.host.serve import Status
 
     rows = _ask(Status(), host, group).vehicles
@@ -113,21 +112,21 @@ def status(
 
 
 def add(
-    what: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A vehicle's name, or a file of several")],
+    what: Annotated[str, typer.Argument(metavar="NAME|FILE", help="Name of a vehicle, or file of several")],
     address: Annotated[
         str | None,
-        typer.Argument(metavar="[ADDRESS]", help="The vehicle's; without: of the host's own file", show_default=False),
+        typer.Argument(metavar="[ADDRESS]", help="Its address [from the host's own file]", show_default=False),
     ] = None,
     own_process: Annotated[
         bool | None,
-        typer.Option("--own-process/--shared", help="Whether its proxy gets a process of its own [as the host's file]"),
+        typer.Option("--own-process/--shared", help="Whether its proxy gets its own process [as in the host's file]"),
     ] = None,
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Serve more vehicles from a running host: one by its address, those of a file, or one of the host's own file.
+    """Add vehicles to a running host: one by its address, all in a file, or one from the host's own file.
 
-    A vehicle by its address gets the defaults of the host's file. Of a file, those that run already are left alone.
+    A vehicle given by address gets the defaults of the host's file. Vehicles already running are not touched.
     """
     from skyloop.host.fleet import read_fleet
     from skyloop.host.serve import Add, AddNamed
@@ -148,13 +147,13 @@ def add(
 
 def remove(
     name: NameArgument,
-    land: Annotated[bool, typer.Option("--land", help="Land it even if somebody has the authority")] = False,
+    land: Annotated[bool, typer.Option("--land", help="Land it even if another application has the authority")] = False,
     host: HostOption = None,
     group: GroupOption = None,
 ) -> None:
-    """Land a vehicle of a running host, and serve it no longer.
+    """Land a vehicle of a running host, and stop serving it.
 
-    It is refused while the vehicle flies and somebody has the authority, unless --land is given.
+    Refused while the vehicle flies and an application has the authority, unless --land is given.
     """
     from skyloop.host.serve import Remove
 
@@ -163,7 +162,7 @@ def remove(
 
 
 def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
-    """Return the rows as a table of text, the reason last because it may be long."""
+    """Return the rows as a text table, with the reason last because it may be long."""
     if not rows:
         return ["This host has no vehicle. Add one: skyloop host add NAME ADDRESS"]
     cells = [("NAME", "ADDRESS", "PROXY", "PROCESS", "STATE", "LINK", "BATTERY", "PILOT", "UP", "WHY")]
@@ -202,7 +201,7 @@ def _ask(request: Request, host: str | None, group: str | None) -> Answer:
 
 
 def _prepare(fleet: Fleet) -> None:
-    """Warn of an open network, and make room for the threads of simulators in this process."""
+    """Warn about an open network, and make room for the threads of simulators in this process."""
     from skyloop.cli.network import settle, warn_if_open
     from skyloop.host.vehicle import network_of
     from skyloop.vehicles.sim.options import options_of

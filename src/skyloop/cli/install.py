@@ -1,7 +1,7 @@
-"""``skyloop install``: installs optional parts into this environment, and knows which are there.
+"""``skyloop install``: installs optional parts into this environment, and reports the missing ones.
 
-An extra has no spelling for pip that is right in a checkout, for a wheel and for a release. Here what it consists of is
-read from the package's own metadata, which all three have.
+No single pip spelling of an extra is right for a checkout, a wheel and a release. The requirements are therefore read
+from the package's own metadata, which all three have.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import typer
 
 from skyloop.errors import SkyloopError, UnknownNameError, UnsupportedError, install_command
 
-#: Each optional part: the extra's name, what it is for, and the modules that it needs.
+#: Each optional part: the extra's name, its purpose, and the modules that it needs.
 EXTRAS: Final = (
     ("sim", "simulator's cameras", ("cv2",)),
     ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
@@ -48,12 +48,12 @@ _EXTRA: Final = re.compile(r"\s*(?:\band\s+)?\bextra\s*==\s*[\"']([\w-]+)[\"']")
 
 def install(
     parts: Annotated[list[str], typer.Argument(metavar="PART...", help="Such as vision; all: nearly all of them")],
-    anew: Annotated[bool, typer.Option("--anew", help="Also what is there, as something of it is broken")] = False,
+    anew: Annotated[bool, typer.Option("--anew", help="Reinstall present packages too, to repair them")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what would be installed")] = False,
 ) -> None:
     """Install optional parts of Skyloop into the Python environment that runs this command.
 
-    skyloop doctor shows which parts there are, and which of them are missing.
+    skyloop doctor shows the parts, and which of them are missing.
     """
     wanted = requirements(parts)
     if dry_run:
@@ -65,11 +65,11 @@ def install(
 
 
 def requirements(parts: Iterable[str]) -> list[str]:
-    """Return what optional parts consist of, as pip takes it.
+    """Return the requirements of optional parts, in pip's syntax.
 
     Raises:
         UnknownNameError: There is no such part.
-        SkyloopError: Skyloop's own metadata is missing: it runs from a folder and was never installed.
+        SkyloopError: Skyloop's own metadata is missing: it runs from a folder without installation.
     """
     table: dict[str, list[str]] = {}
     for line in _metadata():
@@ -90,21 +90,21 @@ def _metadata() -> list[str]:
         return requires("skyloop") or []
     except ModuleNotFoundError:
         raise SkyloopError(
-            "this Skyloop runs from a folder and was never installed: pip install -e FOLDER, then again"
+            "this Skyloop runs from a folder and was never installed: run pip install -e FOLDER, then try again"
         ) from None
 
 
 def _installer(anew: bool) -> list[str]:
-    """Return how packages come into this environment: by its pip, or by uv where it has none."""
+    """Return the command that installs packages into this environment: its pip, or uv if there is none."""
     if importlib.util.find_spec("pip"):
         return [sys.executable, "-m", "pip", "install", *(["--force-reinstall"] if anew else [])]
     if shutil.which("uv"):
         return ["uv", "pip", "install", "--python", sys.executable, *(["--reinstall"] if anew else [])]
-    raise UnsupportedError(f"{sys.prefix} has no pip, and there is no uv: install what --dry-run shows by other means")
+    raise UnsupportedError(f"{sys.prefix} has no pip, and there is no uv: install the list of --dry-run by other means")
 
 
 def missing(parts: Iterable[str]) -> Iterator[str]:
-    """Yield those of the parts that are not installed."""
+    """Yield the parts that are not installed."""
     modules = {extra: needed for extra, _, needed in EXTRAS}
     for part in parts:
         if not all(map(_is_there, modules.get(part, ()))):
@@ -114,11 +114,11 @@ def missing(parts: Iterable[str]) -> Iterator[str]:
 def _is_there(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # the package that it is in
+    except ModuleNotFoundError:  # its parent package is missing
         return False
 
 
 def with_all_missing(told: str, parts: Iterable[str]) -> str:
-    """Return an error that ends with how to install a part, so that it names all of ``parts`` that are missing."""
+    """Extend an error that names one part to install, so that it names all of ``parts`` that are missing."""
     before, command, first = told.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

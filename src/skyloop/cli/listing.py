@@ -1,4 +1,4 @@
-"""``skyloop list``: the proxies of this host and of the network, and who flies; ``skyloop audit``: who flew when."""
+"""``skyloop list``: proxies of this host and the network, with their pilots; ``skyloop audit``: who flew when."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 class Row(msgspec.Struct, frozen=True):
-    """One proxy as ``list`` shows it."""
+    """A proxy as a row of ``list``."""
 
     name: str
     transport: str = "local"  #: ``local``, ``fabric`` (the network) or both
@@ -44,17 +44,17 @@ class Row(msgspec.Struct, frozen=True):
     vehicle_link: str = ""
     problem: str = ""
     link_reason: str = ""  #: why the vehicle's link is not up
-    link_remedy: str = ""  #: what to do about it
+    link_remedy: str = ""  #: how to fix it
 
 
 def list_proxies(
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show the running proxies, where they run, what they fly, in which state, and who holds the authority.
+    """Show the running proxies, their hosts, vehicles and states, and the holders of the authority.
 
-    Those of this host, and with --network those that can be reached over the network.
+    Lists this host's proxies, and with --network those reachable over the network.
     """
     from skyloop.network.config import choose
 
@@ -73,7 +73,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Say that no proxy can be reached, here or on the network that was searched, and whose proxies run here."""
+    """Return in words that no proxy was found here or on the network searched, and whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
@@ -81,19 +81,19 @@ def none_runs(settings: FabricSettings | None) -> str:
 
 
 def of_others() -> str:
-    """Return, in words, which proxies other users run on this host; empty if there are none."""
+    """Return in words which proxies other users run on this host; empty if there are none."""
     from skyloop.transport.local import names_of_others
 
     theirs = [f"{user} runs {', '.join(sorted(names))}" for user, names in sorted(names_of_others().items())]
     if not theirs:
         return ""
-    return f"{'; '.join(theirs)}: a user's proxies are closed to others, but for a group's (SKYLOOP_GROUP)."
+    return f"{'; '.join(theirs)}: a user's proxies are closed to others, except to a group (SKYLOOP_GROUP)."
 
 
 def running(settings: FabricSettings | None = None) -> list[Row]:
-    """Return all proxies of this host and, with settings for it, of the network, by name.
+    """Return all proxies of this host and, with settings, of the network, by name.
 
-    They are asked at the same time, so one that is stopped delays the list only once.
+    They are queried in parallel, so a suspended one delays the list only once.
     """
     from skyloop.transport.local import list_names
 
@@ -105,27 +105,27 @@ def running(settings: FabricSettings | None = None) -> list[Row]:
         return []
     processes = of_one_process(found)
     with ThreadPoolExecutor(max_workers=min(32, len(processes))) as pool:
-        described_rows = [row for rows in pool.map(lambda rows: told(rows, settings), processes) for row in rows]
+        described_rows = [row for rows in pool.map(lambda rows: reported(rows, settings), processes) for row in rows]
     return sorted(described_rows, key=lambda row: (row.name, row.host))
 
 
 def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
-    """Return the rows of each process together: it describes all its vehicles in one overview."""
+    """Group the rows by process, because a process describes all its vehicles in one overview."""
     found: dict[tuple[object, ...], list[Row]] = {}
     for row in rows:
         found.setdefault((row.host, row.pid) if row.pid else (row.host, row.name), []).append(row)
     return list(found.values())
 
 
-def told(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
-    """Return what the proxies of one process report of themselves, several by one connection where that is possible."""
+def reported(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
+    """Return the reports of the proxies of one process, several over one connection if possible."""
     overview: dict[str, VehicleOverview] = {}
     if len(rows) > 1:
         try:
             with observed(rows[0], settings) as drone:
                 overview = {vehicle.name: vehicle for vehicle in drone.overview().vehicles}
         except SkyloopError:
-            pass  # each is asked by itself
+            pass  # each is queried separately
     return [
         with_state(row, seen.vehicle, seen.uri, seen) if (seen := overview.get(row.name)) else described(row, settings)
         for row in rows
@@ -133,7 +133,7 @@ def told(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
 
 
 def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOverview) -> Row:
-    """Return the row with what its proxy reports of the vehicle."""
+    """Return the row with the proxy's report on the vehicle."""
     return msgspec.structs.replace(
         row,
         vehicle=vehicle,
@@ -148,7 +148,7 @@ def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOvervie
 
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
-    """Return these proxies with those of the network; one that is reached both ways has one row."""
+    """Merge these proxies with the network's; one that is reached both ways has one row."""
     from skyloop.network import list_proxies as far
 
     rows = {(row.host, row.pid, row.name): row for row in near}
@@ -160,14 +160,14 @@ def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
 
 
 def describe(name: str) -> Row:
-    """Return what the proxy with this name reports of itself, on this host or the network."""
+    """Return the report of the proxy with this name, on this host or the network."""
     from skyloop.network.config import choose
 
     return described(Row(name, transport=""), choose())
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
-    """Return what a proxy reports of itself; for one that does not answer, the reason."""
+    """Return a proxy's report about itself; if it does not answer, the reason."""
     try:
         with observed(row, settings) as drone:
             return with_state(row, drone.capabilities.vehicle, drone.uri, drone.feedback())
@@ -176,7 +176,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
 
 
 def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
-    """Connect to a proxy as an observer of this name, in the way that its row says.
+    """Connect to a proxy as an observer of this name, over the transport in its row.
 
     Raises:
         SkyloopError: It does not answer.
@@ -194,7 +194,7 @@ def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop lis
 
 
 def lines(rows: Iterable[Row]) -> list[str]:
-    """Return the rows as a table of text, the address last because it may be long."""
+    """Return the rows as a text table, with the address last because it may be long."""
     cells = [("NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
     cells += [
         (
@@ -214,16 +214,16 @@ def lines(rows: Iterable[Row]) -> list[str]:
 
 def audit(
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="One drone's; else those of all", autocompletion=drone_names)
+        str | None, typer.Argument(metavar="[NAME]", help="Only this drone [all]", autocompletion=drone_names)
     ] = None,
     drone: DroneOption = None,
     file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of a proxy that was started with --audit FILE")
+        Path | None, typer.Option(metavar="FILE", help="Audit file of a proxy started with --audit FILE")
     ] = None,
     last: Annotated[int | None, typer.Option(metavar="N", min=1, help="Only the last N")] = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
-    """Show who held the authority over a drone, from when to when, and how it ended. The times are local."""
+    """Show who held the authority over a drone, from when to when, and how it ended. Times are local."""
     from skyloop.proxy.records import read, tenures
 
     name = one_drone(name, drone) if name is not None or drone is not None else None
@@ -245,11 +245,11 @@ def audit(
         for line in flight_lines(rows):
             typer.echo(line)
     if bad:
-        typer.echo(f"{bad} {'line' if bad == 1 else 'lines'} can't be understood, and left out.", err=True)
+        typer.echo(f"Skipped {bad} {'line' if bad == 1 else 'lines'} that can't be parsed.", err=True)
 
 
 def flight_lines(rows: Sequence[Tenure]) -> list[str]:
-    """Return the tenures as a table of text."""
+    """Return the tenures as a text table."""
     cells = [HEAD]
     cells += [
         (
@@ -290,7 +290,7 @@ def _files(name: str | None, file: Path | None) -> list[Path]:
 
 
 def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
-    """Connect as :func:`skyloop.connect` does; where another client flies, the error names it and says what to do."""
+    """Connect like :func:`skyloop.connect`; if another client flies, the error names it and gives advice."""
     from skyloop.client import connect
 
     try:

@@ -1,4 +1,4 @@
-"""``skyloop log``: looks at recordings, exports, compares and mends them."""
+"""``skyloop log``: inspects, exports, compares and repairs recordings."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 File = Annotated[
     Path,
-    typer.Argument(metavar="FILE", help="A recording: an MCAP file that Skyloop wrote", autocompletion=recordings),
+    typer.Argument(metavar="FILE", help="Recording: an MCAP file written by Skyloop", autocompletion=recordings),
 ]
-DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Which one (default: the first)")]
+DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Recorded drone [the first]")]
 _EXAMPLE: Final = "Example: skyloop log "
 
 
 class Form(StrEnum):
-    """What a recording can be exported as."""
+    """Formats that recordings can be exported to."""
 
     CSV = "csv"
     PARQUET = "parquet"
@@ -38,7 +38,7 @@ class Form(StrEnum):
 
 
 class Which(StrEnum):
-    """Which side of the proxy's limits is compared."""
+    """Commands before or after the proxy's limits."""
 
     ASKED = "asked"
     APPLIED = "applied"
@@ -46,18 +46,18 @@ class Which(StrEnum):
 
 @log.callback()
 def _log() -> None:
-    """Look at recordings: what is in them, a report, exports, comparisons; and mend them.
+    """Inspect recordings: contents, reports, exports, comparisons; and repair them.
 
-    skyloop log COMMAND --help shows more about each.
+    skyloop log COMMAND --help describes each.
     """
 
 
-@log.command(short_help="What is in a recording", epilog=f"{_EXAMPLE}info flight.mcap")
+@log.command(short_help="Show a recording's contents", epilog=f"{_EXAMPLE}info flight.mcap")
 def info(
     file: File,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Channels with their counts, rates, gaps, missing samples and delays; drops; what is wrong with the file."""
+    """Show channels with counts, rates, gaps, missing samples and delays; drops; and problems of the file."""
     from skyloop.cli import log_tables
     from skyloop.recording.review.summary import summarise
 
@@ -72,12 +72,12 @@ def info(
         screen.print(part)
 
 
-@log.command("list", short_help="The recordings of a folder", epilog=f"{_EXAMPLE}list flights")
+@log.command("list", short_help="List the recordings in a folder", epilog=f"{_EXAMPLE}list flights")
 def list_recordings(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Where the recordings are")] = Path(),
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Folder of recordings")] = Path(),
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON array")] = False,
 ) -> None:
-    """The recordings of a folder: which drones, when and for how long. What is wrong with a file stands in its row."""
+    """List the recordings in a folder: drones, start and duration. A file's problem is shown in its row."""
     import msgspec
 
     from skyloop.cli import log_tables
@@ -94,19 +94,19 @@ def list_recordings(
     elif rows:
         console().print(log_tables.listing(rows))
     else:
-        typer.echo(f"No recording is in {folder}. Make one: skyloop record alpha")
+        typer.echo(f"No recordings in {folder}. Make one: skyloop record alpha")
 
 
-@log.command(short_help="A page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
+@log.command(short_help="Make a page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
 def report(
     file: File,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Default: FILE with the ending .html")
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="[default: FILE with the suffix .html]")
     ] = None,
     drone: DroneName = None,
-    pictures: Annotated[int, typer.Option(min=0, max=48, help="How many key frames of each camera")] = 8,
+    pictures: Annotated[int, typer.Option(min=0, max=48, help="Number of key frames of each camera")] = 8,
 ) -> None:
-    """One HTML page that needs nothing else: path, attitude with set-points, battery, events, delays, key frames."""
+    """Write one self-contained HTML page: path, attitude with set-points, battery, events, delays, key frames."""
     from skyloop.recording.review.report import write_report
 
     recording = _open(file)
@@ -116,37 +116,37 @@ def report(
     tell(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
 
-@log.command(short_help="Samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
+@log.command(short_help="Export samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
 def export(
     files: Annotated[
         list[Path],
-        typer.Argument(metavar="FILE...", help="A recording; several for lerobot", autocompletion=recordings),
+        typer.Argument(metavar="FILE...", help="Recording; several for lerobot", autocompletion=recordings),
     ],
-    to: Annotated[Form, typer.Option("--to", help="csv and parquet: a file for each channel")] = Form.CSV,
+    to: Annotated[Form, typer.Option("--to", help="csv and parquet: one file per channel")] = Form.CSV,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="PATH", help="A folder for csv, parquet and lerobot, else a file"),
+        typer.Option("-o", "--output", metavar="PATH", help="Folder for csv, parquet and lerobot, otherwise a file"),
     ] = None,
     drone: DroneName = None,
     channel: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. feedback; may be repeated")
+        list[str] | None, typer.Option(metavar="NAME", help="Only this channel, e.g. feedback; repeatable")
     ] = None,
     camera: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME", help="For mp4 (default: the first); for lerobot, may be repeated (default: all)"),
+        typer.Option(metavar="NAME", help="For mp4 [default: the first]; for lerobot, repeatable [default: all]"),
     ] = None,
     burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the frames")] = False,
     encode: Annotated[
-        bool, typer.Option("--encode", help="For mp4: encode H.264 too, which is else copied as it was recorded")
+        bool, typer.Option("--encode", help="For mp4: re-encode H.264, otherwise copied as recorded")
     ] = False,
-    fps: Annotated[float | None, typer.Option(help="For lerobot: rows a second (default: 10)")] = None,
-    task: Annotated[str | None, typer.Option(help="For lerobot: what was to be done, in words")] = None,
+    fps: Annotated[float | None, typer.Option(help="For lerobot: rows per second [default: 10]")] = None,
+    task: Annotated[str | None, typer.Option(help="For lerobot: description of the task")] = None,
 ) -> None:
-    """Write the samples as tables, a camera's frames as a video, flights to learn from, or all of it for Rerun.
+    """Write the samples as tables, a camera's frames as a video, flights as training data, or everything for Rerun.
 
-    H.264 is copied as it was recorded, in seconds, unless the time is written into the frames. To lerobot, flights
-    become episodes of a LeRobotDataset: pictures, the state at their capture, and what was commanded. rrd is a file
-    that Rerun's viewer opens, of all drones.
+    H.264 is copied as recorded, in seconds, unless the time is written into the frames. For lerobot, flights become
+    episodes of a LeRobotDataset: pictures, the state at their capture, and the commands. rrd is a file for Rerun's
+    viewer, with all drones.
     """
     from skyloop.cli import log_tables
     from skyloop.recording.review import tables as ways
@@ -162,7 +162,7 @@ def export(
             {"--channel": bool(channel), "--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to
         )
     if len(files) > 1:
-        raise UsageError(f"{len(files)} recordings were given: {to.value} is made of one at a time")
+        raise UsageError(f"{len(files)} recordings given: {to.value} takes one at a time")
     (file,) = files
     recording = _open(file)
     if to is Form.RRD:
@@ -172,7 +172,7 @@ def export(
     if to is Form.MP4:
         _refuse({"--channel": bool(channel)}, to)
         if camera and len(camera) > 1:
-            raise UsageError(f"{len(camera)} cameras were given: mp4 is made of one at a time")
+            raise UsageError(f"{len(camera)} cameras given: mp4 takes one at a time")
         chosen = camera[0] if camera else _first_camera(recording, name)
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
         with progress_bar(f"exporting {chosen}") as progress:
@@ -193,7 +193,7 @@ def export(
 
 
 @log.command(
-    short_help="The commands of two recordings, side by side",
+    short_help="Compare the commands of two recordings",
     epilog=f"{_EXAMPLE}compare old.mcap new.mcap -o both.html",
 )
 def compare(
@@ -203,19 +203,19 @@ def compare(
         typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first", autocompletion=recordings),
     ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them: a .html page or a .png picture")
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them, as a .html page or .png image")
     ] = None,
     drone: DroneName = None,
-    what: Annotated[Which, typer.Option(help="What applications asked for, or what was applied")] = Which.ASKED,
-    part: Annotated[float, typer.Option(min=0.0, help="They part where set-points differ by more [SI unit]")] = 0.01,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
+    what: Annotated[Which, typer.Option(help="Commands as requested, or as applied")] = Which.ASKED,
+    part: Annotated[float, typer.Option(min=0.0, help="Difference that counts as diverging [SI unit]")] = 0.01,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """How a changed controller's commands differ from the old one's: RMS of each set-point, and where they part."""
+    """Compare a changed controller's commands with the old one's: RMS of each set-point, and where they diverge."""
     from skyloop.cli import log_tables
     from skyloop.recording.review.compare import compare as commands_of
 
     if output is not None and output.suffix not in (".html", ".png"):
-        raise UsageError(f"{output} can't be drawn: its name must end in .html or .png")
+        raise UsageError(f"can't draw {output}: its name must end in .html or .png")
     older, newer = _open(old), _open(new)
     found = commands_of(older, newer, drone=drone, what=what.value, part=part)
     if json:
@@ -233,11 +233,11 @@ def compare(
 def recover(
     file: File,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="NEW", help="Default: FILE-recovered.mcap beside it")
+        Path | None, typer.Option("-o", "--output", metavar="NEW", help="[default: FILE-recovered.mcap beside it]")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """Write what can be read of a cut or damaged recording to a new file, with its index; the old one is left alone."""
+    """Write the readable part of a cut or damaged recording to a new file with an index; the old one is kept."""
     from skyloop.cli import log_tables
     from skyloop.recording.review import summary as mending
 
@@ -245,7 +245,7 @@ def recover(
     with progress_bar("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
-        tell(f"{file} is whole: there is nothing to repair")
+        tell(f"{file} is complete: there is nothing to repair")
         if json:
             typer.echo(log_tables.recovered_json(file, None))
         return
@@ -285,7 +285,7 @@ def _export_lerobot(
             task=task or "",
             doing=lambda _, share: progress(share),
         )
-    repeated = f"; {found.repeated} pictures were damaged, those before them stand there" if found.repeated else ""
+    repeated = f"; {found.repeated} damaged pictures were replaced by the ones before" if found.repeated else ""
     tell(
         f"{target}: {found.episodes} episodes, {found.rows} rows: {', '.join(found.form.state)}; "
         f"{', '.join(found.form.cameras) or 'no camera'}; action: {', '.join(found.form.action)}{repeated}"
@@ -297,7 +297,7 @@ def _export_rrd(recording: Recording, target: Path, drone: str | None) -> None:
 
     with progress_bar("exporting") as progress:
         found = export_rrd(recording, target, drone=drone, progress=progress)
-    lost = f"; {found.left_out} pictures that can't be decoded are left out" if found.left_out else ""
+    lost = f"; {found.left_out} pictures that can't be decoded were skipped" if found.left_out else ""
     tell(f"{target}: {', '.join(found.drones)}: {found.samples} samples, {found.pictures} pictures{lost}")
 
 

@@ -20,7 +20,7 @@ from skyloop.recording.review.video import Videos
 
 
 def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
-    """Return all that ``skyloop log info`` shows."""
+    """Yield the output of ``skyloop log info``."""
     yield _head(recording, summary)
     yield _channels(summary)
     for words in _losses(summary):
@@ -30,7 +30,7 @@ def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
 
 
 def listing(rows: Sequence[tuple[Path, Described]]) -> Table:
-    """Return the recordings of a folder as a table."""
+    """Return the recordings in a folder as a table."""
     table = Table(box=None)
     for title in ("recording", "begun", "lasts", "drones", "problem"):
         table.add_column(title, overflow="fold")
@@ -46,7 +46,7 @@ def listing(rows: Sequence[tuple[Path, Described]]) -> Table:
 
 
 def as_json(recording: Recording, summary: Summary) -> str:
-    """Return all that ``skyloop log info --json`` prints."""
+    """Return the output of ``skyloop log info --json``."""
     head = {"file": str(recording.path), "drones": recording.drones, "started_unix_ns": recording.start.started_unix_ns}
     return msgspec.json.encode(head | {"summary": summary}, enc_hook=str).decode()
 
@@ -69,7 +69,7 @@ def _head(recording: Recording, summary: Summary) -> Table:
 
 def _channels(summary: Summary) -> Table:
     table = Table(box=None)
-    table.add_column("topic", overflow="fold")  # never cut: it distinguishes the rows
+    table.add_column("topic", overflow="fold")  # never cut: it identifies the rows
     for title in ("count", "rate", "gaps", "longest", "missing", "size"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("delay [ms]: median (p99)")
@@ -108,23 +108,23 @@ def _losses(summary: Summary) -> Iterator[str]:
 
 
 def recovered_json(file: Path, saved: Recovered | None) -> str:
-    """Return all that ``skyloop log recover --json`` prints: ``saved`` is null for a recording that is whole."""
+    """Return the output of ``skyloop log recover --json``: ``saved`` is null for a complete recording."""
     return msgspec.json.encode({"file": str(file), "saved": saved}, enc_hook=str).decode()
 
 
 def exported(found: Videos, camera: str) -> Iterator[str]:
-    """Yield a line for each video that was exported, and one for what is missing in them."""
+    """Yield a line for each exported video, and one for missing frames."""
     for video in found.videos:
         since = f", from {video.begin_s:.3f} s on" if video is not found.videos[0] else ""
         how = "as it was recorded" if video.copied else "encoded"
         yield f"{video.path}: {video.frames} frames of {camera}{since}, {video.width}×{video.height}, {how}"
     if found.left_out:
-        why = "of another size" if not found.videos[0].copied else "without the frames that they build on"
-        yield f"{found.left_out} frames are left out: damaged, or {why}"
+        why = "of another size" if not found.videos[0].copied else "without the frames they depend on"
+        yield f"{found.left_out} frames were skipped: damaged, or {why}"
 
 
 def comparison_json(found: Comparison) -> str:
-    """Return all that ``skyloop log compare --json`` prints."""
+    """Return the output of ``skyloop log compare --json``."""
     shown = {
         name: getattr(found, name) for name in ("aligned", "seconds", "same_action", "fields", "part_at_s", "counts")
     }
@@ -133,7 +133,7 @@ def comparison_json(found: Comparison) -> str:
 
 def comparison(found: Comparison, old: str, new: str) -> Table:
     """Return the differences of two recordings."""
-    parts = "they never part" if found.part_at_s is None else f"they part at {found.part_at_s:.2f} s"
+    parts = "they never diverge" if found.part_at_s is None else f"they diverge at {found.part_at_s:.2f} s"
     table = Table(
         named("set-point"),
         "RMS",

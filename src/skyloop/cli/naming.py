@@ -1,4 +1,4 @@
-"""How a command line names drones and the network: the same words, help and completion for every command.
+"""How command lines name drones and the network: the same words, help and completion for every command.
 
 A drone is named by NAME; ``--drone NAME`` means the same everywhere. The network is ``--network WHERE``.
 """
@@ -22,8 +22,8 @@ KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
 
 
 def drone_names(incomplete: str) -> list[str]:
-    """Return the names of proxies that run on this host, sorted. Their sockets are read, nobody is asked."""
-    with suppress(Exception):  # a shell that completes shows no errors
+    """Return the names of proxies on this host, sorted, from their sockets, without querying them."""
+    with suppress(Exception):  # shells show no errors during completion
         from skyloop.transport.local import list_names
 
         return sorted(proxy.name for proxy in list_names() if proxy.name.startswith(incomplete))
@@ -31,7 +31,7 @@ def drone_names(incomplete: str) -> list[str]:
 
 
 def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the parameters of the drone that the command line names already."""
+    """Return the parameters of the drone already named in the command line."""
     name = ctx.params.get("name") or ctx.params.get("drone")
     if not name:
         return []
@@ -44,22 +44,22 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def network_places(incomplete: str) -> list[str]:
-    """Return the place that needs no address."""
+    """Return the network place that needs no address."""
     return [place for place in ("multicast",) if place.startswith(incomplete)]
 
 
 def recordings(incomplete: str) -> list[str]:
-    """Return recordings, and folders that may hold some."""
+    """Return recordings, and folders that may contain some."""
     return files_ending(incomplete, {".mcap"})
 
 
 def python_files(incomplete: str) -> list[str]:
-    """Return Python files, and folders that may hold some."""
+    """Return Python files, and folders that may contain some."""
     return files_ending(incomplete, {".py"})
 
 
 def files_ending(incomplete: str, endings: Iterable[str]) -> list[str]:
-    """Return files with these endings, and folders, that begin with what was typed."""
+    """Return folders and files with these suffixes that begin with the typed text."""
     folder, _, start = incomplete.rpartition("/")
     wanted, found = set(endings), []
     with suppress(OSError):
@@ -78,34 +78,32 @@ def _name(metavar: str, what: str) -> Any:
     return typer.Argument(metavar=metavar, help=what, autocompletion=drone_names, show_default=False)
 
 
-NameArgument = Annotated[str | None, _name("NAME", "A running proxy's, as skyloop list shows them")]
-AnyNameArgument = Annotated[str | None, _name("NAME", "A running proxy's, or a vehicle's address such as sim://")]
-OptionalNameArgument = Annotated[
-    str | None, _name("[NAME]", "A running proxy's, or a vehicle's address; without: sim://")
-]
+NameArgument = Annotated[str | None, _name("NAME", "Running proxy, as shown by skyloop list")]
+AnyNameArgument = Annotated[str | None, _name("NAME", "Running proxy, or a vehicle's address such as sim://")]
+OptionalNameArgument = Annotated[str | None, _name("[NAME]", "Running proxy, or a vehicle's address [default: sim://]")]
 NamesArgument = Annotated[
     list[str] | None,
-    typer.Argument(metavar="NAME...", help="Running proxies; skyloop list shows them", autocompletion=drone_names),
+    typer.Argument(metavar="NAME...", help="Running proxies, as shown by skyloop list", autocompletion=drone_names),
 ]
 DroneOption = Annotated[
-    str | None, typer.Option("--drone", metavar="NAME", help="The same as NAME", autocompletion=drone_names)
+    str | None, typer.Option("--drone", metavar="NAME", help="Same as NAME", autocompletion=drone_names)
 ]
 DronesOption = Annotated[
     list[str] | None,
-    typer.Option("--drone", metavar="NAME", help="The same as NAME; repeatable", autocompletion=drone_names),
+    typer.Option("--drone", metavar="NAME", help="Same as NAME; repeatable", autocompletion=drone_names),
 ]
 NetworkOption = Annotated[
     str | None,
     typer.Option(
         "--network",
         metavar="WHERE",
-        help=f"Search there too: multicast, or addresses with commas [{NETWORK_VARIABLE}]",
+        help=f"Also search there: multicast, or comma-separated addresses [{NETWORK_VARIABLE}]",
         autocompletion=network_places,
     ),
 ]
 KeysOption = Annotated[
     Path | None,
-    typer.Option("--keys", metavar="DIR", help=f"Of the network: folder of an identity [{KEYS_VARIABLE}]"),
+    typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]"),
 ]
 
 
@@ -117,33 +115,33 @@ def keys_directory() -> Path:
 
 
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
-    """Return the drone that a command is about.
+    """Return the drone that a command addresses.
 
     Args:
-        name: As NAME.
-        drone: As ``--drone``.
-        default: Where neither is given; None: one must be.
+        name: Given as NAME.
+        drone: Given as ``--drone``.
+        default: Used if neither is given; None: one is required.
 
     Raises:
-        UsageError: None is named, or two are.
+        UsageError: No drone is named, or two are.
     """
     if name is not None and drone is not None and name != drone:
-        raise UsageError(f"NAME {name} and --drone {drone} name two drones: give one of them")
+        raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
     chosen = name or drone or default
     if chosen is None:
-        raise UsageError(f"no drone is named: give its NAME, or --drone NAME; {_running()}")
+        raise UsageError(f"no drone given: give NAME or --drone NAME; {_running()}")
     return chosen
 
 
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
-    """Return the drones that a command is about, each once: those that it has as NAME, then those as ``--drone``.
+    """Return the drones that a command addresses, each once: first those given as NAME, then as ``--drone``.
 
     Raises:
-        UsageError: None is named and one is needed.
+        UsageError: No drone is named although one is required.
     """
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
-        raise UsageError(f"no drone is named: give its NAME, or --drone NAME; {_running()}")
+        raise UsageError(f"no drone given: give NAME or --drone NAME; {_running()}")
     return chosen
 
 
@@ -153,23 +151,23 @@ def _running() -> str:
 
 
 def join_network(network: str | None, keys: Path | None) -> None:
-    """Search the network as the options say, in this process and those that it starts.
+    """Search the network given by the options, in this process and its children.
 
     Raises:
-        UsageError: An address or the folder is not valid, or keys are given without a network.
+        UsageError: An address or the folder is invalid, or keys are given without a network.
     """
     if network is None and keys is None:
         return
     from skyloop.network.config import choose
 
-    choose(network, keys)  # refuses what is not valid
+    choose(network, keys)  # raises for invalid values
     for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
         if value is not None:
             os.environ[variable] = str(value)
 
 
 def with_place(arguments: Sequence[str]) -> list[str]:
-    """Return the words of a command line with ``multicast`` behind a ``--network`` that names no place."""
+    """Insert ``multicast`` after a ``--network`` without a place, and return the words."""
     words: list[str] = []
     for index, word in enumerate(arguments):
         words.append(word)

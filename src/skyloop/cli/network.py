@@ -1,6 +1,6 @@
-"""The network: what commands that serve vehicles share of it, ``skyloop router`` and ``skyloop keys``.
+"""The network: options shared by commands that serve vehicles, ``skyloop router`` and ``skyloop keys``.
 
-``skyloop keys`` decides who may join a lab's network, and what each may do there.
+``skyloop keys`` decides who may join a lab's network, with which rights.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ MetricsOption = Annotated[
     typer.Option(
         "--metrics",
         metavar="[HOST:]PORT",
-        help="Serve metrics for Prometheus there; on loopback without HOST, on a free port with 0",
+        help="Serve metrics for Prometheus there; without HOST on loopback, with port 0 on a free port",
     ),
 ]
 ServeOption = Annotated[
@@ -43,31 +43,29 @@ ServeOption = Annotated[
     typer.Option(
         "--network",
         metavar="WHERE",
-        help="Serve there too: multicast, or routers' addresses with commas; else nothing leaves this host",
+        help="Also serve there: multicast, or comma-separated routers [default: only this host]",
         autocompletion=network_places,
     ),
 ]
 ListenOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="ADDR", help="Of the network: where to listen, e.g. 10.0.0.5:7447 [all, any free port]"),
+    typer.Option(metavar="ADDR", help="Network: address to listen on, e.g. 10.0.0.5:7447 [all, any free port]"),
 ]
-#: As routers were given before ``--network`` took their addresses.
+#: The former option for routers, before ``--network`` accepted their addresses.
 ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
     bool,
-    typer.Option(
-        "--multicast/--no-multicast", help="Of the network: be found by UDP multicast, where --network names it"
-    ),
+    typer.Option("--multicast/--no-multicast", help="Network: be found by UDP multicast, if --network names it"),
 ]
 KeysOption = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Of the network: folder of this proxy's identity [SKYLOOP_KEYS]")
+    Path | None, typer.Option(metavar="DIR", help="Network: folder of this proxy's identity [SKYLOOP_KEYS]")
 ]
 OPEN: Final = (
-    "WARNING: --network without keys: anyone on this network can watch and fly {names}. Use it on a network that only "
+    "WARNING: --network without keys: anyone on this network can watch and fly {names}. Use a network that only "
     "people you trust can reach, or give each of them a key: skyloop keys --help"
 )
 
-#: Makes the transport server of a proxy: of its name and its vehicle's address.
+#: Creates a proxy's transport server from its name and its vehicle's address.
 MakeEnd = Callable[[str, str], "TransportServer"]
 
 
@@ -78,10 +76,10 @@ def settings_of(
     multicast: bool,
     keys: Path | None,
 ) -> FabricSettings | None:
-    """Return the settings that the options give; None to stay on this host.
+    """Return the settings from the options; None to stay on this host.
 
     Raises:
-        UsageError: An option needs ``--network``, or is not valid.
+        UsageError: An option needs ``--network``, or is invalid.
     """
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
@@ -95,10 +93,10 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return the settings of a network that is named as ``--network`` names it.
+    """Return the settings of a network, given as in ``--network``.
 
     Raises:
-        UsageError: An address or the folder is not valid, or no place is named.
+        UsageError: An address or the folder is invalid, or no place is named.
     """
     from skyloop.network.config import serving
 
@@ -106,7 +104,7 @@ def places(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return what makes a proxy's transport server: on this host, for a group too, and with settings on the network."""
+    """Return a factory for a proxy's transport server: for this host, optionally a group, and the network if set."""
     from skyloop.transport.local import LocalServer
 
     if settings is None:
@@ -117,15 +115,15 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
 
 
 def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
-    """Return what reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
+    """Return a function that reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
     return None if settings is None or settings.ring is None else settings.ring.poll
 
 
 def metrics_beside(where: str | None) -> Beside | None:
-    """Return what serves metrics beside the proxies of a process; None without ``--metrics``.
+    """Return the metrics server to run beside a process's proxies; None without ``--metrics``.
 
     Raises:
-        UsageError: ``where`` is no address.
+        UsageError: ``where`` is not an address.
     """
     if where is None:
         return None
@@ -133,11 +131,11 @@ def metrics_beside(where: str | None) -> Beside | None:
     from skyloop.metrics.endpoint import parse_where
 
     parse_where(where)
-    return serving_beside(where, tell)  # on standard error, as programs read the lines of proxies on standard output
+    return serving_beside(where, tell)  # on standard error, because programs read the proxies' lines on standard output
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
-    """Warn in plain words, each time, what the network means without keys."""
+    """Warn every time, in plain words, about a network without keys."""
     if settings is not None and settings.tls is None:
         typer.echo(
             OPEN.format(names=" and ".join(names) if len(names) < 4 else f"these {len(names)} vehicles"), err=True
@@ -145,13 +143,13 @@ def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
 
 
 def settle(options: SimOptions) -> None:
-    """Make room, in this whole process, for the threads that pass commands on beside those that step and draw.
+    """Make room in this process for the threads that relay commands, beside those that step and draw.
 
-    The interpreter lock is handed over after a millisecond, not five, and OpenCV keeps to one core. Do not call it in
-    the user's process.
+    The interpreter lock is released after one millisecond instead of five, and OpenCV uses one core. Do not call this
+    in the user's process.
 
     Raises:
-        MissingExtraError: Cameras are wanted, and what draws them is not installed.
+        MissingExtraError: Cameras are requested, but the renderer's extra is not installed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:
@@ -173,7 +171,7 @@ def router(
         typer.Option(
             "--network",
             metavar="WHERE",
-            help="What to join: multicast, or other routers' addresses with commas",
+            help="Networks to join: multicast, or comma-separated routers",
             autocompletion=network_places,
         ),
     ] = MULTICAST,
@@ -187,9 +185,9 @@ def router(
         typer.Option("--print-config", help="Only print the configuration, for Zenoh's own router: zenohd -c FILE"),
     ] = False,
 ) -> None:
-    """Pass on what proxies and applications of several networks say, until Ctrl-C.
+    """Relay between proxies and applications of several networks, until Ctrl-C.
 
-    Each of them connects to a router that it can reach; routers connect to each other.
+    Each of them connects to a router within reach; routers connect to each other.
     """
     from skyloop.network import config
     from skyloop.network.config import Part
@@ -204,7 +202,7 @@ def router(
         return
     if chosen.tls is None:
         typer.echo(
-            "WARNING: a router without keys: anyone who reaches it can watch and fly what is behind it", err=True
+            "WARNING: a router without keys: anyone who reaches it can watch and fly the drones behind it", err=True
         )
     ended = threading.Event()
 
@@ -217,7 +215,7 @@ def router(
 
             tell(beside.enter_context(serve(lambda: [router_readings(lambda: session)], metrics)).announcement)
         typer.echo(f"ready: a router at {', '.join(session.listens)}")
-        while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
+        while not ended.wait(_POLL_S):  # poll, because the kernel may deliver a signal to any thread
             if chosen.ring is None:
                 continue
             for change in chosen.ring.poll():
@@ -244,18 +242,18 @@ LabOption = Annotated[
 
 @keys.callback()
 def _keys() -> None:
-    """Keys for the network: make a lab's authority, issue identities, look at them, revoke them.
+    """Manage the network's keys: create a lab's authority, issue, show and revoke identities.
 
-    skyloop keys COMMAND --help shows more about each; docs/security.md has a lab in five commands.
+    skyloop keys COMMAND --help describes each; docs/security.md sets up a lab in five commands.
     """
 
 
-@keys.command(short_help="Make a lab's authority", epilog=f"{_EXAMPLE}init")
+@keys.command(short_help="Create a lab's authority", epilog=f"{_EXAMPLE}init")
 def init(
     directory: LabOption = None,
-    days: Annotated[int, typer.Option(metavar="N", help="How long it, and so the lab, is valid")] = 1825,
+    days: Annotated[int, typer.Option(metavar="N", help="Validity of the authority, and so of the lab")] = 1825,
 ) -> None:
-    """Make a lab's certificate authority. Who has its folder can make any key: keep it on one machine, with a copy."""
+    """Create a lab's certificate authority. Its folder can make any key: keep it on one machine, with a backup."""
     from skyloop.network.keys import Lab
 
     lab = Lab.make(_place(directory), days)
@@ -267,15 +265,16 @@ def init(
     short_help="Issue an identity, or renew one", epilog=f"{_EXAMPLE}issue jane --role pilot --drones 'alpha*'"
 )
 def issue(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of a person, a proxy or a router")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of a person, a proxy or a router")],
     role: Annotated[str, typer.Option(metavar="ROLE", help="pilot, observer, proxy or router")],
     drones: Annotated[
-        str, typer.Option(metavar="GLOB", help="A pilot flies, an observer sees, a proxy serves: alpha,b*")
+        str,
+        typer.Option(metavar="GLOB", help="Drones that a pilot flies, an observer sees or a proxy serves: alpha,b*"),
     ] = "*",
-    days: Annotated[float, typer.Option(metavar="N", help="How long it is valid")] = 30.0,
+    days: Annotated[float, typer.Option(metavar="N", help="Validity")] = 30.0,
     directory: LabOption = None,
 ) -> None:
-    """Make a key and a certificate, and the folder that its holder is given. An old key of that name stays valid."""
+    """Create a key and a certificate, in a folder for their holder. An old key of that name stays valid."""
     from skyloop.network.keys import Lab
     from skyloop.network.keys.identity import make_identity
 
@@ -286,14 +285,14 @@ def issue(
     _print_roster(lab.directory, [each for each in lab.roster.entries if each.name != name])
 
 
-@keys.command(short_help="Who has keys, until when", epilog=f"{_EXAMPLE}show")
+@keys.command(short_help="Show who has keys, until when", epilog=f"{_EXAMPLE}show")
 def show(
     directory: LabOption = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
 ) -> None:
-    """List all identities: role, drones, end. --dir may also be the folder of an identity, to see its copy of the list.
+    """List all identities: role, drones, expiry. --dir may also be the folder of an identity, to show its copy.
 
-    Keys that expire within a week, or have expired, are listed on standard error as well.
+    Keys that have expired, or will within a week, are also listed on standard error.
     """
     from skyloop.network.keys.credentials import expiry_warning, read_public
 
@@ -316,15 +315,15 @@ def show(
 
 @keys.command(short_help="Revoke a key", epilog=f"{_EXAMPLE}revoke jane")
 def revoke(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Whose key was lost, or who left")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Identity whose key was lost, or who left")],
     directory: LabOption = None,
 ) -> None:
-    """Take an identity off the roster. Its key opens nothing wherever the new roster is in use."""
+    """Remove an identity from the roster. Its key is rejected wherever the new roster is in use."""
     from skyloop.network.keys import Lab
 
     lab = Lab.open(_place(directory))
     entry = lab.revoke(name)
-    typer.echo(f"{name} is revoked; who has an older roster lets it in until {_day(entry.last_at)}")
+    typer.echo(f"{name} is revoked; holders of an older roster admit it until {_day(entry.last_at)}")
     _print_roster(lab.directory, lab.roster.entries)
 
 

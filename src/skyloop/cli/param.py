@@ -20,11 +20,11 @@ from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
 
-ADVICE: Final = "write when they have landed, or take over with a higher --priority (a lower number, 0 is the highest)"
+ADVICE: Final = "write after they have landed, or take over with a higher --priority (a lower number, 0 is the highest)"
 TRUTH: Final = {
     word: truth for truth, words in ((True, "true yes on 1"), (False, "false no off 0")) for word in words.split()
 }
-LONGEST_VALUE: Final = 30  #: of a value in a table; the world of a simulator is a thousand characters
+LONGEST_VALUE: Final = 30  #: of a value in a table; a simulator's world has a thousand characters
 KINDS: Final = {
     ParameterType.BOOL: "true or false",
     ParameterType.INT: "a whole number",
@@ -39,24 +39,24 @@ def param(
     key: Annotated[
         str | None,
         typer.Argument(
-            metavar="[KEY]", help="A parameter, or the first part of several: limits", autocompletion=parameter_names
+            metavar="[KEY]", help="Parameter, or first part of several: limits", autocompletion=parameter_names
         ),
     ] = None,
     value: Annotated[
-        str | None, typer.Argument(metavar="[VALUE]", help="Its new value; needs the authority for a moment")
+        str | None, typer.Argument(metavar="[VALUE]", help="New value; takes the authority for a moment")
     ] = None,
     drone: DroneOption = None,
     priority: Annotated[
-        int, typer.Option(metavar="P", min=0, max=31, help="Of a writer: 0 is the highest, 31 the lowest")
+        int, typer.Option(metavar="P", min=0, max=31, help="Priority for writing: 0 is the highest, 31 the lowest")
     ] = 31,
-    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON array of parameters")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the parameters as a JSON array")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
     """List the parameters of a vehicle, show one, or write one."""
-    if drone is not None:  # the words before are KEY and VALUE then
+    if drone is not None:  # the words before are then KEY and VALUE
         if value is not None and name != drone:
-            raise UsageError(f"NAME {name} and --drone {drone} name two drones: give one of them")
+            raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
         if name != drone:
             name, key, value = drone, name, key
     join_network(network, keys)
@@ -92,10 +92,10 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """Parse the value that a person typed, by the parameter's type.
+    """Parse a value typed by a person, by the parameter's type.
 
     Raises:
-        UsageError: It is not of that type.
+        UsageError: It has another type.
     """
     try:
         match parameter.type:
@@ -114,31 +114,31 @@ def parse_value(parameter: Parameter, text: str) -> Value:
 
 
 def table(parameters: list[Parameter]) -> list[str]:
-    """Return a line for each parameter: name, value with unit, what is allowed; long values are cut."""
+    """Return a line for each parameter: name, value with unit, allowed values; long values are cut."""
     rows = [(p.name, shorten(f"{show(p.value)} {p.unit}".rstrip()), allowed(p)) for p in parameters]
     return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
 
 
 def shorten(value: str) -> str:
-    """Return a value as it fits into a table."""
+    """Return a value shortened to fit into a table."""
     return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
 def details(parameter: Parameter) -> list[str]:
-    """Return all that is known of one parameter."""
+    """Return everything known about one parameter."""
     p = parameter
     rows = [
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),
         ("  allowed", allowed(p) or KINDS[p.type]),
         ("  default", "" if p.default is None else show(p.default)),
-        ("  momentary", "writing it does something once" if p.momentary else ""),
+        ("  momentary", "writing it acts once" if p.momentary else ""),
         ("  what", p.description),
     ]
     return columns([row for row in rows if row[1]])
 
 
 def allowed(parameter: Parameter) -> str:
-    """Return which values a parameter takes, for people."""
+    """Return a parameter's allowed values, for people."""
     p = parameter
     if p.read_only:
         return "read-only"
@@ -153,7 +153,7 @@ def allowed(parameter: Parameter) -> str:
 
 
 def show(value: Value) -> str:
-    """Return a value as it can be typed."""
+    """Return a value as a person would type it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

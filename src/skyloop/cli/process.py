@@ -1,4 +1,4 @@
-"""``skyloop process`` and ``skyloop detect``: a class of the user's, or a detector, on a drone's frames."""
+"""``skyloop process`` and ``skyloop detect``: run the user's class, or a detector, on a drone's frames."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
 _MOST_WORKERS: Final = 64
-MOST: Final = 64  #: detections of one frame that are published, the surest: a result has a limit of 32 768 bytes
+MOST: Final = 64  #: detections published of one frame, the most certain: a result is limited to 32 768 bytes
 
 
 def process(
@@ -48,35 +48,33 @@ def process(
     ],
     drone_name: AnyNameArgument = None,
     drone: DroneOption = None,
-    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
     name: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of the processor; the class's in small letters if not given")
+        str | None, typer.Option(metavar="NAME", help="Name of the processor [default: the class's, in lower case]")
     ] = None,
     share: Annotated[
-        bool, typer.Option("--share/--all", help="Each frame to one of the workers of this name, or all to all")
+        bool, typer.Option("--share/--all", help="Each frame to one worker of this name, or to all")
     ] = True,
-    workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes on this machine")] = 1,
-    max_age: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="Leave out frames that are older when their turn comes")
-    ] = 1.0,
+    workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes to run here")] = 1,
+    max_age: Annotated[float, typer.Option(metavar="S", min=0.0, help="Skip frames older than this")] = 1.0,
     max_fps: Annotated[
-        float | None, typer.Option(metavar="F", min=0.001, help="Frames a second that a worker takes at most")
+        float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second of a worker")
     ] = None,
     stuck: Annotated[
-        float, typer.Option(metavar="S", min=0.05, help="One frame for longer than this, and others get the share")
+        float, typer.Option(metavar="S", min=0.05, help="After this long on one frame, its share goes to others")
     ] = 2.0,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON object each second")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Take the newest frames of a drone, and publish what a class of yours finds in them. Read-only.
+    """Process the newest frames of a drone with your own class, and publish its results. Read-only.
 
     The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
-    arrays; drone.results("NAME") and Controller.on_result get them. A line each second shows its progress.
+    arrays; read them with drone.results("NAME") and Controller.on_result. A line each second shows the progress.
     """
     from skyloop.processing import Settings, load_processor
 
@@ -92,7 +90,7 @@ def process(
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
-        pass  # how it is meant to end
+        pass  # the normal end
 
 
 def work(
@@ -104,7 +102,7 @@ def work(
     *,
     child: bool,
 ) -> None:
-    """Run one worker in this process, of the processor that ``make`` returns, until its end."""
+    """Run one worker, of the processor returned by ``make``, in this process until its end."""
     from skyloop.client import connect
     from skyloop.processing import Worker
     from skyloop.processing.group import end_with_parent
@@ -139,7 +137,7 @@ def _lead(
     seconds: float | None,
     show: Callable[[Status], str],
 ) -> None:
-    """Run several workers, each in a process of its own, so that none waits for another's interpreter."""
+    """Run several workers, each in its own process, so that none waits for another's interpreter."""
     from skyloop.processing.group import Group, child_command
 
     if "://" in drone:
@@ -157,7 +155,7 @@ def _lead(
 
 
 def _arguments(settings: Settings, target: str, drone: str, seconds: float | None) -> list[str]:
-    """Return the command of one worker of several."""
+    """Return the command of one of several workers."""
     options: dict[str, object] = {
         "--drone": drone,
         "--name": settings.name,
@@ -186,40 +184,38 @@ def detect(
         str | None,
         typer.Argument(
             metavar="[FILE]",
-            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, of the simulator's figures",
+            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, for the simulator's figures",
             show_default=False,
         ),
     ] = None,
     on: Annotated[
         str | None, typer.Option("--on", metavar="NAME", help="Running proxy", autocompletion=drone_names)
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
-    score: Annotated[float, typer.Option(metavar="S", min=0.0, max=1.0, help="Leave out what is less sure")] = 0.4,
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Camera to use [default: the first]")] = None,
+    score: Annotated[float, typer.Option(metavar="S", min=0.0, max=1.0, help="Minimum score of a detection")] = 0.4,
     classes: Annotated[
-        str | None, typer.Option(metavar="NAME,…", help="Only these classes, by name; all if not given")
+        str | None, typer.Option(metavar="NAME,…", help="Only these classes, by name [default: all]")
     ] = None,
     names: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Names of the classes, one a line; else the file's own")
+        str | None, typer.Option(metavar="FILE", help="Names of the classes, one per line [default: the file's own]")
     ] = None,
     layout: Annotated[
-        str | None, typer.Option(metavar="LAYOUT", help="Of the outputs, where the file does not show it")
+        str | None, typer.Option(metavar="LAYOUT", help="Layout of the outputs, if the file does not show it")
     ] = None,
-    name: Annotated[str, typer.Option(metavar="NAME", help="Of the processor and its results")] = "detections",
-    max_fps: Annotated[
-        float | None, typer.Option(metavar="F", min=0.001, help="Frames a second that it takes at most")
-    ] = None,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the processor and its results")] = "detections",
+    max_fps: Annotated[float | None, typer.Option(metavar="F", min=0.001, help="Maximum frames per second")] = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON object each second")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print a JSON object each second")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Detect people, cars or whatever a network of yours knows in a drone's frames, and draw them live. Read-only.
+    """Detect people, cars or any class of your network in a drone's frames, and draw them live. Read-only.
 
     Without FILE it finds the simulator's people, cars and crates: person, car, box. For a real camera give a FILE.
-    The results, with the time of their frame, are those of a processor: drone.results("detections"). Run the same
-    command again for another worker that shares the frames. A line each second shows its progress.
+    The results, with their frame's time, are those of a processor: drone.results("detections"). Run the same command
+    again for another worker that shares the frames. A line each second shows the progress.
     """
     from skyloop.processing import Settings
     from skyloop.vision import OnnxDetector
@@ -241,7 +237,7 @@ def detect(
     digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     interrupt_by_signals()
-    with contextlib.suppress(KeyboardInterrupt):  # how it is meant to end
+    with contextlib.suppress(KeyboardInterrupt):  # the normal end
         work(make, settings, drone, seconds, show_json if json else show_text, child=False)
 
 
@@ -252,7 +248,7 @@ class DetectionProcessor:
     """
 
     def __init__(self, detector: ObjectDetector, classes: Collection[str] = ()) -> None:
-        """Keep the detector, called on the worker's thread, and the names of the classes to publish; none: all."""
+        """Set the detector, called on the worker's thread, and the names of the classes to publish; none: all."""
         self._detector = detector
         self._classes = frozenset(classes)
 

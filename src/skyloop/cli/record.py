@@ -1,4 +1,4 @@
-"""``skyloop record``: everything that drones send, into a file; ``skyloop view``: live in Foxglove or Rerun."""
+"""``skyloop record``: records drones to a file; ``skyloop view``: shows them live in Foxglove or Rerun."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ def record(
     names: NamesArgument = None,
     drone: DronesOption = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="PATH", help="A file, or a folder to choose a name in")
+        Path, typer.Option("--output", "-o", metavar="PATH", help="File, or folder for an automatic name")
     ] = Path(),
     channels: Annotated[
         str | None,
         typer.Option(
-            metavar="LIST", help="Only these, with commas: commands, feedback, events, video, video.front, logs …"
+            metavar="LIST", help="Only these, comma-separated: commands, feedback, events, video, video.front, logs …"
         ),
     ] = None,
     encoding: Annotated[
         str,
         typer.Option(
-            metavar="auto|jpeg|png", help="Of frames; auto keeps H.264 as it came, else jpeg; png is without any loss"
+            metavar="auto|jpeg|png", help="Encoding of frames; auto keeps H.264 unchanged, else jpeg; png is lossless"
         ),
     ] = "auto",
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
-    rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="A new file after so much")] = None,
-    rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="A new file after so long")] = None,
-    min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Room to leave on the disk")] = 256.0,
-    buffer_mb: Annotated[float, typer.Option(metavar="MB", min=1.0, help="What may wait for a slow disk")] = 64.0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over an existing file")] = False,
-    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="How long; else until Ctrl-C")] = None,
+    rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="Maximum size of a file")] = None,
+    rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="Maximum time of a file")] = None,
+    min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Disk space to leave free")] = 256.0,
+    buffer_mb: Annotated[float, typer.Option(metavar="MB", min=1.0, help="Buffer for a slow disk")] = 64.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file")] = False,
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Duration [until Ctrl-C]")] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Record drones to an MCAP file until Ctrl-C. It only looks on: any application may fly meanwhile.
+    """Record drones to an MCAP file until Ctrl-C. Only observes: any application may fly meanwhile.
 
-    Where the output is no terminal: one line a second.
+    If the output is not a terminal: one line per second.
     """
     from skyloop.recording import record as start
 
@@ -67,7 +67,7 @@ def record(
         drones(names, drone),
         output,
         channels=None if channels is None else [name.strip() for name in channels.split(",")],
-        encoding=cast("VideoEncoding", encoding),  # which is checked there
+        encoding=cast("VideoEncoding", encoding),  # checked by the recorder
         quality=quality,
         rotate_mb=rotate_mb,
         rotate_s=rotate_s,
@@ -77,7 +77,7 @@ def record(
         in_process=True,
     )
     interrupt_by_signals((signal.SIGTERM,))
-    with recorder, suppress(KeyboardInterrupt):  # how it is meant to end
+    with recorder, suppress(KeyboardInterrupt):  # the normal end
         _show(recorder, math.inf if seconds is None else seconds)
     _conclude(recorder)
 
@@ -95,7 +95,7 @@ def _show(recorder: Recorder, seconds: float) -> None:
         line = progress(status, before)
         typer.echo(f"\r\x1b[K{line}" if live else line, nl=not live)
         before = status
-        if status.state.value == "failed":  # it does not come back
+        if status.state.value == "failed":  # it does not recover
             break
     if live:
         typer.echo()
@@ -130,46 +130,47 @@ def _conclude(recorder: Recorder) -> None:
         f"dropped {counts(status.dropped)}, missed {counts(status.missed)}"
     )
     if status.state.value == "failed":
-        raise SkyloopError(f"the recording is not complete: {status.reason}")
+        raise SkyloopError(f"the recording is incomplete: {status.reason}")
 
 
 def view(
     names: NamesArgument = None,
     drone: DronesOption = None,
-    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove, on this machine alone")] = False,
-    rerun: Annotated[bool, typer.Option("--rerun", help="Show them in Rerun's viewer, which is started")] = False,
+    foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove, on this machine only")] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback whoever reaches it sees the drones")
+        str,
+        typer.Option(metavar="ADDRESS", help="Listen on it; beyond loopback, anyone who reaches it sees the drones"),
     ] = "127.0.0.1",
     port: Annotated[
         int | None,
-        typer.Option(metavar="PORT", min=0, max=65535, help="Of Foxglove [8765] or Rerun [9876]; 0: any free one"),
+        typer.Option(metavar="PORT", min=0, max=65535, help="Port of Foxglove [8765] or Rerun [9876]; 0: any free one"),
     ] = None,
     write: Annotated[
-        bool, typer.Option("--write", help="Let Foxglove write parameters, under a lease that is held for that moment")
+        bool, typer.Option("--write", help="Let Foxglove write parameters, under a lease held for that moment")
     ] = False,
     priority: Annotated[
-        int, typer.Option(metavar="P", min=0, max=31, help="Of who writes: 0 is the highest, 31 the lowest")
+        int, typer.Option(metavar="P", min=0, max=31, help="Priority for writing: 0 is the highest, 31 the lowest")
     ] = 31,
     connect: Annotated[
-        str | None, typer.Option(metavar="URL", help="Of a Rerun viewer that runs: rerun+http://HOST:PORT/proxy")
+        str | None, typer.Option(metavar="URL", help="Running Rerun viewer: rerun+http://HOST:PORT/proxy")
     ] = None,
     save: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --rerun: into this .rrd file, and no viewer")
+        Path | None, typer.Option(metavar="FILE", help="With --rerun: save to this .rrd file instead of a viewer")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="How long; else until Ctrl-C")] = None,
+    seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="Duration [until Ctrl-C]")] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones live in Foxglove or Rerun until Ctrl-C. It only looks on: any application may fly meanwhile.
+    """Show drones live in Foxglove or Rerun until Ctrl-C. Only observes: any application may fly meanwhile.
 
-    Foxglove connects to the address that is shown. A viewer that is slow or stands still slows nobody.
+    Connect Foxglove to the address shown. A slow or stalled viewer slows nothing else.
     """
     _refuse(foxglove, rerun, write, connect, save, port)
     join_network(network, keys)
     chosen = drones(names, drone)
     interrupt_by_signals((signal.SIGTERM,))
-    with ExitStack() as stack, suppress(KeyboardInterrupt):  # how it is meant to end
+    with ExitStack() as stack, suppress(KeyboardInterrupt):  # the normal end
         from skyloop.client import connect as connect_to
         from skyloop.recording.view import View, give_way
 
@@ -190,7 +191,9 @@ def _foxglove(known: Sequence[Drone], host: str, port: int | None, priority: int
     server = FoxgloveServer(known, host=host, port=PORT if port is None else port, priority=priority)
     typer.echo(f"In Foxglove: Open connection, Foxglove WebSocket, {server.url}")
     if not is_loopback(host):
-        typer.echo(f"WARNING: whoever reaches {host} sees the drones: Foxglove's protocol knows no passwords", err=True)
+        typer.echo(
+            f"WARNING: anyone who reaches {host} sees the drones: Foxglove's protocol has no passwords", err=True
+        )
     return server
 
 
@@ -204,17 +207,17 @@ def _rerun(known: Sequence[Drone], host: str, port: int | None, connect: str | N
 
 def _refuse(foxglove: bool, rerun: bool, write: bool, connect: str | None, save: Path | None, port: int | None) -> None:
     if foxglove == rerun:
-        raise UsageError("give one of --foxglove and --rerun: what the drones are to be shown in")
+        raise UsageError("give either --foxglove or --rerun")
     if foxglove and (connect is not None or save is not None):
-        raise UsageError("--connect and --save are of --rerun: leave them out, or choose --rerun")
+        raise UsageError("--connect and --save are for --rerun: leave them out, or choose --rerun")
     if rerun and write:
-        raise UsageError("--write is of --foxglove: Rerun writes no parameters")
+        raise UsageError("--write is for --foxglove: Rerun writes no parameters")
     if connect is not None and (save is not None or port is not None):
-        raise UsageError("--connect names where the viewer is: leave out --save and --port")
+        raise UsageError("--connect names a running viewer: leave out --save and --port")
 
 
 def _watch(view: View, seconds: float) -> None:
-    """Print what is subscribed to, each time that it changes."""
+    """Print the subscriptions each time they change."""
     end = time.monotonic() + seconds
     before: dict[str, list[str]] = {}
     while (left := end - time.monotonic()) > 0:

@@ -1,4 +1,4 @@
-"""``skyloop ros``: drones as nodes of ROS 2."""
+"""``skyloop ros``: shows drones as nodes of ROS 2."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ def ros(
             metavar="P",
             min=0,
             max=31,
-            help="Ask for the authority at once, 0 is the highest; without: the service authority/request asks",
+            help="Request the authority at once, 0 is the highest; without: use the service authority/request",
         ),
     ] = None,
     cmd_vel_timeout: Annotated[
-        float, typer.Option(metavar="S", min=0.05, max=5.0, help="Silence of cmd_vel after which the drone hovers")
+        float, typer.Option(metavar="S", min=0.05, max=5.0, help="Silence on cmd_vel after which the drone hovers")
     ] = 0.5,
     map_frame: Annotated[
-        str, typer.Option("--map", metavar="FRAME", help="Join the drones' odom frames, where they share their axes")
+        str, typer.Option("--map", metavar="FRAME", help="Join the drones' odom frames, if they share their axes")
     ] = "",
-    use_sim_time: Annotated[bool, typer.Option("--use-sim-time", help="Stamps on the clock of /clock")] = False,
+    use_sim_time: Annotated[bool, typer.Option("--use-sim-time", help="Use the time of /clock")] = False,
     domain: Annotated[
-        str | None, typer.Option(metavar="ID", help="Of DDS, 0 to 101 [ROS_DOMAIN_ID]", show_default=False)
+        str | None, typer.Option(metavar="ID", help="DDS domain, 0 to 101 [ROS_DOMAIN_ID]", show_default=False)
     ] = None,
     subnet: Annotated[
         bool,
-        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, whoever reaches it may fly"),
+        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in reach may fly"),
     ] = False,
     ros_args: Annotated[
         str, typer.Option(metavar="ARGS", help='For ROS 2, in quotes: --ros-args "-r cmd_vel:=teleop"')
@@ -43,10 +43,10 @@ def ros(
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Show drones to ROS 2: images, state and transforms as topics, flying by cmd_vel and services. Until Ctrl-C.
+    """Show drones to ROS 2: images, state and transforms as topics; fly by cmd_vel and services. Until Ctrl-C.
 
-    Each drone is a namespace, /alpha. It is found on this machine only, unless --subnet or the variables of ROS 2 say
-    otherwise. Leaving lands what it flies.
+    Each drone is a namespace, such as /alpha. Only this machine finds it, unless --subnet or the variables of ROS 2
+    say otherwise. Drones that it flies land when it ends.
     """
     from skyloop.ros import Bridge, Settings
     from skyloop.vehicles.ros2.node import domain_of
@@ -69,4 +69,4 @@ def ros(
                 typer.echo(f"ready /{namespace}: {name}, {bridge.drones[name].uri}")
             bridge.run()
     except KeyboardInterrupt:
-        pass  # how it is meant to end
+        pass  # the normal end

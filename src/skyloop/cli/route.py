@@ -21,9 +21,9 @@ KEYS = "P pauses, R resumes, S skips the waypoint, Ctrl-C lands"
 
 route = typer.Typer(help="Check and fly routes of waypoints (NAME.route.json).", rich_markup_mode=None)
 
-FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A route: NAME.route.json")]
+FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Route: NAME.route.json")]
 DroneOption = Annotated[
-    str, typer.Option("--drone", metavar="NAME", help="A running proxy, or a vehicle's address such as sim://")
+    str, typer.Option("--drone", metavar="NAME", help="Running proxy, or a vehicle's address such as sim://")
 ]
 
 
@@ -31,9 +31,9 @@ DroneOption = Annotated[
 def check(
     file: FileArgument,
     drone: DroneOption = "sim://",
-    as_json: Annotated[bool, typer.Option("--json", help="What was found as JSON")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON")] = False,
 ) -> None:
-    """Show what speaks against a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
+    """Show the problems of a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
     from skyloop.client import connect
     from skyloop.control import load_route
     from skyloop.control.route import check_for
@@ -53,7 +53,7 @@ def check(
 def fly(
     file: FileArgument,
     drone: DroneOption = "sim://",
-    photos: Annotated[Path, typer.Option(metavar="DIR", help="Where photos are saved")] = Path("photos"),
+    photos: Annotated[Path, typer.Option(metavar="DIR", help="Folder for photos")] = Path("photos"),
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
     wait: Annotated[
         float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
@@ -94,7 +94,7 @@ def fly(
 
 
 def _run(flight: FlyRoute) -> None:
-    """Fly, with the terminal's keys where there is one."""
+    """Fly, with the terminal's keys if there is a terminal."""
     with ExitStack() as stack:
         pressed = None
         if sys.stdin.isatty():
@@ -109,7 +109,7 @@ def _run(flight: FlyRoute) -> None:
             for key in pressed(0.0) if pressed is not None else ():
                 if key.lower() in acts:
                     acts[key.lower()]()
-            return pressed is None and flight.law.state == "paused"  # nobody is there who could resume it
+            return pressed is None and flight.law.state == "paused"  # no keyboard could resume it
 
         flight.run(until=look)
     if flight.law.state == "paused":

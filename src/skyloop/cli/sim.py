@@ -1,6 +1,6 @@
 """``skyloop sim``: several simulated drones in one world.
 
-Each has a proxy of its own, or with ``--firmware`` is the firmware of a real drone for other people's programs.
+Each has its own proxy, or with ``--firmware`` is a real drone's firmware for other people's programs.
 """
 
 from __future__ import annotations
@@ -59,23 +59,21 @@ LOOK_UP_S: Final = 0.2
 
 
 def sim(
-    drones: Annotated[int, typer.Option(metavar="N", min=1, max=MOST_DRONES, help="How many, in one world")] = 1,
-    world: Annotated[str, typer.Option(metavar="WORLD", help="Its name, or a file")] = "room",
-    seed: Annotated[
-        int, typer.Option(metavar="S", min=0, help="The same one gives the same wind, noise and targets")
-    ] = 0,
-    speed: Annotated[float, typer.Option(metavar="X", min=0.01, max=100.0, help="Simulated seconds in a second")] = 1.0,
-    name: Annotated[str, typer.Option(metavar="NAME", help="Of the proxy; several get a number: sim1, sim2, …")] = NAME,
+    drones: Annotated[int, typer.Option(metavar="N", min=1, max=MOST_DRONES, help="Number of drones in the world")] = 1,
+    world: Annotated[str, typer.Option(metavar="WORLD", help="Name or file of the world")] = "room",
+    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Seed of wind, noise and targets")] = 0,
+    speed: Annotated[float, typer.Option(metavar="X", min=0.01, max=100.0, help="Simulated seconds per second")] = 1.0,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Proxy; several are numbered: sim1, sim2, …")] = NAME,
     option: Annotated[
         list[str] | None,
-        typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; may be repeated"),
+        typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; repeatable"),
     ] = None,
     autopilot: Annotated[
         list[AutopilotKind] | None,
         typer.Option(
             metavar="KIND",
-            help="Real firmware flies the drones: ardupilot, betaflight or px4; its program by SKYLOOP_ARDUCOPTER, "
-            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; several, by repeating it, are given to the drones in turn",
+            help="Fly with real firmware: ardupilot, betaflight or px4, the program named by SKYLOOP_ARDUCOPTER, "
+            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; repeat it to assign several to the drones in turn",
         ),
     ] = None,
     network: ServeOption = None,
@@ -88,44 +86,42 @@ def sim(
         Firmware | None,
         typer.Option(
             metavar="KIND",
-            help="Be a real drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
+            help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
         ),
     ] = None,
     bind: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help=f"Of the firmware: where it listens [{LOOPBACK}]")
+        str | None, typer.Option(metavar="ADDRESS", help=f"Firmware: address to listen on [{LOOPBACK}]")
     ] = None,
     port_base: Annotated[
         int | None,
         typer.Option(
-            metavar="P", min=0, max=65000, help="Of the firmware: its ports count from here, not the usual; 0 any free"
+            metavar="P", min=0, max=65000, help="Firmware: count its ports from here, not the usual; 0: any free"
         ),
     ] = None,
     lose: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Of the firmware: datagrams lost, each way")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams lost, each way")
     ] = None,
     delay: Annotated[
         float | None,
-        typer.Option(metavar="S", min=0, max=MOST_DELAY_S, help="Of the firmware: datagrams late, each way [s]"),
+        typer.Option(metavar="S", min=0, max=MOST_DELAY_S, help="Firmware: delay of datagrams, each way [s]"),
     ] = None,
     repeat: Annotated[
-        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Of the firmware: datagrams that come twice")
+        float | None, typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams duplicated")
     ] = None,
     reorder: Annotated[
         float | None,
-        typer.Option(metavar="SHARE", min=0, max=1, help="Of the firmware: datagrams that come after the next"),
+        typer.Option(metavar="SHARE", min=0, max=1, help="Firmware: share of datagrams swapped with the next"),
     ] = None,
     video_port: Annotated[
         int | None,
-        typer.Option(metavar="P", min=1, max=65000, help="Of arducopter and px4: where the camera's video is sent"),
+        typer.Option(metavar="P", min=1, max=65000, help="For arducopter and px4: port to send the video to"),
     ] = None,
-    fault_seed: Annotated[
-        int | None, typer.Option(metavar="S", min=0, help="Of the firmware: the same one, the same faults [0]")
-    ] = None,
+    fault_seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Firmware: seed of the faults [0]")] = None,
 ) -> None:
-    """Simulate drones that see one another in one world, each with a proxy of its own, until Ctrl-C.
+    """Simulate drones that see one another in one world, each with its own proxy, until Ctrl-C.
 
-    With --autopilot real ArduCopter, PX4 or Betaflight flies them (docs/autopilots.md). With --firmware each is an
-    emulated drone's firmware on the network instead, for any program that flies the real one.
+    With --autopilot, real ArduCopter, PX4 or Betaflight flies them (docs/autopilots.md). With --firmware, each is
+    instead an emulated drone's firmware on the network, for any program that flies the real one.
 
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option
     cameras=front.
@@ -158,7 +154,7 @@ def sim(
         _serve_proxies(uris, options, names, server_ends(network_settings), look, beside)
         return
     if metrics is not None:
-        raise UsageError("--metrics is of proxies, and with --firmware there is none: leave it out")
+        raise UsageError("--metrics is for proxies, and with --firmware there is none: leave it out")
     if network is not None:
         raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")
     if options.autopilot is not None:
@@ -176,23 +172,25 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
         raise UsageError("--name is the proxy's, and with --firmware there is none: leave it out")
     fixed = sorted(FIXED_BY_FIRMWARE.intersection(uri.options))
     if fixed:
-        raise UsageError(f"--option {fixed[0]} can't be chosen with --firmware: the emulated drone has its own")
+        raise UsageError(f"--option {fixed[0]} can't be set with --firmware: the emulated drone has its own")
 
 
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
-    """Return the options of the world that these drones share.
+    """Return the options of the drones' shared world.
 
     Raises:
-        UsageError: An option is not valid, or the drones can't share a world.
+        UsageError: An option is invalid, or the drones can't share a world.
     """
     from skyloop.vehicles.sim.options import options_of
 
     if len(uris) > drones:
-        raise UsageError(f"--autopilot is given {len(uris)} times for --drones {drones}: give one for each at most")
+        raise UsageError(f"--autopilot given {len(uris)} times for --drones {drones}: give at most one for each")
     each = [options_of(uri) for uri in uris]
     if any(options.parameters != each[0].parameters for options in each):
-        raise UsageError("these --autopilot usually fly different vehicles: choose one, such as --option vehicle=iris")
-    return min(each, key=lambda options: options.most_lag_s)  # one that keeps the computer's time decides
+        raise UsageError(
+            "these --autopilot fly different vehicles by default: choose one, such as --option vehicle=iris"
+        )
+    return min(each, key=lambda options: options.most_lag_s)  # the strictest one about the computer's time decides
 
 
 def _serve_proxies(
@@ -220,13 +218,13 @@ def address(world: str, seed: int, speed: float, others: list[str]) -> str:
     """Return the vehicles' address.
 
     Raises:
-        UsageError: There is no such option, or its value is not valid.
+        UsageError: There is no such option, or its value is invalid.
     """
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
         if not equals:
-            raise UsageError(f"--option {text!r} has no value: it looks like --option cameras=front")
+            raise UsageError(f"--option {text!r} has no value: use the form --option cameras=front")
         if key in OWN_OPTIONS:
             raise UsageError(f"--option {text!r}: give --{key} {value} instead")
         if key in settings:
@@ -251,28 +249,28 @@ MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """Where the emulated drones listen, and what happens to their datagrams."""
+    """The addresses of the emulated drones, and the faults of their datagrams."""
 
     bind: str
     port_base: int | None  #: None: the usual ports
     faults: Faults
     delay_s: float
-    video_port: int | None = None  #: of autopilots: where pictures are sent; None: nowhere
+    video_port: int | None = None  #: for autopilots: destination port of pictures; None: none
 
 
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
     """Run the drones until SIGINT or SIGTERM. On the main thread.
 
-    One line that begins with ``ready`` is written for each drone when all of them listen.
+    Prints a line that begins with ``ready`` for each drone once all of them listen.
 
     Raises:
-        UsageError: An option is not valid.
+        UsageError: An option is invalid.
         LinkError: A port is taken.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
     elif serving.video_port is not None:
-        raise UsageError("--video-port is for --firmware arducopter and px4: the others have a port of their own")
+        raise UsageError("--video-port is for --firmware arducopter and px4: the others have their own port")
     elif firmware is Firmware.BETAFLIGHT:
         _run(_racers(options, drones, serving))
     elif firmware is Firmware.TELLO:
@@ -346,7 +344,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
     from skyloop.vehicles.tello.emulator import FRONT, TelloFirmware, with_tellos
     from skyloop.vehicles.tello.wire import PORT
 
-    prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
+    prepare(FRONT, Quality(options.quality))  # compile now, so that the first picture is not delayed
     host = SimHost(with_tellos(options), drones)
     return [
         TelloFirmware(
@@ -362,7 +360,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello: all have the same port, and each further one the next address.
+    """Return the address of a Tello: all have the same port, and each the address after the previous one's.
 
     Raises:
         UsageError: The first address is not IPv4, or there is no next one.
@@ -372,14 +370,14 @@ def address_from(base: str, drone: int) -> str:
     try:
         return str(ipaddress.IPv4Address(base) + drone)
     except ValueError:
-        raise UsageError(f"--bind {base}: several Tellos need an IPv4 address to count their own from") from None
+        raise UsageError(f"--bind {base}: several Tellos need an IPv4 address to count from") from None
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return the ports of an AR.Drone: the first one's count from ``base`` (0: any free ones), others' are 10 higher.
+    """Return the ports of an AR.Drone: the first one's count from ``base`` (0: any free ones), the next 10 higher.
 
     Raises:
-        UsageError: There are no such ports.
+        UsageError: A port is out of range.
     """
     from skyloop.vehicles.ardrone.emulator import Ports
 
@@ -401,7 +399,9 @@ def _run(firmwares: Sequence[Emulated]) -> None:
             started.enter_context(firmware)
         for firmware in firmwares:
             print(f"ready {describe(firmware)}", flush=True)
-        while not shutdown.requested.wait(LOOK_UP_S):  # a signal that another thread gets does not wake this one
+        while not shutdown.requested.wait(
+            LOOK_UP_S
+        ):  # poll: a signal delivered to another thread does not wake this one
             pass
 
 

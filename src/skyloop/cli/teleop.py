@@ -1,4 +1,4 @@
-"""``skyloop teleop``: flies a drone by the keys of the terminal."""
+"""``skyloop teleop``: flies a drone with the terminal's keys."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
 
 ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
-PERIOD_S: Final = 0.05  #: how often a moved stick is sent again; sooner at each press
+PERIOD_S: Final = 0.05  #: resend period of a moved stick; each press sends at once
 REFRESH_HZ: Final = 8
 EVENTS_SHOWN: Final = 3
-GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: that + and - step through
+GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the steps of + and -
 
 
 def teleop(
     name: AnyNameArgument = None,
     drone: DroneOption = None,
-    speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Of a key that is held")] = 0.5,
-    turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turning, of a key held")] = 0.8,
+    speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Speed of a held key")] = 0.5,
+    turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turn rate of a held key")] = 0.8,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
     wait: Annotated[
         float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
     ] = 0.0,
-    cockpit: Annotated[bool, typer.Option("--cockpit", help="Serve a page beside it that shows the video")] = False,
+    cockpit: Annotated[bool, typer.Option("--cockpit", help="Also serve a page that shows the video")] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
-    """Fly by keys, with the drone's state live. It hovers when no key is held, and lands at the end.
+    """Fly with keys, and watch the drone's state live. It hovers when no key is held, and lands at the end.
 
-    The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q end.
+    The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q quit.
     """
     from skyloop.cli.listing import connect_pilot
     from skyloop.client import Authority
@@ -59,14 +59,14 @@ def teleop(
         try:
             Teleop(flown, speed, turn, "" if page is None else page.address()).run(keyboard)
         except (KeyboardInterrupt, EOFError):
-            pass  # as good as Q: the end of the block lands it
+            pass  # like Q: leaving the block lands it
         finally:
             if page is not None:
                 page.close()
 
 
 class Teleop:
-    """One session of a pilot at the keys."""
+    """A pilot's session at the keys."""
 
     def __init__(self, drone: Drone, speed: float, turn: float, page: str = "") -> None:
         self._drone = drone
@@ -83,7 +83,7 @@ class Teleop:
         Raises:
             EOFError: The terminal is gone.
         """
-        # It is drawn on a thread of its own: a terminal that takes no more keeps no key waiting.
+        # Drawn on a separate thread: a stalled terminal must not delay keys.
         console = Console()
         with (
             keyboard,
@@ -99,9 +99,9 @@ class Teleop:
                 self._message = self._hands.no_effect or keyboard.other or self._message
 
     def obey(self, order: Order | Deflection) -> None:
-        """Carry out what the hands ask for; what is not possible is reported and changes nothing.
+        """Carry out an order; an impossible one is reported and changes nothing.
 
-        Only to take control waits for an answer, on a thread of its own: an emergency stop is heard meanwhile.
+        Only taking control waits for an answer, on a separate thread: an emergency stop still works meanwhile.
         """
         if order != "take":
             self._carry_out(order)
@@ -132,9 +132,9 @@ class Teleop:
         if order == "grounded":
             return "on the ground: T takes off"
         if order == "held":
-            return "Esc is held, which stops no motors: press it twice"
+            return "holding Esc does not stop the motors: press it twice"
         if order == "centre":
-            let_go(drone, "all keys are let go")
+            let_go(drone, "all keys were released")
             return ""
         if order == "takeoff":
             drone.takeoff(wait=False)
@@ -167,11 +167,11 @@ class Teleop:
         if link.application not in (LinkState.UP, LinkState.DEGRADED):
             return f"the link is {link.application.value} ({link.reason})"
         if self._drone.authority.state != "held":
-            return "control is asked for"
+            return "control has been requested"
         return told.text if told is not None and told.text else "nothing can be sent now"
 
     def picture(self) -> Group:
-        """Return all that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""
+        """Return the whole display, most important first: anything that does not fit is cut at the bottom."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone
@@ -183,7 +183,7 @@ class Teleop:
 
 @contextmanager
 def _focus_told(console: Console) -> Iterator[None]:
-    """Ask the terminal to report whether its window gets the keys."""
+    """Ask the terminal to report whether its window receives keys."""
     try:
         console.file.write(TELL_FOCUS if console.is_terminal else "")
         yield

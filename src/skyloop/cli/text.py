@@ -1,4 +1,4 @@
-"""Text for terminals and pipes alike, and errors in the words of the command line: what is wrong, and what to type."""
+"""Text for terminals and pipes, and errors in the terms of the command line: the problem, and the words to type."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 
 _PIPE_COLUMNS: Final = 10_000
 _PLAIN_ERRORS: Final = "skyloop.plain"
-#: What is written for characters that a terminal's encoding lacks; others lose their accents, or become a "?".
+#: Replacements for characters missing from a terminal's encoding; others lose their accents, or become a "?".
 _PLAIN: Final = {
     **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
     **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
 }
 _RED: Final = 31
 _YELLOW: Final = 33
-#: What is coloured at the beginning of a line.
+#: Beginnings of lines that are coloured.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 
 def make_printable() -> None:
-    """Let standard output and standard error take every text, also where their encoding lacks some characters."""
+    """Let standard output and standard error accept every text, even if their encoding lacks some characters."""
     codecs.register_error(_PLAIN_ERRORS, _plain)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
@@ -58,13 +58,13 @@ def tell(text: str) -> None:
 
 
 def coloured(line: str, stream: TextIO | None) -> str:
-    """Return a line with a coloured beginning, if it has one that matters and the stream shows colours.
+    """Return a line with its beginning coloured, if that is significant and the stream shows colours.
 
-    That is a terminal which is not dumb, where ``NO_COLOR`` is not set (https://no-color.org).
+    A stream shows colours if it is a terminal that is not dumb, and ``NO_COLOR`` is not set (https://no-color.org).
 
     Args:
-        line: For people.
-        stream: Where it is written to; None, as Python has it for one that was closed before it began: nowhere.
+        line: The line, for people.
+        stream: Its destination; None, Python's value for a stream closed before the start: nowhere.
     """
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb" or stream is None or not stream.isatty():
         return line
@@ -75,14 +75,14 @@ def coloured(line: str, stream: TextIO | None) -> str:
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Return rows of as many cells each as lines with aligned columns."""
+    """Return rows with equal numbers of cells as lines with aligned columns."""
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
 
 
 def named(title: str) -> Column:
-    """Return a column of a table whose words are never cut: in a narrow terminal they go on below."""
+    """Return a table column whose words are never cut: in a narrow terminal they wrap."""
     from rich.table import Column
 
     return Column(title, overflow="fold")
@@ -91,8 +91,8 @@ def named(title: str) -> Column:
 def console() -> Console:
     """Return a console for tables on standard output.
 
-    It is as wide as the terminal, and in a pipe as wide as the tables are, so that nothing is cut there. ``COLUMNS``
-    overrides both.
+    It is as wide as the terminal; in a pipe it is as wide as the tables, so that nothing is cut. ``COLUMNS`` overrides
+    both.
     """
     from rich.console import Console
 
@@ -102,10 +102,10 @@ def console() -> Console:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[..., None]]:
-    """Show a bar on standard error that goes away at the end, if that is a terminal.
+    """Show a bar on standard error, if that is a terminal, and remove it at the end.
 
     Yields:
-        What moves it: called with the share that is done, from 0 to 1, and with what is being done, if that changes.
+        A function that updates the bar: with the share done, from 0 to 1, and optionally a new description.
     """
     if not sys.stderr.isatty():
         yield lambda *_: None
@@ -121,7 +121,7 @@ def progress_bar(what: str) -> Iterator[Callable[..., None]]:
 # Errors ---------------------------------------------------------------------------------------------------------
 
 
-#: The base of what Typer raises for a wrong word; its place differs between Typer's versions, its name does not.
+#: The base of Typer's errors for wrong words; its module differs between Typer's versions, its name does not.
 WordError: Final[type[Exception]] = next(one for one in typer.BadParameter.__mro__ if one.__name__ == "ClickException")
 
 _HINTS: Final = {
@@ -145,7 +145,7 @@ _PLAIN_WORDS: Final = (
     (re.compile(r"^(.*) is not one of (?!any)(.*)\.?$"), r"\1 is none of \2"),
     (re.compile(r"^Option '?(.+?)'? requires an argument\.?$"), r"\1 needs a value"),
     (re.compile(r"^Option '?(.+?)'? does not take a value\.?$"), r"\1 takes no value"),
-    (re.compile(r"^Got unexpected extra arguments?(?:\(s\))? \((.*)\)$"), r"more words than are needed: \1"),
+    (re.compile(r"^Got unexpected extra arguments?(?:\(s\))? \((.*)\)$"), r"too many words: \1"),
     (re.compile(r"^No such option:? '?(.+?)'?\.?$"), r"no option \1"),
     (re.compile(r"^No such command '(.*?)'\.?"), r"no command \1."),
     (re.compile(r"^Missing command\.?$"), "a command is missing"),
@@ -153,13 +153,13 @@ _PLAIN_WORDS: Final = (
 
 
 def error_text(error: SkyloopError) -> str:
-    """Return what an error says on the command line."""
+    """Return an error's message for the command line."""
     hint = _HINTS.get(error.hint) if error.hint is not None else None
     return f"{error.reason}; {hint}" if hint else error.reason
 
 
 def usage_text(error: Any, name: str) -> str:
-    """Return what a wrong word or value is, as Typer raised it, with the usage and an example of its command."""
+    """Return the message for a wrong word or value raised by Typer, with its command's usage and an example."""
     context = getattr(error, "ctx", None)
     if type(error).__name__ == "NoArgsIsHelpError":
         return str(error.message)
@@ -185,7 +185,7 @@ def _said(error: Any) -> str:
 
 
 def plain(text: str) -> str:
-    """Return a library's words about a wrong value in plain ones."""
+    """Rephrase a library's message about a wrong value in plain words."""
     for pattern, words in _PLAIN_WORDS:
         text, count = pattern.subn(words, text)
         if count and words:

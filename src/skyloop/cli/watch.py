@@ -1,4 +1,4 @@
-"""``skyloop watch``: what a drone does, live in the terminal, or line by line into a pipe."""
+"""``skyloop watch``: a drone's state, live in the terminal, or line by line into a pipe."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 REFRESH_HZ: Final = 8
-WIDE_COLUMNS: Final = 60  #: for two facts side by side
-ROOMY_COLUMNS: Final = 90  #: for space between them
+WIDE_COLUMNS: Final = 60  #: from here on, two facts side by side
+ROOMY_COLUMNS: Final = 90  #: from here on, space between them
 LINE_EVERY_S: Final = 1.0
 EVENTS_SHOWN: Final = 8
 COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
@@ -37,18 +37,18 @@ def watch(
     name: NameArgument = None,
     drone: DroneOption = None,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+        float | None, typer.Option(metavar="S", min=0.0, help="Duration [default: until Ctrl-C]")
     ] = None,
-    video: Annotated[bool, typer.Option(help="Ask for the first camera's frames, to show their rate and age")] = True,
+    video: Annotated[bool, typer.Option(help="Request the first camera's frames, to show their rate and age")] = True,
     json: Annotated[
-        bool, typer.Option("--json", help="For programs: a JSON object a line, one a second and one an event")
+        bool, typer.Option("--json", help="Print JSON lines, one each second and one for each event")
     ] = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
     """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
 
-    Where the output is no terminal: one line a second, and one for each event.
+    If the output is not a terminal: one line per second, and one for each event.
     """
     from skyloop.client import connect
 
@@ -56,7 +56,7 @@ def watch(
     with connect(one_drone(name, drone), access="observe", name="skyloop watch") as watched:
         duration_s = math.inf if seconds is None else seconds
         if video and watched.capabilities.cameras:
-            watched.frame()  # the first call asks for them
+            watched.frame()  # the first call subscribes
         try:
             if json:
                 _lines(watched, duration_s, _state_json, _event_json)
@@ -65,16 +65,16 @@ def watch(
             else:
                 _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
-            pass  # how it is meant to end
+            pass  # the normal end
 
 
 def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
-    """Absolute deadlines, so that there is a line for each second; the first one at once."""
+    """Print a line every second, by absolute deadlines; the first one at once."""
     due = time.monotonic()
     end = due + duration_s
 
     def show(one: Event) -> None:
-        with suppress(BrokenPipeError):  # the reader is gone, which the next line finds, too
+        with suppress(BrokenPipeError):  # the reader is gone, as the next line also finds
             typer.echo(event(one))
 
     with drone.on_event(show):
@@ -115,7 +115,7 @@ def state_line(drone: Drone) -> str:
 
 
 def event_line(event: Event) -> str:
-    """Return an event as a line of its own."""
+    """Return an event as a line."""
     return f"{time.strftime('%H:%M:%S')}  {event.severity.value}: {event.text}"
 
 
@@ -132,12 +132,12 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """Return all that is shown at one time."""
+    """Return the whole display."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 
 def state_panel(drone: Drone) -> Panel:
-    """Return what the drone and its links are doing."""
+    """Return a panel with the state of the drone and its links."""
     return Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left")
 
 
@@ -175,7 +175,7 @@ def _state(drone: Drone) -> Table:
 
 
 def channels(drone: Drone) -> Table:
-    """Return rates, delays and ages, a line for each channel; where it is narrow the most important ones."""
+    """Return rates, delays and ages, a line for each channel; in a narrow terminal only the most important ones."""
     titles = ("rate", "delay median", "age", "p99", "lost", "dropped")
     table = Table(named("channel"), *((*titles[:1], "delay", "age") if _is_narrow() else titles), box=None)
     for name, channel in drone.stats.items():
@@ -193,7 +193,7 @@ def channels(drone: Drone) -> Table:
 
 
 def _is_narrow() -> bool:
-    """Return whether the terminal has no room for two facts side by side."""
+    """Return whether the terminal is too narrow for two facts side by side."""
     return _width() < WIDE_COLUMNS
 
 

@@ -1,6 +1,6 @@
-"""``python -m skyloop.cockpit [NAME …]``: the cockpit as a process of its own.
+"""``python -m skyloop.cockpit [NAME …]``: the cockpit as its own process.
 
-It prints the page's address as the first line.
+The first line it prints is the page's address.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the cockpit.
 
     Args:
-        arguments: In place of the command line's.
+        arguments: Used instead of the command line's.
 
     Returns:
-        The exit code: 0, or 2 with a line of explanation when it could not start.
+        The exit code: 0, or 2 with a line of explanation if it could not start.
     """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
-    parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they come)")
+    parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they appear)")
     parser.add_argument("--port", type=int, help=f"0 takes a free one (default: {DEFAULT_PORT}, or the next free one)")
     parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="folder for recordings")
-    parser.add_argument("--parent-fd", type=int, help="end when this descriptor (the reading end of a pipe) ends")
+    parser.add_argument("--parent-fd", type=int, help="exit when this descriptor (the reading end of a pipe) is closed")
     given = parser.parse_args(arguments)
     stop = threading.Event()
     if given.parent_fd is not None:

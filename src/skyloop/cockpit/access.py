@@ -1,14 +1,13 @@
-"""Who asks, and what that person may do: roles, tokens, sessions, certificates.
+"""Who sent a request, and what that person may do: roles, tokens, sessions, certificates.
 
-=============  ====================================================================================================
-gate           lets in
-=============  ====================================================================================================
-``OpenGate``   programs of this user (and of the superuser) on this machine, all in one role; loopback only
-``TokenGate``  who once sent a token of the file of tokens, and has the cookie that was given for it, or sends the
-               token with each request (``Authorization: Bearer …``), or who sent a code to pair with, which is
-               shown in the terminal and works once
-``CertificateGate``  whose TLS certificate is signed by the given authority; its OU names the role, its CN the person
-=============  ====================================================================================================
+===================  ==============================================================================================
+gate                 admits
+===================  ==============================================================================================
+``OpenGate``         programs of this user (and of the superuser) on this machine, all in one role; loopback only
+``TokenGate``        browsers that exchanged a token from the token file, or the one-time pairing code shown in the
+                     terminal, for a session cookie; requests with a token (``Authorization: Bearer …``)
+``CertificateGate``  clients whose TLS certificate the given authority signed; its OU names the role, its CN the person
+===================  ==============================================================================================
 """
 
 from __future__ import annotations
@@ -34,19 +33,19 @@ from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import decoded
 from skyloop.messages import Role
 
-SESSION_S: Final = 12 * 3600.0  #: how long a log-in lasts
-PAIRING_S: Final = 3600.0  #: how long a code to pair with works
+SESSION_S: Final = 12 * 3600.0  #: lifetime of a session
+PAIRING_S: Final = 3600.0  #: lifetime of a pairing code
 MAX_SESSIONS: Final = 1000
 SHORTEST_TOKEN: Final = 16  #: characters; a shorter one could be guessed
 MAX_TOKEN: Final = 256
-CERTIFICATE: Final = "peer_certificate"  #: where the server puts it, in the connection's state
+CERTIFICATE: Final = "peer_certificate"  #: its key in the connection's state
 
-FIRST_S: Final = 0.25  #: after the first wrong token of an address; each further one doubles it
-LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.listening.ANSWER_S`, or nobody would get the answer
-FORGET_S: Final = 600.0  #: an address from which no wrong token came for this long starts over
-MAX_ADDRESSES: Final = 1024  #: kept in mind; the one that has been quiet for longest is forgotten first
-FREE_IN_ALL: Final = 20  #: wrong tokens a minute from everywhere that cost nothing besides
-EACH_IN_ALL_S: Final = 0.1  #: that each further one a minute adds, from any address
+FIRST_S: Final = 0.25  #: delay after an address's first wrong token; each further one doubles it
+LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.listening.ANSWER_S`, or no answer would arrive
+FORGET_S: Final = 600.0  #: an address starts over after this long without a wrong token
+MAX_ADDRESSES: Final = 1024  #: remembered at once; the one quiet for longest is forgotten first
+FREE_IN_ALL: Final = 20  #: wrong tokens a minute, over all addresses, before the delay below is added
+EACH_IN_ALL_S: Final = 0.1  #: added by each further one a minute, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
@@ -63,17 +62,17 @@ _log = logging.getLogger(__name__)
 def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
     """Return the user id of the program at the client's end of a loopback connection.
 
-    It is looked up in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in proc_pid_net(5)
-    and the kernel's ``proc_net_tcp.txt``: columns of local and remote address in hexadecimal, state, …, user id and
-    inode. A socket that its program has closed already has user 0 and inode 0 there, so an entry without an inode says
-    nothing of who opened it.
+    Looks the connection up in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
+    proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``: columns of local and remote address in hexadecimal, state, …,
+    user id and inode. A socket already closed by its program has user 0 and inode 0 there, so an entry without an
+    inode does not reveal who opened it.
 
     Args:
         client: The client's address and port.
-        server: This server's.
+        server: This server's address and port.
 
     Returns:
-        None if it is not known.
+        The user id; None if it is unknown.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -84,7 +83,7 @@ def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
 
 
 def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
-    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is not there, or nobody's."""
+    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is missing or unowned."""
     wanted = {(_table_entry(client, mapped), _table_entry(server, mapped)) for mapped in (False, True)}
     for line in table.splitlines()[1:]:
         cells = line.split()
@@ -110,34 +109,34 @@ def _table_entry(end: Endpoint, mapped: bool) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Who asks, as far as is known; ``name`` may be empty."""
+    """Whoever sent a request, as far as known; ``name`` may be empty."""
 
     role: Role
     name: str = ""
 
     def may(self, role: Role) -> bool:
-        """Return whether this person may do what needs a role: a pilot may also observe."""
+        """Return whether this person has a role's permissions: a pilot may also observe."""
         return self.role is Role.PILOT or role is Role.OBSERVER
 
 
 class Gate(Protocol):
     """Decides who sent a request."""
 
-    #: Whether a person can log in with a token.
+    #: Whether people can log in with a token.
     takes_tokens: bool
-    #: What somebody who is not let in should know.
+    #: The hint for a person who is refused.
     hint: str
 
     def person(self, scope: Scope) -> Person | None:
-        """Return who sent this request; None if it is not let in."""
+        """Return who sent this request; None if they are not admitted."""
 
 
 class OpenGate:
-    """Gives everybody on this machine who runs as the same user one role.
+    """Gives every program of the same user on this machine one role.
 
     Args:
         role: The role.
-        uid_of: Returns the user id of the client, by the addresses of both ends.
+        uid_of: Returns the client's user id, given the addresses of both ends.
     """
 
     takes_tokens = False
@@ -157,42 +156,42 @@ class OpenGate:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """One line of the file of tokens."""
+    """One line of the token file."""
 
     person: Person
     secret: bytes = field(repr=False)
 
 
 class Pairing:
-    """Gives codes that let one browser in each, once and within :data:`PAIRING_S`. On the event loop.
+    """Issues codes that each admit one browser, once and within :data:`PAIRING_S`. Used on the event loop.
 
     Args:
-        role: Of who is let in.
+        role: The role of the browsers that use a code.
         clock: The monotonic clock [ns].
     """
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
-        self.on_used: Callable[[str], None] = lambda _: None  #: called after a code was used, with who used it
-        self.on_expired: Callable[[], None] = lambda: None  #: called once a code's time was over
+        self.on_used: Callable[[str], None] = lambda _: None  #: called with address and role after a code was used
+        self.on_expired: Callable[[], None] = lambda: None  #: called once a code has expired
         self.role = role
         self._clock = clock
         self._code = ""
         self._until_ns = 0
 
     def code(self) -> str:
-        """Return a new code; those before it work no longer."""
+        """Return a new code, which invalidates the earlier ones."""
         self._code = secrets.token_urlsafe(24)
         self._until_ns = self._clock() + nanoseconds(PAIRING_S)
         return self._code
 
     def expire(self) -> None:
-        """Give up a code whose time is over; call it some times a minute."""
+        """Drop an expired code; call it a few times a minute."""
         if self._code != "" and self._clock() >= self._until_ns:
             self._code = ""
             self.on_expired()
 
     def person(self, code: str, address: str) -> Person | None:
-        """Return who sent a code, and use it up; None if it is not the one that works."""
+        """Return who sent a code, and use it up; None if it is not the current one."""
         works = self._code != "" and self._clock() < self._until_ns
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
@@ -202,7 +201,7 @@ class Pairing:
 
 
 class TokenGate:
-    """Lets in by a token, sent once for a session's cookie or with each request. On the event loop."""
+    """Admits by a token, sent once in exchange for a session cookie or with each request. Used on the event loop."""
 
     takes_tokens = True
     hint = "log in with a token"
@@ -216,14 +215,14 @@ class TokenGate:
         pairing: Pairing | None = None,
         kept: SessionFile | None = None,
     ) -> None:
-        """Initialise with the sessions that were kept, as far as what began them still lets in.
+        """Restore the saved sessions whose token or pairing role is still valid.
 
         Args:
-            tokens: Those that let in.
-            cookie: The name of the cookie that browsers are given.
+            tokens: The tokens to accept.
+            cookie: The name of the session cookie.
             clock: The monotonic clock [ns].
-            pairing: Gives codes that are taken once in place of a token.
-            kept: Where sessions are kept for the next run of the cockpit.
+            pairing: Issues one-time codes that replace a token.
+            kept: Where sessions are kept across runs of the cockpit.
         """
         self.cookie = cookie
         self.pairing = pairing
@@ -246,11 +245,11 @@ class TokenGate:
         return Person(session.role, session.name) if session is not None and self._clock() < session.until_ns else None
 
     def wrong_token_s(self, scope: Scope) -> float:
-        """Count a wrong token, and return for how long the answer to it is to wait [s]."""
+        """Count a wrong token, and return how long to delay its answer [s]."""
         return self.wrong.another(_address(scope))
 
     def known(self, token: str) -> Person | None:
-        """Return whose token this is, None if nobody's; a nearly right token takes as long as any other."""
+        """Return the owner of a token, None if it is unknown; a nearly right token takes as long as any other."""
         given = token.encode()[: MAX_TOKEN + 1]
         found = None
         for one in self._tokens:
@@ -259,18 +258,18 @@ class TokenGate:
         return found
 
     def logged_in(self, token: str, scope: Scope) -> Person | None:
-        """Return who logs in with a token, or with a code to pair with, which is used up; None if it is neither."""
+        """Return who logs in with a token or with a pairing code, which is used up; None if it is neither."""
         found = self.known(token)
         if found is None and self.pairing is not None:
             found = self.pairing.person(token, _address(scope))
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
-        """Begin a session, and return its cookie; the oldest sessions make room if there are too many.
+        """Begin a session and return its cookie; the oldest sessions make room if there are too many.
 
         Args:
-            person: Whose it is.
-            token: What was given for it.
+            person: The owner of the session.
+            token: The token it was given for.
         """
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
@@ -293,7 +292,7 @@ class TokenGate:
             self._kept.save(self._sessions.values())
 
     def _still_lets_in(self, session: Session) -> bool:
-        """Return whether what began a session would do so now: its token is known, or pairing gives its role."""
+        """Return whether a session would be admitted now: its token is still known, or pairing still gives its role."""
         if session.origin == b"":
             return self.pairing is not None and self.pairing.role is session.role
         person = Person(session.role, session.name)
@@ -301,7 +300,7 @@ class TokenGate:
 
 
 class CertificateGate:
-    """Lets in by the certificate that the TLS handshake has verified."""
+    """Admits by the certificate verified in the TLS handshake."""
 
     takes_tokens = False
     hint = "your certificate names no role: its OU must be pilot or observer"
@@ -311,14 +310,14 @@ class CertificateGate:
 
 
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
-    """Return role and name of a certificate.
+    """Return the role and name in a certificate.
 
     Args:
         certificate: As ``SSLObject.getpeercert()`` returns it.
 
     Returns:
-        The role by the organizational unit and the name by the common name; None if there is no OU that is a role, or
-        two of them.
+        The role from the organizational unit and the name from the common name; None if no OU, or more than one, is
+        a role.
     """
     if not certificate:
         return None
@@ -332,27 +331,27 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
 
 
 def read_tokens(path: Path) -> list[Token]:
-    """Read the file of tokens.
+    """Read the token file.
 
-    It has a line for each, ``ROLE TOKEN [NAME]``; empty lines and those that begin with # are left out.
+    Each line is ``ROLE TOKEN [NAME]``; empty lines and lines that begin with # are skipped.
 
     Raises:
-        UsageError: It can't be read, or others may read it.
-        FileFormatError: A line is not valid, or there is no token.
+        UsageError: The file can't be read, or others may read it.
+        FileFormatError: A line is invalid, or there is no token.
     """
     try:
         mode = path.stat().st_mode
         text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"the file of tokens {path} can't be read: {error}") from None
+        raise UsageError(f"the token file {path} can't be read: {error}") from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise UsageError(f"the file of tokens {path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 600 it")
+        raise UsageError(f"the token file {path} is readable by others (mode {stat.S_IMODE(mode):04o}): chmod 600 it")
     tokens: list[Token] = []
     for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.lstrip().startswith("#"):
             token = _token(line, f"{path} line {number}")
             if any(token.secret == known.secret for known in tokens):
-                raise FileFormatError(f"{path} line {number}: this token is in the file already")
+                raise FileFormatError(f"{path} line {number}: this token is already in the file")
             tokens.append(token)
     if not tokens:
         raise FileFormatError(f"{path} has no token: write a line such as: pilot {secrets.token_urlsafe(24)}")
@@ -362,23 +361,23 @@ def read_tokens(path: Path) -> list[Token]:
 def _token(line: str, where: str) -> Token:
     role, *rest = line.split(maxsplit=2)
     if role not in list(Role) or not rest:
-        raise FileFormatError(f"{where}: ROLE TOKEN [NAME] is needed, with a role of {' or '.join(Role)}")
+        raise FileFormatError(f"{where}: expected ROLE TOKEN [NAME], where the role is {' or '.join(Role)}")
     if not (rest[0].isascii() and SHORTEST_TOKEN <= len(rest[0]) <= MAX_TOKEN):
         raise FileFormatError(
-            f"{where}: a token has {SHORTEST_TOKEN} to {MAX_TOKEN} characters of ASCII, so that it can't be guessed: "
+            f"{where}: a token needs {SHORTEST_TOKEN} to {MAX_TOKEN} ASCII characters, so that it can't be guessed: "
             f"for example {secrets.token_urlsafe(24)}"
         )
     return Token(Person(Role(role), rest[1].strip()[:48] if len(rest) > 1 else ""), rest[0].encode())
 
 
 def _hash(value: str) -> bytes:
-    """Hash a cookie: looking up a hash takes a time that reveals nothing of the cookie."""
+    """Hash a cookie: the time to look up a hash reveals nothing about the cookie."""
     return hashlib.sha256(value.encode()).digest()
 
 
 def _address(scope: Scope) -> str:
     client = scope.get("client")
-    return str(client[0]) if client else "a client that is gone"
+    return str(client[0]) if client else "a disconnected client"
 
 
 def _header(scope: Scope, wanted: bytes) -> str | None:
@@ -387,7 +386,7 @@ def _header(scope: Scope, wanted: bytes) -> str | None:
 
 
 def has_token(scope: Scope) -> bool:
-    """Return whether a token comes with this request."""
+    """Return whether this request carries a token."""
     return any(name.lower() == b"authorization" for name, _ in scope["headers"])
 
 
@@ -398,12 +397,12 @@ def _cookies(scope: Scope) -> dict[str, str]:
 
 
 class WrongTokens:
-    """Decides how long the answer to a wrong token waits. On the event loop.
+    """Decides how long to delay the answer to a wrong token. Used on the event loop.
 
-    The wait is longer, the more wrong tokens there were, from the same address and in all. A right token never waits,
-    so nobody can lock out who has one, from the same address neither. What grows is the wait for *no*: a guesser who
-    reads the answers gets few of them. One who does not, and takes silence for *no*, is as fast as connections are
-    made; against that the length of tokens is what counts.
+    The delay grows with the number of wrong tokens, from the same address and overall. A right token is never delayed,
+    so an attacker can't lock out its owner, not even from the same address. Only *no* gets slower: a guesser who reads
+    the answers gets few of them. One who ignores them, and takes silence for *no*, is limited only by the rate of
+    connections; the length of the tokens protects against that.
 
     Args:
         clock: The monotonic clock [ns].
@@ -417,7 +416,7 @@ class WrongTokens:
         self._in_minute = 0
 
     def another(self, address: str) -> float:
-        """Count a wrong token from an address, and return for how long its answer is to wait [s]."""
+        """Count a wrong token from an address, and return how long to delay its answer [s]."""
         now_ns = self._clock()
         before, last_ns = self._of_address.pop(address, (0, now_ns))
         many = 1 if seconds(now_ns - last_ns) >= FORGET_S else before + 1

@@ -1,4 +1,4 @@
-"""Where the page is: the sockets that it is served on, its addresses, and what the person at the terminal is told."""
+"""Where the page is served: its sockets, its addresses, and the lines printed in the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.errors import UsageError
 
 DEFAULT_PORT: Final = 8420
-NEXT_PORTS: Final = 9  #: tried after it, if it is taken
+NEXT_PORTS: Final = 9  #: further ports to try if the default is taken
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _LISTENS: Final = "0A"  # the state of a listening socket in these tables
 _LOCAL, _STATE, _INODE = 1, 3, 9  # their columns
@@ -31,10 +31,10 @@ def bind(address: str, port: int | None) -> socket.socket:
     Args:
         address: The address.
         port: The TCP port; 0: any free one; None: :data:`DEFAULT_PORT`, or the next free one, with a line on standard
-            error that says who has it.
+          error that names the program on the default one.
 
     Raises:
-        UsageError: The port is taken, or can't be used.
+        UsageError: The port is taken or unusable.
     """
     if port is not None:
         return _bind(address, port)
@@ -53,7 +53,7 @@ def _bind(address: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((address, port))
-        listening.listen(0)  # now, as two may bind one port where neither listens yet
+        listening.listen(0)  # at once: two programs may bind one port until either listens
     except (OSError, OverflowError) as error:
         listening.close()
         taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
@@ -68,7 +68,7 @@ def _by(port: int) -> str:
 
 
 def listener_of(port: int) -> str:
-    """Return which program of this user listens at a port: its process and command line; empty if it can't be found."""
+    """Return which of this user's programs listens on a port: process and command line; empty if none is found."""
     inodes = set()
     for table in _TABLES:
         with suppress(OSError):
@@ -80,7 +80,7 @@ def listener_of(port: int) -> str:
         return ""
     for process in Path("/proc").iterdir():
         if process.name.isdigit():
-            with suppress(OSError):  # another user's, or gone
+            with suppress(OSError):  # another user's process, or one that has ended
                 if any(str(entry.readlink()) in inodes for entry in (process / "fd").iterdir()):
                     command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
                     return f"process {process.name} ({command[:_MAX_COMMAND]})"
@@ -88,9 +88,9 @@ def listener_of(port: int) -> str:
 
 
 def reachable(address: str) -> list[str]:
-    """Return the addresses under which others reach what listens at one; the first is the one to tell people.
+    """Return the addresses at which others reach a service bound to ``address``, the best one first.
 
-    Where this machine is in no network, that is its loopback address.
+    On a machine without a network, that is its loopback address.
 
     Args:
         address: An address of this machine, ``0.0.0.0`` or ``::``.
@@ -104,15 +104,15 @@ def reachable(address: str) -> list[str]:
     found = []
     for family, somewhere in families:
         with suppress(OSError), closing(socket.socket(family, socket.SOCK_DGRAM)) as probe:
-            probe.connect((somewhere, 9))  # sends nothing: it only asks which of our addresses would be used
+            probe.connect((somewhere, 9))  # sends nothing: it only selects our address for that route
             found.append(str(probe.getsockname()[0]))
     return found or own_addresses() or ["127.0.0.1" if known.version == 4 else "::1"]
 
 
 def own_addresses() -> list[str]:
-    """Return the IPv4 addresses of this machine's networks, in the order of its interfaces; none but on Linux.
+    """Return the IPv4 addresses of this machine's networks, in the order of its interfaces; empty except on Linux.
 
-    They matter where no route leads further: a drone's own Wi-Fi, or a hall's that has no internet.
+    Needed in networks without a default route: a drone's own Wi-Fi, or a lab without internet.
     """
     if sys.platform != "linux":
         return []
@@ -128,13 +128,13 @@ def own_addresses() -> list[str]:
 
 
 def host_names() -> tuple[str, ...]:
-    """Return the names of this machine: its own, and that of multicast DNS where a program answers for it."""
+    """Return the names of this machine: its host name, and its multicast DNS name where a program answers for it."""
     name = socket.gethostname()
     return (name, f"{name.partition('.')[0]}.local") if _MDNS.exists() else (name,)
 
 
 def qr_code(text: str) -> str:
-    """Return a QR code for a terminal, in half blocks; empty if the library is not installed."""
+    """Return a QR code for a terminal, in half blocks; empty if the library is missing."""
     try:
         import segno
     except ImportError:
@@ -147,13 +147,13 @@ def qr_code(text: str) -> str:
 
 
 class Announcer:
-    """Prints the page's address, and a QR code for phones where others reach it and a terminal can show one.
+    """Prints the page's address, with a QR code for phones if others can reach it and the terminal can show one.
 
-    The address of the QR code has a code to pair with, if there are any, after the ``#``: browsers send that part to
-    nobody. The next one is printed as soon as it was used, or is too old.
+    With pairing, the address in the QR code carries the code after the ``#``, the part that browsers never send. The
+    next code is printed as soon as the last one was used or has expired.
 
     Args:
-        pairing: Gives the codes; None: none is needed, or people have tokens.
+        pairing: Issues the codes; None: everyone is admitted, or people have tokens.
         loopback: Whether only this machine reaches it.
     """
 
@@ -166,9 +166,9 @@ class Announcer:
         print(f"cockpit: {page}", flush=True)
         if self._pairing is not None:
             self._pairing.on_used = lambda who: self._show(page, f"paired with {who}")
-            self._pairing.on_expired = lambda: self._show(page, "the address to pair with is too old now")
+            self._pairing.on_expired = lambda: self._show(page, "the pairing address has expired")
         if not self._loopback and ipaddress.ip_address(urlsplit(page).hostname or "").is_loopback:
-            print("cockpit: this machine is in no network: nobody else reaches the page", file=sys.stderr)
+            print("cockpit: this machine has no network: the page can't be reached from elsewhere", file=sys.stderr)
         self._show(page, "")
 
     def _show(self, page: str, before: str) -> None:

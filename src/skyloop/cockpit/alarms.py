@@ -1,6 +1,6 @@
-"""What a person must know of a drone at once: decided from links, feedback and ages, pure.
+"""The alarms of a drone: pure decisions from links, feedback and ages.
 
-Its thresholds are parameters of the drone's proxy: the same for every page, wherever it is served.
+The thresholds are parameters of the drone's proxy, so they are the same on every page.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class AlarmSeverity(StrEnum):
 
 
 class Alarm(msgspec.Struct, frozen=True):
-    """One thing that is wrong now.
+    """A problem that exists now.
 
     Args:
-        id: What it is about, the same while it lasts: a page remembers by it that a person has acknowledged it.
-        severity: It may rise while it lasts, as from a degraded link to a lost one.
-        text: In words, with the figure of now.
+        id: Its subject, constant while it lasts: a page uses it to remember that a person acknowledged the alarm.
+        severity: It may rise while the alarm lasts, as from a degraded link to a lost one.
+        text: In words, with the current value.
     """
 
     id: str
@@ -47,7 +47,7 @@ class Alarm(msgspec.Struct, frozen=True):
 
 
 class Thresholds(msgspec.Struct, frozen=True):
-    """From where on something is an alarm: charges from 0 to 1, ages in seconds; 0: never."""
+    """Where alarms begin: charges from 0 to 1, ages in seconds; 0: never."""
 
     battery_low: float = 0.2
     battery_critical: float = 0.15
@@ -60,13 +60,13 @@ USUAL: Final = Thresholds()
 
 
 class DegradedTimes:
-    """How long the hops have been degraded without a break."""
+    """How long each hop has been degraded without a break."""
 
     def __init__(self) -> None:
         self._since_ns: dict[str, int] = {}
 
     def update(self, link: LinkStatus, now_ns: int) -> dict[str, float]:
-        """Take the state of now, and return the time of each hop that is degraded [s], by the ``id`` of its alarm."""
+        """Take the current state, and return how long each degraded hop has been so [s], by the ``id`` of its alarm."""
         degraded = [hop for hop, _, state in _hops(link) if state is LinkState.DEGRADED]
         self._since_ns = {hop: self._since_ns.get(hop, now_ns) for hop in degraded}
         return {hop: seconds(now_ns - since_ns) for hop, since_ns in self._since_ns.items()}
@@ -80,23 +80,23 @@ def alarms(
     degraded_s: Mapping[str, float],
     thresholds: Thresholds = USUAL,
 ) -> list[Alarm]:
-    """Return what a person must know at once, the most severe first.
+    """Return the alarms of this moment, the most severe first.
 
     Args:
         link: The state of both hops.
         feedback: The newest, None for none.
         feedback_age_s: Its age [s].
-        video_age_s: Age of what is shown [s], by camera that somebody watches.
-        degraded_s: How long the links that are degraded have been so [s], from :class:`DegradedTimes`.
-        thresholds: From where on a charge, an age or a degraded link is an alarm.
+        video_age_s: Age of the frame shown [s], for each camera that is watched.
+        degraded_s: How long each degraded hop has been so [s], from :class:`DegradedTimes`.
+        thresholds: The limits for charges, ages and degraded links.
     """
-    # On the ground there is time: only what is, or was when last heard of, in the air is urgent.
+    # On the ground there is time: only a vehicle that is in the air, or was at last report, is urgent.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
     if link.application in _BROKEN:
-        # Nothing else is known any more: what came before is out of date.
+        # Everything else is out of date.
         return [urgent("application_link", _because("link to the proxy lost", link.reason))]
     if link.vehicle is LinkState.CLOSED:
-        return []  # a recording that is over, as every recording is some time: nothing is wrong
+        return []  # a replay that has reached its end: nothing is wrong
     found = [*_of_flight(feedback, thresholds, urgent), *_of_links(link, degraded_s, thresholds, urgent)]
     if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
         found.append(urgent("feedback_age", f"feedback is {feedback_age_s:.1f} s old"))
@@ -113,9 +113,9 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
         yield _critical("emergency", "emergency: the motors are off")
     if feedback.failsafe is Failsafe.LAND:
         returns = feedback.return_phase in (ReturnPhase.CLIMBING, ReturnPhase.FLYING)
-        yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'} by itself")
+        yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'}")
     elif feedback.failsafe is not Failsafe.NONE:
-        yield _warning("failsafe", "failsafe: hovering by itself")
+        yield _warning("failsafe", "failsafe: hovering")
     charge = feedback.battery
     if charge is not None and charge < thresholds.battery_critical:
         yield urgent("battery", f"battery critical: {charge:.0%}")
@@ -151,8 +151,8 @@ def _because(what: str, *more: str) -> str:
     return ": ".join((what, *filter(None, more)))
 
 
-RETRY_S: Final = 2.0  #: between two attempts to read them
-#: The parameters, by the field of :class:`Thresholds`.
+RETRY_S: Final = 2.0  #: between two attempts to read the parameters
+#: The parameters, by field of :class:`Thresholds`.
 PARAMETERS: Final = {
     "battery_low": "battery.warn",
     "battery_critical": "alarms.battery_critical",
@@ -163,13 +163,13 @@ PARAMETERS: Final = {
 
 
 class _Readable(Protocol):
-    """``drone.config``, as far as it is used here."""
+    """The part of ``drone.config`` that is used here."""
 
     def __getitem__(self, name: str, /) -> Value: ...
 
 
 class ThresholdReader:
-    """Reads the thresholds, and reads them anew when a parameter was written or a link came back.
+    """Reads the thresholds, and reads them again after a parameter was written or a link came back.
 
     Made and used on the event loop.
 
@@ -189,13 +189,13 @@ class ThresholdReader:
         self._listener = drone.on_event(lambda event: call_soon(loop, self.on_event, event))
 
     def on_event(self, event: Event) -> None:
-        """Note that the thresholds may be others now."""
+        """Note that the thresholds may have changed."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._is_stale, self._tried_ns = True, None
 
     def newest(self) -> Thresholds:
-        """Return them as last read, and start to read them if they may have changed. Does not wait."""
+        """Return the thresholds last read, and start to read them if they may have changed. Does not block."""
         now_ns = self._clock()
         rested = self._tried_ns is None or now_ns - self._tried_ns >= nanoseconds(RETRY_S)
         if self._is_stale and rested and self._task is None:
@@ -211,13 +211,13 @@ class ThresholdReader:
         try:
             self._values = await asyncio.to_thread(thresholds_of, self._drone.config)
         except SkyloopError:
-            self._is_stale = True  # no answer: tried again after RETRY_S
+            self._is_stale = True  # no answer: retry after RETRY_S
         finally:
             self._task = None
 
 
 def thresholds_of(config: _Readable) -> Thresholds:
-    """Read the thresholds; those that a proxy does not have, or that are no finite numbers, are the usual ones.
+    """Read the thresholds; the default replaces any that the proxy lacks or that is not finite.
 
     Raises:
         SkyloopError: The proxy does not answer.

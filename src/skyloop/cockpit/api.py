@@ -1,4 +1,4 @@
-"""Requests over HTTP, answered in JSON, whole or not at all; :mod:`.security` has decided who may ask."""
+"""HTTP requests, answered in JSON, entirely or not at all; :mod:`.security` has decided who may send them."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from skyloop.cockpit.stream import PageCounts
 
 LARGEST_BODY: Final = 65_536  #: bytes
-BODY_S: Final = 10.0  #: within which a request's body must have come
+BODY_S: Final = 10.0  #: time limit for receiving a request's body
 _JSON: Final = "application/json"
 
 _STATUS: Final = (
     (UnknownNameError, 404),
-    (ClosedError, 404),  # a replay that was ended meanwhile
+    (ClosedError, 404),  # a replay that has ended meanwhile
     (UsageError, 400),
     (RefusedError, 409),
     (UnsupportedError, 409),
@@ -50,12 +50,12 @@ _STATUS: Final = (
 
 T = TypeVar("T")
 Handler = Callable[[Any, Request], Awaitable[Response]]
-MAX_ASKING: Final = 4  #: proxies that are asked for parameters at one time; each may take its thread for seconds
-MOST_CHECKS: Final = 4  #: at one time: each asks a proxy, and may take its thread for seconds
+MAX_ASKING: Final = 4  #: parameter requests to proxies at one time; each may block its thread for seconds
+MOST_CHECKS: Final = 4  #: route checks at one time; each asks a proxy and may block its thread for seconds
 
 
-class BadRequest(Exception):  # noqa: N818  (as HTTP calls it)
-    """A request that is not valid; ``status`` is the HTTP status of the answer."""
+class BadRequest(Exception):  # noqa: N818  (HTTP's name for it)
+    """An invalid request; ``status`` is the HTTP status of the answer."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -63,7 +63,7 @@ class BadRequest(Exception):  # noqa: N818  (as HTTP calls it)
 
 
 def answered(handler: Handler) -> Handler:
-    """Turn what a handler raises into an answer with a status and ``{"error": why}``."""
+    """Turn exceptions of a handler into an answer with a status and ``{"error": why}``."""
 
     @wraps(handler)
     async def answer(self: Any, request: Request) -> Response:
@@ -81,13 +81,13 @@ def answered(handler: Handler) -> Handler:
 
 
 async def while_wanted(request: Request, work: Coroutine[Any, Any, T]) -> T:
-    """Run work for a request, and cancel it as soon as who asked is gone.
+    """Run work for a request, and cancel it once the client has disconnected.
 
     Returns:
         What ``work`` returns.
 
     Raises:
-        ClientDisconnect: Who asked is gone.
+        ClientDisconnect: The client has disconnected.
     """
     task, gone = asyncio.create_task(work), asyncio.create_task(_gone(request))
     try:
@@ -112,7 +112,7 @@ def answer_json(values: Any, status: int = 200) -> Response:
 
 
 def check_json(request: Request) -> None:
-    """Check the content type: another site's page can't send this one without asking first, which is refused."""
+    """Check the content type: browsers ask before they send this one for another site, and are refused."""
     if request.headers.get("content-type", "").partition(";")[0].strip().lower() != _JSON:
         raise BadRequest(415, f"the content type must be {_JSON}")
 
@@ -122,10 +122,10 @@ async def body_of(request: Request, kind: type[T]) -> T:
 
     Args:
         request: The request.
-        kind: What the body is to be.
+        kind: The type to decode.
 
     Raises:
-        BadRequest: It is no JSON, too large, not whole in time, or something else.
+        BadRequest: The body is not JSON, too large, incomplete in time, or of another type.
     """
     check_json(request)
     data = b""
@@ -134,9 +134,9 @@ async def body_of(request: Request, kind: type[T]) -> T:
             async for part in request.stream():
                 data += part
                 if len(data) > LARGEST_BODY:
-                    raise BadRequest(413, f"at most {LARGEST_BODY} bytes are taken")
+                    raise BadRequest(413, f"at most {LARGEST_BODY} bytes are accepted")
     except TimeoutError:
-        raise BadRequest(408, f"the request was not whole within {BODY_S:g} s") from None
+        raise BadRequest(408, f"the request was incomplete after {BODY_S:g} s") from None
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.DecodeError as error:
@@ -152,11 +152,11 @@ class Api:
 
     Args:
         fleet: The drones.
-        gate: Who is let in.
-        counts: What pages were sent.
+        gate: Decides who is admitted.
+        counts: The messages sent to pages.
         scheme: ``http`` or ``https``.
-        admission: The connections.
-        authority: Certificate of the authority that certified this server, PEM; None where it made none.
+        admission: The open connections.
+        authority: PEM certificate of the authority that signed this server's; None if the cockpit made none.
     """
 
     def __init__(
@@ -188,10 +188,10 @@ class Api:
             Route("/api/statistics", self.statistics),
         ]
 
-    # Who asks --------------------------------------------------------------------------------------------------
+    # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
-        """Answer with the role of who asks; null for nobody known, with what to do about it."""
+        """Answer with the role of the client; null for strangers, with a hint on how to log in."""
         person = person_of(request.scope)
         return answer_json(
             {
@@ -204,19 +204,19 @@ class Api:
 
     @answered
     async def login(self, request: Request) -> Response:
-        """Exchange a token for a session's cookie; the answer to a wrong token waits."""
+        """Exchange a token for a session cookie; the answer to a wrong token is delayed."""
         gate = self._gate
         if not isinstance(gate, TokenGate):
-            raise BadRequest(404, "this cockpit asks for no token")
+            raise BadRequest(404, "this cockpit uses no tokens")
         token = (await body_of(request, _Login)).token
         person = gate.logged_in(token, request.scope)
         if person is None:
             await gone_within(request.receive, gate.wrong_token_s(request.scope))
             raise BadRequest(
                 401,
-                "this token is not known here"
+                "this token is unknown here"
                 if gate.pairing is None
-                else "this code was used, or is too old: take the newest one",
+                else "this code was already used or has expired: use the newest one",
             )
         answer = answer_json({"role": person.role, "name": person.name})
         answer.set_cookie(
@@ -240,7 +240,7 @@ class Api:
 
     @answered
     async def authority(self, _: Request) -> Response:
-        """Answer with the certificate that browsers are to trust, as a file."""
+        """Answer with the certificate that browsers should trust, as a file."""
         if self._authority is None:
             raise BadRequest(404, "this cockpit made no certificate: start it with --https")
         answer = Response(self._authority, media_type="application/x-x509-ca-cert")
@@ -250,7 +250,7 @@ class Api:
     # Drones ----------------------------------------------------------------------------------------------------
 
     async def drones(self, _: Request) -> Response:
-        """Answer with the drones that are connected."""
+        """Answer with the connected drones."""
         return answer_json(
             [
                 {"name": name, "uri": one.drone.uri, "cameras": [c.name for c in one.drone.capabilities.cameras]}
@@ -267,9 +267,9 @@ class Api:
         return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
-        """Answer with what pages were sent.
+        """Answer with counts of the messages sent to pages.
 
-        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts the cameras that are there now.
+        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts only the current cameras.
         """
         counts = self._counts
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
@@ -302,7 +302,7 @@ class Api:
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter as JSON values, with all that is needed to edit it."""
+    """Return a parameter as JSON values, with everything needed to edit it."""
     return {
         "name": parameter.name,
         "type": str(parameter.type),
@@ -319,16 +319,16 @@ def parameter_values(parameter: Parameter) -> dict[str, Any]:
 
 
 def _value(value: Value) -> Any:
-    """Return a value for JSON; the encoder makes numbers that are not finite null."""
+    """Return a value for JSON; the encoder turns numbers that are not finite into null."""
     return list(value) if isinstance(value, tuple) else value
 
 
 class RoutesApi:
-    """The routes below ``/api/routes``, and the check of one for a drone.
+    """The routes below ``/api/routes``, and the check of a route for a drone.
 
     Args:
         fleet: The drones.
-        files: The routes that are kept.
+        files: The stored routes.
     """
 
     def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
@@ -348,7 +348,7 @@ class RoutesApi:
 
     @answered
     async def check(self, request: Request) -> Response:
-        """Answer with what speaks against a route for a drone, and the ``id`` by which it is flown."""
+        """Answer with the problems of a route for a drone, and the ``id`` to fly it by."""
         name, stations = request.path_params["name"], self._fleet.stations
         if name not in stations:
             raise UnknownNameError("drone", name, stations)
@@ -360,18 +360,18 @@ class RoutesApi:
 
     @answered
     async def listing(self, _: Request) -> Response:
-        """Answer with the routes that are kept here."""
+        """Answer with the routes stored here."""
         return answer_json(await asyncio.to_thread(self._files.listing))
 
     @answered
     async def load(self, request: Request) -> Response:
-        """Answer with a route, as its file is."""
+        """Answer with the file of a route."""
         route = await asyncio.to_thread(self._files.load, request.path_params["name"])
         return Response(route.to_json(), media_type="application/json")
 
     @answered
     async def save(self, request: Request) -> Response:
-        """Keep a route under a name."""
+        """Store a route under a name."""
         name, route = request.path_params["name"], parse_route(bytes(await body_of(request, msgspec.Raw)))
         await asyncio.to_thread(self._files.save, name, route)
         return answer_json({"name": name}, 201)

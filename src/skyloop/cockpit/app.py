@@ -1,14 +1,14 @@
-"""The cockpit's routes: one page, requests in JSON, WebSockets for what moves. ``docs/cockpit.md`` describes them all.
+"""The cockpit's routes: one page, JSON requests, WebSockets for live data. ``docs/cockpit.md`` describes them all.
 
 ======================================  ==================================================================
 ``/``, ``/static/…``                    the page
 ``/api/…``                              see :mod:`skyloop.cockpit.api` and :mod:`skyloop.cockpit.recordings_api`
 ``/ws/overview``                        to the page: all drones, twice a second
-``/ws/control``                         from the page: commands to all drones; to the page: what became of them
+``/ws/control``                         from the page: commands to all drones; to the page: their outcome
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
-``/ws/drones/NAME/control``             from the page: commands; to the page: what became of them, who has control
+``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, who has control
 ======================================  ==================================================================
 """
 
@@ -56,7 +56,7 @@ from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
-SMALLEST_PACKED: Final = 1000  #: bytes; to compress less saves nothing
+SMALLEST_PACKED: Final = 1000  #: bytes; compressing less saves nothing
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
@@ -65,17 +65,17 @@ _FOR_GOOD: Final = "private, max-age=31536000, immutable"
 
 @dataclass(frozen=True, slots=True)
 class _File:
-    """A file as it was read; ``stamp`` tells whether it has changed since."""
+    """A file as read; ``stamp`` shows whether it has changed since."""
 
     stamp: tuple[int, int]
     kind: str
     hash: str
     plain: bytes
-    packed: bytes | None  #: None: it is sent as it is
+    packed: bytes | None  #: None: sent uncompressed
 
 
 class PageFiles(StaticFiles):
-    """Serves the folder of the page.
+    """Serves the page's folder.
 
     Args:
         folder: The folder; it may be missing.
@@ -87,7 +87,7 @@ class PageFiles(StaticFiles):
         self._files: dict[str, _File] = {}
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """Return a file, compressed where the browser takes that."""
+        """Return a file, compressed if the browser accepts that."""
         try:
             full, found = self.lookup_path(path)
         except (OSError, ValueError):
@@ -100,7 +100,7 @@ class PageFiles(StaticFiles):
         return self._answer(file, Headers(scope=scope), _FOR_GOOD if for_good else "no-cache")
 
     async def page(self) -> Response:
-        """Return the page itself, which names its files by what is in them."""
+        """Return the page itself, with file names that carry a hash of their content."""
         try:
             text = self._index.read_text()
         except OSError:
@@ -131,7 +131,7 @@ class PageFiles(StaticFiles):
         stamp = (found.st_mtime_ns, found.st_size)
         file = self._files.get(full)
         if file is None or file.stamp != stamp:
-            # On a thread: the 3-D view takes some 30 ms to compress, and pilots' commands wait for nothing here.
+            # On a thread: compressing the 3-D view takes some 30 ms, and pilots' commands must not wait for it.
             file = self._files[full] = await asyncio.to_thread(_read, full, stamp)
         return file
 
@@ -145,7 +145,7 @@ def _read(full: str, stamp: tuple[int, int]) -> _File:
 
 
 STATIC = Path(__file__).with_name("static")
-_THREADS: Final = 32  # for what waits: proxies that answer late, recorders that end
+_THREADS: Final = 32  # for work that blocks: proxies that answer late, recorders that end
 
 
 class Cockpit:
@@ -153,9 +153,9 @@ class Cockpit:
 
     Args:
         fleet: The drones.
-        recordings: Of the same drones.
-        static: The folder of the page.
-        follower: Makes what tracks a target that a page marks, and flies after it.
+        recordings: The recordings of the same drones.
+        static: The page's folder.
+        follower: Creates followers for targets marked on a page.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
@@ -197,7 +197,7 @@ class Cockpit:
         await socket.accept()
         person = person_of(socket.scope)
         if person is None or not person.may(Role.PILOT):
-            await socket.close(NOT_ALLOWED, "this needs a pilot")
+            await socket.close(NOT_ALLOWED, "only a pilot may do this")
             return
         await FleetSession(socket, self._fleet, person.name).run()
 
@@ -230,13 +230,13 @@ class Cockpit:
             return
         person = person_of(socket.scope)
         if person is None or not person.may(Role.PILOT):
-            await socket.close(NOT_ALLOWED, "this needs a pilot")
+            await socket.close(NOT_ALLOWED, "only a pilot may do this")
             return
         photos = self._recordings.folder / "photos"
         await ControlSession(socket, station, person.name, photos=photos, follower=self._follower).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
-        """Return the station of the drone that is asked for; None, and the socket is closed, if there is none."""
+        """Return the station of the requested drone; None, with the socket closed, if there is none."""
         station = self._fleet.stations.get(socket.path_params["name"])
         await socket.accept()
         if station is None:
@@ -256,18 +256,18 @@ def create_app(
     follower: FollowerFactory = TargetFollower,
     page_authority: bytes | None = None,
 ) -> Starlette:
-    """Make the cockpit's application.
+    """Create the cockpit's application.
 
     Args:
         fleet: The drones.
-        recordings: Of the same drones.
-        names: The only names to which it answers.
-        gate: Decides who is let in.
-        static: The folder of the page.
+        recordings: The recordings of the same drones.
+        names: The only host names to answer to.
+        gate: Decides who is admitted.
+        static: The page's folder.
         admission: Counts the connections.
-        world: What stands around drones that don't know it themselves.
-        follower: Makes what tracks a target that a page marks, and flies after it.
-        page_authority: Certificate of the authority that certified this server, PEM, for browsers that are to trust it.
+        world: The surroundings of drones that don't report them.
+        follower: Creates followers for targets marked on a page.
+        page_authority: PEM certificate of the authority that signed this server's, for browsers that should trust it.
     """
     cockpit = Cockpit(fleet, recordings, static, follower)
     api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission(), page_authority)

@@ -1,4 +1,4 @@
-"""The cockpit as a child process, for a program that shows a page beside its own work."""
+"""The cockpit as a child process, for programs that show a page beside their own work."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _ASK_S = 2.0
 class CockpitProcess:
     """Runs ``python -m skyloop.cockpit [NAME]`` as a child process.
 
-    The child ends with :meth:`close`, and with this process, however that ends. Ctrl-C is for the parent.
+    The child ends with :meth:`close`, or with this process, however that ends. It ignores Ctrl-C.
     """
 
     def __init__(self, name: str | None = None, port: int | None = 0, recordings: Path | None = None) -> None:
-        """Start the child; returns at once, see :meth:`address`.
+        """Start the child without waiting for the page; see :meth:`address`.
 
         Args:
             name: The proxy to show (default: all).
-            port: The port on loopback; 0 takes a free one, None the default port or the next free one.
+            port: The port on loopback; 0 selects a free one, None the default port or the next free one.
             recordings: The folder for recordings.
         """
         names = [] if name is None else [name]
@@ -50,7 +50,7 @@ class CockpitProcess:
             The page's address.
 
         Raises:
-            LinkError: It was not served in time, or the child ended; with the last line of its errors.
+            LinkError: The page was not served in time, or the child ended; includes its last line of standard error.
         """
         deadline = time.monotonic() + timeout_s
         line = b""
@@ -65,10 +65,10 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """Return what its pages were sent: see ``/api/statistics``.
+        """Return counts of the messages sent to its pages: see ``/api/statistics``.
 
         Raises:
-            LinkError: It does not answer.
+            LinkError: The cockpit does not answer.
         """
         try:
             with urllib.request.urlopen(f"{self.address()}api/statistics", timeout=_ASK_S) as answer:
@@ -82,7 +82,7 @@ class CockpitProcess:
         self._process.close()
 
     def _complaint(self) -> str:
-        """Return the last line that the child wrote to its standard error, if it has ended."""
+        """Return the last line of the child's standard error, if it has ended."""
         code = self._process.wait(0.5)
         if code is None:
             return "no answer in time"

@@ -1,4 +1,4 @@
-"""Commands of a page: one JSON object per message, its kind named by ``do``; and whether it is in time."""
+"""A page's commands: one JSON object per message, with the kind in ``do``; and whether one is in time."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ CameraName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
 Pixels = Annotated[float, msgspec.Meta(gt=0)]
 Word = Annotated[str, msgspec.Meta(max_length=64)]
 
-LATE_S: Final = 0.5  #: a command that may be older is refused: the person no longer expects it to happen
+LATE_S: Final = 0.5  #: a command that may be older is refused: its sender no longer expects it to happen
 #: An emergency stop may be this late: as long as the page shows it as pending.
 STOP_LATE_S: Final = 2.0
-#: Sticks that are pushed and that no hand has moved for so long are in nobody's hand. Bluetooth itself notices that a
-#: gamepad is gone after up to 20 s only.
+#: Pushed sticks that have not moved for this long count as held by no hand. Bluetooth reports a lost gamepad only
+#: after up to 20 s.
 UNTOUCHED_S: Final = 10.0
-AHEAD_S: Final = 0.05  #: what clocks may differ by beyond what the page stated; as for commands of programs
-SETTLED_NS: Final = 50_000_000  #: feedback captured so soon after a command may still be from before it [ns]
+AHEAD_S: Final = 0.05  #: tolerated clock difference beyond the page's own bound, as for programs' commands
+SETTLED_NS: Final = 50_000_000  #: feedback captured this soon after a command may predate it [ns]
 
 
 class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):
-    """Base of all commands of a page."""
+    """Base of all commands from a page."""
 
-    #: When the person asked for it, on the cockpit's clock as the page knows it from pongs [s].
+    #: When the person requested it, on the cockpit's clock as the page knows it from pongs [s].
     at_s: float | None = None
-    unsure_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  #: and by how much that may be wrong
-    n: int = 0  #: by which the page knows the answers
+    unsure_s: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0  #: uncertainty of ``at_s`` [s]
+    n: int = 0  #: repeated in the answers
 
     @property
     def do(self) -> str:
-        """The command's kind, by which messages name it."""
+        """The command's kind, as messages name it."""
         return str(self.__struct_config__.tag)
 
 
@@ -43,7 +43,7 @@ class Take(Command, frozen=True, tag="take"):
     """Ask for the authority: 0 is the highest priority, 31 the lowest."""
 
     priority: Priority
-    ask: bool = False  #: the holder is asked first, and the page waits in line
+    ask: bool = False  #: ask the holder first and wait in the queue
 
 
 class Release(Command, frozen=True, tag="release"):
@@ -51,18 +51,18 @@ class Release(Command, frozen=True, tag="release"):
 
 
 class Answer(Command, frozen=True, tag="answer"):
-    """The holder's answer to who asks for the authority."""
+    """The holder's answer to a request for the authority."""
 
     id: int  #: of the question
     grant: bool
-    reason: Reason = ""  #: why not, for a person
+    reason: Reason = ""  #: reason for a refusal, shown to a person
 
 
 class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover, as the person decided; or by itself, as nothing is held any more, which takes the vehicle from nobody."""
+    """Hover on a person's request; or automatically, as nothing is held, without taking the vehicle from others."""
 
     automatic: bool = False
 
@@ -85,12 +85,12 @@ class Fly(Command, frozen=True, tag="fly"):
     left: float = 0.0
     up: float = 0.0
     yaw_rate: float = 0.0
-    #: Grows with each sign of a hand: fingers that move, keys that repeat, raw axes. None: it does not say.
+    #: Grows with each sign of a hand: moving fingers, repeating keys, raw axes. None: the page does not report it.
     touches: int | None = None
 
 
 class GoTo(Command, frozen=True, tag="goto"):
-    """A place in world axes: east, north, up [m], yaw counter-clockwise from east [rad]."""
+    """Fly to a place in world axes: east, north, up [m], yaw counter-clockwise from east [rad]."""
 
     x: float
     y: float
@@ -99,11 +99,11 @@ class GoTo(Command, frozen=True, tag="goto"):
 
 
 class FlyBack(Command, frozen=True, tag="return"):
-    """Fly back to where it took off, and land or hover there, as its parameters say."""
+    """Fly back to the place of take-off, and land or hover there, as the drone's parameters say."""
 
 
 class FlyRoute(Command, frozen=True, tag="route"):
-    """Fly along a route that was checked: ``id`` is of the check's answer."""
+    """Fly along a checked route; ``id`` comes from the answer to the check."""
 
     id: Annotated[str, msgspec.Meta(max_length=64)]
 
@@ -113,44 +113,44 @@ class PauseRoute(Command, frozen=True, tag="route_pause"):
 
 
 class ResumeRoute(Command, frozen=True, tag="route_resume"):
-    """Fly on to the waypoint that comes next."""
+    """Continue to the next waypoint."""
 
 
 class SkipWaypoint(Command, frozen=True, tag="route_skip"):
-    """Leave the present waypoint out."""
+    """Skip the current waypoint."""
 
 
 class StopRoute(Command, frozen=True, tag="route_stop"):
-    """Hover, and end the route."""
+    """End the route and hover."""
 
 
 class SelectTarget(Command, frozen=True, tag="follow_select"):
-    """Keep the frames of a camera, as a box is about to be drawn on one of them; None: no longer."""
+    """Keep the frames of a camera while a person draws a box on one of them; None: stop keeping them."""
 
     camera: CameraName | None
 
 
 class FollowTarget(Command, frozen=True, tag="follow"):
-    """Track what is in a box, and fly after it if there is a mode."""
+    """Track the content of a box, and fly after it if a mode is given."""
 
     camera: CameraName
-    captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: of the frame that it was drawn on [ns]
+    captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: of the frame under the box [ns]
     box: tuple[float, float, float, float]  #: x, y of its upper left corner, width and height [pixels]
-    mode: Word | None = None  #: None: track it, and fly nothing before there is one
-    class_name: Word | None = None  #: of a detection that was chosen
-    distance_m: float | None = None  #: to keep; None: the follower's own
-    size: tuple[Pixels, Pixels] | None = None  #: of the picture that it was drawn on; None: the frame's
+    mode: Word | None = None  #: None: only track, until a mode is set
+    class_name: Word | None = None  #: of a selected detection
+    distance_m: float | None = None  #: distance to keep; None: the follower's default
+    size: tuple[Pixels, Pixels] | None = None  #: of the picture under the box; None: the frame's
 
 
 class SetFollowMode(Command, frozen=True, tag="follow_mode"):
-    """Fly after the target that is tracked, or go on in another mode."""
+    """Fly after the tracked target, or change the mode of following."""
 
     mode: Word
-    distance_m: float | None = None  #: to keep; None: as it is
+    distance_m: float | None = None  #: distance to keep; None: unchanged
 
 
 class StopFollowing(Command, frozen=True, tag="follow_stop"):
-    """Forget the target; hover if it was flown after."""
+    """Forget the target; hover if the vehicle was following it."""
 
 
 class Write(Command, frozen=True, tag="set"):
@@ -161,7 +161,7 @@ class Write(Command, frozen=True, tag="set"):
 
 
 class Alive(Command, frozen=True, tag="ping"):
-    """The page is there and receives from us: ``seen_s`` is the ``now_s`` of the newest pong that it got."""
+    """Report that the page is present and receives: ``seen_s`` is the ``now_s`` of its newest pong."""
 
     seen_s: float | None = None
 
@@ -209,7 +209,7 @@ def decode_command(text: str | bytes) -> AnyCommand:
     """Decode a command to one drone.
 
     Raises:
-        DecodeError: It is not one; the message says what is wrong.
+        DecodeError: It is not a valid command; the message says what is wrong.
     """
     command: AnyCommand = _decoded(_decoder, text)
     return command
@@ -219,44 +219,44 @@ def decode_fleet_command(text: str | bytes) -> AnyFleetCommand:
     """Decode a command to all drones.
 
     Raises:
-        DecodeError: It is not one; the message says what is wrong.
+        DecodeError: It is not a valid command; the message says what is wrong.
     """
     command: AnyFleetCommand = _decoded(_fleet_decoder, text)
     return command
 
 
 def late_s(command: Command) -> float:
-    """Return how old a command may be [s]."""
+    """Return the age at which a command is too old [s]."""
     return STOP_LATE_S if isinstance(command, Stop | StopAll) else LATE_S
 
 
 class HandWatch:
-    """Whether sticks that are pushed are in anybody's hand. Pure.
+    """Whether a hand holds the pushed sticks. Pure.
 
-    Hands are never still: a finger moves by pixels, a held key repeats, an axis that is at its end trembles across it.
-    A gamepad whose radio link broke is still, and so would be a page that lost track of what is held.
+    Hands are never still: a finger moves by pixels, a held key repeats, an axis at its end trembles. A gamepad that
+    lost its radio link is still, and so is a page that lost track of the keys held.
     """
 
     def __init__(self) -> None:
-        """Begin with sticks that nobody has pushed."""
+        """Begin with untouched sticks."""
         self._last: Fly | None = None
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Return whether a hand was seen on them within :data:`UNTOUCHED_S`; called with each command of the sticks."""
+        """Return whether the sticks showed a hand within :data:`UNTOUCHED_S`; call it with each stick command."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")
         )
-        if not same or sticks.touches is None:  # a pause is no sign of a hand: the network makes them, too
+        if not same or sticks.touches is None:  # a pause is no sign of a hand: networks cause them, too
             self._moved_s = now_s
         return now_s - self._moved_s <= UNTOUCHED_S
 
 
 def untimely(command: Command, now_s: float) -> str:
-    """Return why a command is not carried out; empty if it is in time.
+    """Return the reason to refuse a command for its age; empty if it is in time.
 
-    It may be too old, or nobody knows how old it is. A command that may be too old counts as too old.
+    A command whose age is unknown is refused, and one that may be too old counts as too old.
 
     Args:
         command: The command.

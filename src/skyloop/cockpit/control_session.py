@@ -1,12 +1,12 @@
-"""One page's control of one drone: from its messages to the vehicle's commands, and the answers to them.
+"""One page's control of one drone: turns the page's messages into commands for the vehicle, and answers them.
 
-A command is carried out if it comes in time (:func:`skyloop.cockpit.commands.untimely`); else it is refused, and never
-carried out later. Only the hover of released sticks is carried out at any age.
+A command that arrives in time (:func:`skyloop.cockpit.commands.untimely`) is carried out; any other is refused and
+never carried out later. Only the hover of released sticks is carried out at any age.
 
-The page is watched (*dead-man*): while it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
-vehicle hovers. A page that has not shown for :data:`GONE_S` that it receives from the cockpit is a silent pilot:
-nothing is repeated for it any more, so that the proxy ends its lease and the failsafe ladder acts, as for every
-program. When the page's connection ends the vehicle hovers at once, and the authority is given back.
+The page has a dead-man switch: if it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
+vehicle hovers. A page that has not confirmed receiving from the cockpit for :data:`GONE_S` counts as a silent pilot:
+the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts, as for any
+program. When the page's connection ends, the vehicle hovers at once and the authority is released.
 """
 
 from __future__ import annotations
@@ -68,21 +68,21 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 
-SILENT_S: Final = 0.5  #: a page that flies and sends nothing for so long counts as dead
-GONE_S: Final = (
-    2.0  #: a page that receives nothing from the cockpit for so long flies nothing, and its control runs out
-)
-_REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
+SILENT_S: Final = 0.5  #: a page that flies and sends nothing for this long counts as dead
+#: A page that receives nothing from the cockpit for this long flies nothing, and its control expires.
+GONE_S: Final = 2.0
+_REFUSE_AGAIN_S: Final = 1.0  # between equal refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-_TAKEOFF_NS: Final = 1_000_000_000  # a take-off that the proxy does not tell of by then is not wanted any more,
-_BEGUN_NS: Final = 6_000_000_000  # nor is one that the vehicle does not begin by then
+# A take-off is no longer repeated if the proxy has not acknowledged it, or the vehicle not begun it, by then.
+_TAKEOFF_NS: Final = 1_000_000_000
+_BEGUN_NS: Final = 6_000_000_000
 _numbers = itertools.count(1)
 
 Json = dict[str, Any]
 
 
 class ControlSession:
-    """Serves one control socket of a page, from its opening to its end. On the event loop."""
+    """Serves one control socket of a page, from open to close. On the event loop."""
 
     def __init__(
         self,
@@ -97,41 +97,41 @@ class ControlSession:
         """Prepare the session; :meth:`run` serves it.
 
         Args:
-            socket: Accepted already.
+            socket: Already accepted.
             station: The drone.
-            person: The name of who flies, if it is known.
+            person: The name of the person who flies, if known.
             clock: The monotonic clock [ns].
-            photos: Where photos of routes are saved, in a folder of the drone's name.
-            follower: Makes what tracks a target that the page marks, and flies after it.
+            photos: The folder for photos of routes; each drone has a subfolder.
+            follower: Creates followers for targets that the page marks.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._station = station
         self._clock = clock
-        #: The name under which everybody sees who flies.
+        #: The name that other applications see.
         self.app = f"{person} (cockpit {next(_numbers)})" if person else f"cockpit {next(_numbers)}"
         self._pilot: PilotConnection | None = None
         self._jobs: set[asyncio.Task[None]] = set()
-        self._turn = asyncio.Lock()  # what waits for the proxy is done one after the other
+        self._turn = asyncio.Lock()  # one job at a time waits for the proxy
         self._place = PlaceFlight(station, self.app, self._done, self._refuse)
         self._follow = FollowSession(station.drone, self._send, self._end_flight, follower, clock)
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
-        self._steering = False  # by sticks: the newest set-point is a velocity of this page
-        self._stood_down = False  # with the vehicle under way: nothing was commanded since
+        self._steering = False  # the newest set-point is a velocity from this page's sticks
+        self._stood_down = False  # stood down with the vehicle under way, and nothing commanded since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
-        self._decided = ("", 0)  # what the page decided last, which may yet be refused, or wait for answers: do, n
-        self._last_command, self._first = (
-            ("", 0),
-            0,
-        )  # what took another's place last, and its first intent
-        self._decisions = 0  # grows with whatever flies, or ends a flight: what waits for answers compares it
+        self._decided = ("", 0)  # do, n of the page's last decision, which may still be refused or waiting
+        # The last command that replaced another, and its first intent.
+        self._last_command, self._first = ("", 0), 0
+        self._decisions = 0  # counts commands that fly or end a flight; jobs that waited compare it
         self._hands = HandWatch()
-        self._awaited: tuple[str, int, frozenset[FlightState], int] | None = None  # do, n, in which states, from when
-        self._repeated = False  # for as long as a take-off may be
-        self._last_refusal = ("", -_REFUSE_AGAIN_S)  # about sticks: why, and when [s]
+        self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
+            None  # do, n, until in which states, since when
+        )
+        self._repeated = False  # the take-off was repeated for as long as allowed
+        self._last_refusal = ("", -_REFUSE_AGAIN_S)  # of stick commands: reason and time [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
             Take: lambda command: self._run_in_turn(command, self._take),
             Release: lambda command: self._run_in_turn(command, self._release),
@@ -162,11 +162,11 @@ class ControlSession:
 
     @property
     def waits(self) -> bool:
-        """Whether the page waits for the authority: in the queue, or to have it back."""
+        """Whether the page waits for the authority: queued, or to get it back."""
         return self._pilot is not None and self._pilot.authority.state in ("queued", "preempted")
 
     async def run(self) -> None:
-        """Serve the page until it is gone, then leave the vehicle in a safe state."""
+        """Serve the page until it disconnects, then leave the vehicle in a safe state."""
         update = self._update
         self._station.pilot_came()
         self._station.sessions.add(self)
@@ -181,10 +181,10 @@ class ControlSession:
             finally:
                 self._station.sessions.discard(self)
 
-    # Messages of the page ----------------------------------------------------------------------------------------
+    # Messages of the page --------------------------------------------------------------------------------------
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
-        """Carry out what the page asks for, of sticks that waited behind one another the newest only."""
+        """Carry out the page's commands; of stick commands that queued up, only the newest."""
         commands: list[AnyCommand] = []
         for text in texts:
             try:
@@ -199,44 +199,42 @@ class ControlSession:
         now_ns = self._clock()
         problem = untimely(command, seconds(now_ns))
         if not problem and not _is_deaf(command, now_ns):
-            self._restart_silence_timer()  # what is old is no sign of life
+            self._restart_silence_timer()  # an old message is no sign of life
         if isinstance(command, Alive):
             self._on_ping(command, now_ns)
             return
         try:
-            if problem and not (isinstance(command, HoverHere) and command.automatic):  # which is said only once
+            if problem and not (isinstance(command, HoverHere) and command.automatic):  # the page sends it only once
                 raise RefusedError(problem)
             if _decides(command):
                 self._decisions += 1
-                # A stop has a connection of its own: no refusal here is its own.
+                # A stop uses its own connection, so no refusal here belongs to it.
                 self._decided = self._decided if isinstance(command, Stop) else (command.do, command.n)
             self._handlers[type(command)](command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
 
     def _on_ping(self, ping: Alive, now_ns: int) -> None:
-        """Count the page as present, from when it last received from us, and answer."""
+        """Mark the page as present since it last received from the cockpit, and answer."""
         if ping.seen_s is not None and self._pilot is not None:
-            ago_s = min(
-                GONE_S, max(0.0, seconds(now_ns) - ping.seen_s)
-            )  # never more than it is, whatever the page sends
+            ago_s = min(GONE_S, max(0.0, seconds(now_ns) - ping.seen_s))  # never in the future, whatever the page sends
             self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
         self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
 
     def _send_command(
         self, command: AnyCommand, act: Callable[[PilotConnection], bool], until: frozenset[FlightState] = frozenset()
     ) -> None:
-        """Send one command, which ends whatever the page flew before.
+        """Send one command, which ends the page's previous flight.
 
-        It is done when it was sent or, if ``until`` has states, when the vehicle is in one of them.
+        It is done once sent or, if ``until`` names states, once the vehicle is in one of them.
 
         Args:
-            command: The page's.
+            command: The page's command.
             act: Sends it; returns whether it was sent.
-            until: The states.
+            until: The states that complete the command.
 
         Raises:
-            SkyloopError: What the drone raises; :class:`LinkError` if it was not sent.
+            SkyloopError: Any error of the drone; :class:`LinkError` if it was not sent.
         """
         pilot = self._held()
         self._send_now(pilot, act, command)
@@ -247,26 +245,26 @@ class ControlSession:
             self._done(command.do, command.n)
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
-        """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
+        """End the page's previous flight and send a command; :class:`LinkError` if it was not sent."""
         with self._in_place_of(pilot, f"{command.do} was commanded"):
             sent = act(pilot)
         if not sent:
             with suppress(SkyloopError):
-                pilot.idle()  # or it would be done after all when the link is back soon
+                pilot.idle()  # or it would still be carried out if the link came back soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
 
     @contextmanager
     def _in_place_of(self, pilot: PilotConnection, why: str) -> Iterator[None]:
-        """End what the page flew before, and hover if what takes its place is refused."""
+        """End the page's previous flight, and hover if its replacement is refused."""
         self._end_flight(why)
-        with _else_hovering(pilot, "what was to take its place was refused"):
+        with _else_hovering(pilot, "its replacement was refused"):
             yield
 
     def _hover_here(self, command: HoverHere) -> None:
-        """Hover: as the person decided, or because the page finds that nothing is held any more."""
+        """Hover because the person decided to, or because the page reports that nothing is held."""
         if command.automatic:
             self._held()
-            self.let_go("nothing is held on the page any more")
+            self.let_go("nothing is held on the page")
             self._acknowledge(command)
         else:
             self._send_command(command, lambda pilot: pilot.hover())
@@ -284,7 +282,7 @@ class ControlSession:
         self._restart_silence_timer()
 
     def _set_out(self, command: AnyCommand, plan: Callable[[PilotConnection], Leg]) -> None:
-        """Send a flight to a place, and watch it until it is over."""
+        """Command a flight to a place, and watch it until it is over."""
         pilot = self._held()
         leg = plan(pilot)
         self._send_now(pilot, lambda pilot: pilot.command(leg.action), command)
@@ -301,7 +299,7 @@ class ControlSession:
         if problem:
             raise RefusedError(f"the route can't be flown: {problem}")
         pilot = held()
-        with self._in_place_of(pilot, "another route was begun"):
+        with self._in_place_of(pilot, "another route was started"):
             self._end_route()
             self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
             self._route.begin()
@@ -314,7 +312,7 @@ class ControlSession:
             raise RefusedError("no route is flown from this page")
         if isinstance(command, ResumeRoute):
             self._end_flight()
-        with _else_hovering(pilot, "its route can't be steered"):
+        with _else_hovering(pilot, "its route can't be changed"):
             act(route)
         self._acknowledge(command)
         self._restart_silence_timer()
@@ -324,7 +322,7 @@ class ControlSession:
         self._acknowledge(command)
 
     async def _follow_target(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track what is in a box; without a mode that needs no authority."""
+        """Track the content of a box; without a mode this needs no authority."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
         self._restart_silence_timer()
@@ -339,20 +337,20 @@ class ControlSession:
         self._acknowledge(command)
 
     def _aim(self, goal: Waypoint | None) -> None:
-        """Show where a route flies to."""
+        """Show the goal that a route flies to."""
         if goal is None:
             self._station.goals.pop(self.app, None)
         else:
             self._station.goals[self.app] = goal
 
     def _end_route(self) -> None:
-        """End the route for good, as its connection ends or another begins; the vehicle is commanded elsewhere."""
+        """End the route for good: its connection ends, or another route or flight replaces it."""
         if self._route is not None:
             self._route.end(hover=False)
             self._route = None
 
     async def _stop_motors(self, command: Stop) -> None:
-        """Stop the motors, trying for as long as the page shows the command as pending."""
+        """Stop the motors, retrying for as long as the page shows the command as pending."""
         assert command.at_s is not None  # or it would be untimely
         until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
         try:
@@ -371,11 +369,11 @@ class ControlSession:
             loop = asyncio.get_running_loop()
             pilot.on_event(lambda event: call_soon(loop, self._on_event, event), inline=True)
         elif not pilot.is_linked:
-            raise LinkError("the link to the proxy is lost: control can be taken when it is back")
+            raise LinkError("the link to the proxy is lost: take control when it is back")
         pilot.present_until(monotonic_ns() + nanoseconds(GONE_S))
         if self.waits and not command.ask and not self._authority.outranks(command.priority):
-            # To ask the proxy would be to leave the queue.
-            raise AuthorityError(f"{self._authority.busy(command.priority)}; you keep your place in line", code="busy")
+            # Asking the proxy again would give up the place in the queue.
+            raise AuthorityError(f"{self._authority.busy(command.priority)}; you stay in the queue", code="busy")
         self._takeover.request(ask=command.ask)
         self._acknowledge(command)
         try:
@@ -393,7 +391,7 @@ class ControlSession:
         pilot = self._held()
         self._acknowledge(command)
         if command.grant:
-            self._authority.handed_over()  # which may be seen before the answer's own answer is here
+            self._authority.handed_over()  # observers may see this before the proxy confirms the answer
         try:
             await self._takeover.answer(command, pilot)
         except RefusedError:
@@ -410,7 +408,7 @@ class ControlSession:
         self._update()
 
     async def _close_pilot(self) -> None:
-        """Without the authority a page needs no connection of its own."""
+        """Close the page's own connection, which it does not need without the authority."""
         self._end_route()
         pilot, self._pilot = self._pilot, None
         if pilot is not None:
@@ -432,7 +430,7 @@ class ControlSession:
         """Return the connection that holds the authority.
 
         Raises:
-            AuthorityError: There is none.
+            AuthorityError: No connection holds it.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
@@ -443,16 +441,16 @@ class ControlSession:
         return pilot
 
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
-        """Return what stands for :meth:`_held` in a job that waits for answers.
+        """Return a check that replaces :meth:`_held` in a job that waits for answers.
 
-        It raises :class:`RefusedError` once anything else was commanded, or ended a flight, as the newest decision
-        counts; or once the command is too old.
+        It raises :class:`RefusedError` if any other command has flown or ended a flight since (the newest decision
+        counts), or if the command has become too old.
         """
         number = self._decisions
 
         def held() -> PilotConnection:
             if self._decisions != number:
-                raise RefusedError("something else was commanded meanwhile, or the page was away")
+                raise RefusedError("something else was commanded meanwhile, or the page was silent")
             if problem := untimely(command, seconds(self._clock())):
                 raise RefusedError(problem)
             return self._held()
@@ -462,7 +460,7 @@ class ControlSession:
     # The dead-man ----------------------------------------------------------------------------------------------
 
     def _restart_silence_timer(self) -> None:
-        """Restart the timer, as the page has just given a sign of life."""
+        """Restart the timer after a sign of life from the page."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
@@ -482,10 +480,10 @@ class ControlSession:
         route = self._route is not None and self._route.is_under_way
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
-    def _end_flight(self, why: str = "something else was commanded, or the page was away") -> None:
-        """End what the page flew before; a route is paused, and may be resumed."""
+    def _end_flight(self, why: str = "something else was commanded, or the page was silent") -> None:
+        """End the page's previous flight; a route is paused and can be resumed."""
         self._decisions += 1
-        if self._decided != self._last_command:  # until here what flies, and its refusals, were the former's
+        if self._decided != self._last_command:  # earlier intents, and their refusals, belong to the previous command
             self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
         self._steering = self._stood_down = False
         self._follow.interrupt(why)
@@ -495,7 +493,7 @@ class ControlSession:
         self._place.cancel()
 
     def let_go(self, why: str) -> None:
-        """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
+        """Hover if this page has the vehicle under way; a take-off or landing completes safely without the page."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         pilot = self._pilot
@@ -503,7 +501,7 @@ class ControlSession:
             pilot.let_go(why)
 
     def stand_down(self, why: str) -> None:
-        """Command nothing any more, as the motors are being stopped; the authority is kept."""
+        """Send no more commands, as the motors are being stopped; the authority is kept."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         self._stood_down = flies
@@ -514,24 +512,24 @@ class ControlSession:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _on_page_gone(self) -> None:
-        """Hover at once, as the page is gone."""
+        """Hover at once after the page has disconnected."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
         self.let_go("the page is gone")
 
     async def _close(self) -> None:
-        """Wait for what is under way, and give the authority back."""
+        """Wait for running jobs and release the authority."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         await self._follow.close()
-        self.let_go("the page is gone")  # what was taken, or begun, only just now
+        self.let_go("the page is gone")  # control may have been taken, or a flight begun, only now
         await self._close_pilot()
         await self._station.pilot_went()
 
-    # Messages to the page -------------------------------------------------------------------------------------
+    # Messages to the page --------------------------------------------------------------------------------------
 
     def _update(self) -> None:
-        """Send the authority, the page's open questions, and commands that are done, where that has changed."""
+        """Send changes of the authority and of the page's open questions, and report completed commands."""
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
@@ -542,11 +540,11 @@ class ControlSession:
         if self._awaited is not None and pilot is not None:
             do, n, states, from_ns = self._awaited
             if do == TakeOff().do and not self._repeated:
-                patience_ns = _BEGUN_NS if pilot.is_told else _TAKEOFF_NS
+                patience_ns = _BEGUN_NS if pilot.is_acknowledged else _TAKEOFF_NS
                 if pilot.proxy_now_ns - from_ns > patience_ns:
                     self._repeated = True
                     with suppress(SkyloopError):
-                        pilot.idle()  # what has begun goes on; what has not must not begin when a slow link is back
+                        pilot.idle()  # it continues if begun; if not, it must not begin once a slow link is back
             with suppress(LinkError):
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
@@ -554,12 +552,12 @@ class ControlSession:
                     self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
-        """Handle takeovers by asking."""
+        """Handle requests for a takeover."""
         if self._pilot is not None:
             self._takeover.on_event(event, self._pilot)
 
     def _observe_refusal(self, pilot: PilotConnection) -> None:
-        """End what this page flies, and tell it, where the proxy has refused or ended it."""
+        """End this page's flight and inform the page if the proxy has refused or ended it."""
         outcome = pilot.refusal(self._first)
         if outcome is None:
             return
@@ -569,10 +567,10 @@ class ControlSession:
         if not watched and (refused or self._awaited or self._is_under_way):
             self._refuse(*self._last_command, outcome.text)
         if watched or self._place.is_under_way:
-            self.let_go(outcome.text)  # the same feedback tells whether others have the vehicle
+            self.let_go(outcome.text)  # the same feedback shows whether others have the vehicle
         elif self._last_command[0] == TakeOff().do:
             with suppress(SkyloopError):
-                pilot.idle()  # or it would take off, to everybody's surprise, once it can
+                pilot.idle()  # or it would take off by surprise as soon as it can
         self._awaited = None
 
     def _refuse(self, do: str, n: int, why: str) -> None:
@@ -582,7 +580,7 @@ class ControlSession:
         self._send({"type": "done", "do": do} | ({"n": n} if n else {}))
 
     def _refuse_command(self, command: AnyCommand, why: str) -> None:
-        if isinstance(command, Fly):  # comes twenty times a second
+        if isinstance(command, Fly):  # arrives 20 times a second
             now_s = seconds(self._clock())
             before, at_s = self._last_refusal
             if why == before and now_s - at_s <= _REFUSE_AGAIN_S:
@@ -594,7 +592,7 @@ class ControlSession:
         self._send({"type": "sent", "do": command.do, "n": command.n})
 
     def _run_in_turn(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
-        """Start work that takes a moment, after what was started before."""
+        """Start a job that may block, after those started before it."""
         self._start_job(self._run(command, work))
 
     def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
@@ -606,7 +604,7 @@ class ControlSession:
         try:
             async with self._turn:
                 problem = untimely(command, seconds(self._clock()))
-                if problem:  # what was before it took too long
+                if problem:  # earlier jobs took too long
                     raise RefusedError(problem)
                 await work(command)
         except SkyloopError as error:
@@ -615,7 +613,7 @@ class ControlSession:
 
 @contextmanager
 def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
-    """Hover if what is commanded here is refused: nobody watches any more what flew before."""
+    """Hover if the command in this block is refused, because the previous flight is no longer watched."""
     try:
         yield
     except SkyloopError:
@@ -624,14 +622,14 @@ def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
 
 
 def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
-    """Return whether a ping shows that its page receives nothing: it hovers before it is no longer present."""
+    """Return whether a ping shows that its page receives nothing: it hovers before it counts as gone."""
     if not isinstance(command, Alive) or command.seen_s is None:
         return False
     return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S
 
 
 def _decides(command: AnyCommand) -> bool:
-    """Return whether a command flies, or ends a flight."""
+    """Return whether a command flies or ends a flight."""
     if isinstance(command, FollowTarget):
         return command.mode is not None
     return not isinstance(command, Take | Answer | Write | SelectTarget | Alive)

@@ -1,4 +1,4 @@
-"""Discovery: which proxies of this host and of the network there are, without any of them noticing."""
+"""Discovery: find the proxies of this host and of the network, without any of them noticing."""
 
 from __future__ import annotations
 
@@ -17,39 +17,39 @@ if TYPE_CHECKING:
 
 
 class Found(NamedTuple):
-    """A proxy that can be connected to."""
+    """A proxy that is available for connection."""
 
     name: str
-    transport: str  #: as a person reads it: ``local``
+    transport: str  #: as shown to people, such as ``local``
     dial: Dialer
 
 
 class Finder(Protocol):
-    """Searches for proxies, again and again, on threads that are not the event loop's."""
+    """Searches for proxies repeatedly, on threads other than the event loop's."""
 
     def __call__(self) -> list[Found]:
-        """Return the proxies that are there now.
+        """Return the proxies available now.
 
         Raises:
-            SkyloopError: The search is not possible now.
+            SkyloopError: The search is impossible now.
             OSError: The same.
         """
 
     def add_name(self, name: str) -> None:
-        """Find this proxy too, where only certain names are searched for."""
+        """Also find this proxy, if the search is limited to certain names."""
 
     def close(self) -> None:
-        """Release what searching needs. Idempotent."""
+        """Release the resources of the search. Idempotent."""
 
 
 class LocalFinder:
-    """Finds the proxies of this host that this user may reach."""
+    """Finds the proxies of this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
         """Prepare the search.
 
         Args:
-            names: Only these; none: all.
+            names: Search for these only; empty: all.
         """
         self._names = frozenset(names)
         self._also: set[str] = set()
@@ -59,10 +59,10 @@ class LocalFinder:
         self._also.add(name)
 
     def close(self) -> None:
-        """Do nothing: it holds nothing."""
+        """Do nothing, as nothing was opened."""
 
     def __call__(self) -> list[Found]:
-        if sys.platform != "linux":  # no proxy can run there
+        if sys.platform != "linux":  # proxies run on Linux only
             return []
         from skyloop.transport.base import NAME
         from skyloop.transport.local import dial
@@ -85,9 +85,9 @@ class LocalFinder:
 
 
 class NetworkFinder:
-    """Finds the proxies of this host, and those of the network under other names. Any thread.
+    """Finds the proxies of this host, and those of the network with other names. Any thread.
 
-    It opens one session with the first search and keeps it, so that further ones cost little.
+    The first search opens a session and keeps it, so later searches are cheap.
     """
 
     def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
@@ -96,12 +96,12 @@ class NetworkFinder:
         Args:
             local: Finds the proxies of this host.
             settings: How to join the network.
-            wanted: Only these names; empty: all.
+            wanted: Search for these names only; empty: all.
         """
         self._local = local
         self._settings = settings
         self._wanted = wanted
-        self._lock = threading.Lock()  # guards what follows: several threads may search
+        self._lock = threading.Lock()  # guards the fields below: several threads may search
         self._session: Session | None = None
         self._known: dict[str, Found] = {}
 
@@ -134,7 +134,7 @@ class NetworkFinder:
         with self._lock:
             current = self._settings.current()
             if self._session is not None and current is not self._settings:
-                release(self._session)  # the lab's roster has changed: who was revoked is not to be found any more
+                release(self._session)  # the roster has changed: revoked members must no longer be found
                 self._session = None
             self._settings = current
             if self._session is None:

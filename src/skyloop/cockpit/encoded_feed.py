@@ -1,7 +1,7 @@
-"""A camera's frames for all pages that show them: each made a JPEG once, and H.264 relayed as it comes.
+"""A camera's frames for all pages that show them: each encoded to JPEG once, and H.264 relayed unchanged.
 
-The drone's own thread keeps the newest pictures; pages take theirs on the event loop. A picture of H.264 builds on the
-one before, so a page gets all of them in order, or goes on with a key picture. Nothing is encoded to H.264 here.
+The drone's own thread keeps the newest pictures; pages fetch theirs on the event loop. An H.264 picture depends on the
+one before, so a page receives all of them in order or resumes at a key picture. Nothing is encoded to H.264 here.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ JPEG_QUALITY = 80
 
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
-NICENESS: Final = 10  #: of the thread that encodes
+NICENESS: Final = 10  #: of the encoding thread
 
 
 def _give_way() -> None:
-    if sys.platform == "linux":  # elsewhere it is the whole process that has a priority
+    if sys.platform == "linux":  # elsewhere only whole processes have a priority
         os.nice(NICENESS)
 
 
-#: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps the
-#: priority it was started with: a person's sticks and stop pass through it, and must not starve beside a browser.
+#: One thread for all cameras: encoding for many pages must not take the cores that fly. The event loop keeps its
+#: original priority: a person's sticks and stop pass through it, and must not starve beside a browser.
 _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
-KEPT: Final = 16  #: newest pictures of a form; who is further behind goes on with a key picture
-SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes, so that like panes share a form
-RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s], for the same reason
-BITS: Final = 0.12  #: for a pixel of a picture that moves
-_FPS: Final = 30.0  # of a camera that doesn't say
+KEPT: Final = 16  #: newest pictures of a form; a page further behind resumes at a key picture
+SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: of pictures in panes; few steps, so that similar panes share a form
+RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: [kbit/s]; likewise
+BITS: Final = 0.12  #: per pixel of a moving picture
+_FPS: Final = 30.0  # of a camera that reports no rate
 
 
 P = TypeVar("P")
@@ -56,9 +56,9 @@ P = TypeVar("P")
 
 @dataclass(frozen=True, slots=True)
 class Numbered(Generic[P]):
-    """A picture on its way to pages. Its number counts those of this process, across restarts of the proxy.
+    """A picture for pages, numbered within this process, across restarts of the proxy.
 
-    Of H.264 it grows by one where the picture follows the one before.
+    For H.264 the number grows by one only if the picture continues the previous one.
     """
 
     serial: int
@@ -66,7 +66,7 @@ class Numbered(Generic[P]):
 
 
 class CameraFeed:
-    """The newest frame of one camera, encoded at most once for all pages, and only while a page wants it.
+    """The newest frame of one camera, encoded at most once for all pages, and only while a page shows it.
 
     Args:
         drone: The drone.
@@ -77,10 +77,10 @@ class CameraFeed:
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
         self.newest: Numbered[Frame] | None = None
-        self.encoded = 0  #: frames that were made a JPEG
+        self.encoded = 0  #: frames encoded to JPEG
         self._drone = drone
         self._clock = clock
-        self._since_ns = 0  # since when a page wants frames
+        self._since_ns = 0  # time of the first page's subscription
         self._listener: Cancellable | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
@@ -88,7 +88,7 @@ class CameraFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page watches it."""
+        """Whether a page shows it."""
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
@@ -102,7 +102,7 @@ class CameraFeed:
             wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Call ``wake`` no longer; after the last one the camera is no longer subscribed to."""
+        """Stop calling ``wake``; the last subscriber unsubscribes from the camera."""
         self._wakes.discard(wake)
         if not self._wakes and self._listener is not None:
             self._listener.cancel()
@@ -110,16 +110,16 @@ class CameraFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or how long one was waited for in vain.
+        """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page wants any, and before the first that ever came: a vehicle may take seconds to send it.
+        None while no page shows the camera and before the first frame ever: a vehicle may take seconds to send it.
         """
         if self._listener is None or not self._serial:
             return None
         return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.picture.age_s
 
     async def jpeg(self, picture: Numbered[Frame]) -> bytes:
-        """Return the picture as a JPEG file; it is encoded once for all pages, on a thread."""
+        """Return the picture as a JPEG file, encoded on a thread, once for all pages."""
         if self._jpeg is None or self._jpeg[0] != picture.serial:
             loop = asyncio.get_running_loop()
             self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.picture)
@@ -133,7 +133,7 @@ class CameraFeed:
             self._listener = None
 
     def _put(self, frame: Frame) -> None:
-        if self._listener is None:  # cancelled while this was on its way
+        if self._listener is None:  # cancelled while this call was on its way
             return
         self._serial += 1
         self.newest = Numbered(self._serial, frame)
@@ -149,13 +149,13 @@ def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
         quality: 1 to 100.
 
     Raises:
-        ValueError: OpenCV could not.
+        ValueError: OpenCV failed to encode it.
     """
     import cv2
 
     done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise ValueError(f"frame {frame.seq} of {frame.camera} could not be made a JPEG")
+        raise ValueError(f"frame {frame.seq} of {frame.camera} could not be encoded to JPEG")
     return bytes(data.data)
 
 
@@ -165,14 +165,14 @@ def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
     return b"".join((_LENGTH.pack(len(text)), text, *jpegs))
 
 
-FPS: Final = 12.0  #: frames of each camera in a second, at most
-WIDTHS: Final = (160, 240, 320, 480)  #: of frames [pixels]; what a page wishes is rounded up to one of them
+FPS: Final = 12.0  #: at most, of each camera
+WIDTHS: Final = (160, 240, 320, 480)  #: of frames [pixels]; a page's request is rounded up to one of them
 QUALITY: Final = 70  #: of the JPEG files
 
 
 @dataclass(frozen=True, slots=True)
 class SmallFrame:
-    """A frame as a JPEG file; ``serial`` counts those of one feed."""
+    """A frame as a JPEG file; ``serial`` counts the frames of its feed."""
 
     serial: int
     jpeg: bytes
@@ -195,7 +195,7 @@ class SmallFeed:
     def __init__(self, drone: Drone, camera: CameraInfo, width: int, clock: Clock = monotonic_ns) -> None:
         self.camera = camera.name
         self.newest: SmallFrame | None = None  #: replaced as a whole, by the drone's receiving thread
-        self.encoded = 0  #: frames that were made a JPEG
+        self.encoded = 0  #: frames encoded to JPEG
         self._drone = drone
         self._scale = min(1.0, width / camera.width) if camera.width > 0 else 1.0
         self._clock = clock
@@ -210,9 +210,9 @@ class SmallFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or how long one was waited for in vain.
+        """Age of the newest frame [s], or the time spent waiting for one.
 
-        None while no page shows it, and before the first that ever came: a vehicle may take seconds to send it.
+        None while no page shows the camera and before the first frame ever: a vehicle may take seconds to send it.
         """
         if not self.wanted or not self.encoded:
             return None
@@ -222,21 +222,21 @@ class SmallFeed:
         return seconds(now_ns + self._drone.clock_offset_ns - newest.captured_ns)
 
     def subscribe(self) -> None:
-        """Show it on one more page; the first subscribes to the camera.
+        """Add a page that shows it; the first subscribes to the camera.
 
         Raises:
-            SkyloopError: The drone was closed, or has no such camera any more.
+            SkyloopError: The drone was closed, or no longer has this camera.
         """
         if self._listener is None:
             self._since_ns = self._clock()
-            # Inline: a thread of its own for each camera would be woken for each frame, and do no more than this.
+            # Inline: a thread for each camera would be woken for each frame, and do no more than this.
             self._listener = self._drone.on_frame(
                 self._put, camera=self.camera, inline=True, encoding="jpeg", max_fps=FPS, scale=self._scale
             )
         self._pages += 1
 
     def unsubscribe(self) -> None:
-        """Show it on one page less; after the last the camera is no longer subscribed to."""
+        """Remove a page that shows it; the last unsubscribes from the camera."""
         self._pages -= 1
         if self._pages == 0:
             self.close()
@@ -256,16 +256,16 @@ class SmallFeed:
 
 
 def rounded_width(wish: int) -> int:
-    """Return the smallest of :data:`WIDTHS` that is not below ``wish`` [pixels]; the largest if all are."""
+    """Return the smallest of :data:`WIDTHS` that is at least ``wish`` [pixels]; the largest if none is."""
     return next((width for width in WIDTHS if width >= wish), WIDTHS[-1])
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """How a camera's pictures are encoded. Neither rate nor subscriber: as the vehicle itself does it.
+    """How a camera's pictures are encoded. With neither rate nor subscriber: as the vehicle encodes them.
 
-    ``kbit_s``: at this rate, once for all who want the same. ``subscriber``: for this one alone, at the rate and size
-    that the path to it carries.
+    ``kbit_s``: at this rate, once for all subscribers of the same form. ``subscriber``: for this one alone, at the rate
+    and size that its path carries.
     """
 
     kbit_s: int | None = None
@@ -275,18 +275,18 @@ class Form:
 
     @property
     def kind(self) -> str:
-        """Whose it is: ``vehicle``, ``shared`` or ``own``."""
+        """The form's owner: ``vehicle``, ``shared`` or ``own``."""
         if self.subscriber:
             return "own"
         return "vehicle" if self.kbit_s is None else "shared"
 
 
 def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
-    """Choose the form that all panes of about the same size share.
+    """Choose the form shared by all panes of about the same size.
 
     Args:
         camera: The camera.
-        width: Of the pane [device pixels]; 0: the picture's full size.
+        width: Of the pane [device pixels]; 0: full size.
         max_fps: Most pictures a second; None: all.
     """
     scale = 1.0
@@ -301,7 +301,7 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
 
 
 class EncodedFeed:
-    """The newest pictures of one form, while a page wants them. Made and used on the event loop.
+    """The newest pictures of one form, while a page shows them. Created and used on the event loop.
 
     Args:
         drone: The drone.
@@ -310,7 +310,7 @@ class EncodedFeed:
         clock: The monotonic clock [ns].
     """
 
-    encoded = 0  #: frames that were encoded here: none
+    encoded = 0  #: frames encoded here: none
 
     def __init__(self, drone: Drone, camera: str, form: Form, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
@@ -318,11 +318,11 @@ class EncodedFeed:
         self._counter = ChannelCounter()
         self._drone = drone
         self._clock = clock
-        self._came_ns = 0  # when the newest picture came
+        self._came_ns = 0  # arrival time of the newest picture
         self._channel: StreamChannel | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._serial = 0
-        self._lock = threading.Lock()  # guards the following
+        self._lock = threading.Lock()  # guards the fields below
         self._wakes: dict[object, Wake | None] = {}  # by page
         self._pictures: deque[Numbered[EncodedFrame]] = deque(maxlen=KEPT)
 
@@ -335,7 +335,7 @@ class EncodedFeed:
     def age_s(self) -> float | None:
         """Age of the newest picture [s].
 
-        None while no page shows it, before the first, and where it waits for the one page that it is for: that tells
+        None while no page shows it, before the first picture, and while it waits for the one page it serves, which says
         nothing about the camera.
         """
         with self._lock:
@@ -346,24 +346,24 @@ class EncodedFeed:
 
     @property
     def silent_s(self) -> float:
-        """For how long no picture has come [s]; 0 where that may be as the one page that it is for takes none."""
+        """Time without a picture [s]; 0 if that may be because the one page it serves accepts none."""
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
 
     def stats(self) -> ChannelStats:
-        """Return how its pictures come, as for a channel of the drone."""
+        """Return the statistics of the stream, as for a channel of the drone."""
         return self._counter.stats(self._clock())
 
     def subscribe(self, page: object, wake: Wake | None) -> None:
-        """Show it on one more page; the first subscribes to the stream, whose first picture is a key.
+        """Add a page that shows it; the first subscribes to the stream, which begins with a key picture.
 
         Args:
-            page: Which one.
-            wake: Called on the event loop for each picture; None: the page looks by itself.
+            page: Identifies the page.
+            wake: Called on the event loop for each picture; None: the page polls.
 
         Raises:
-            SkyloopError: The drone was closed, or has no such camera any more.
+            SkyloopError: The drone was closed, or no longer has this camera.
         """
         if self._channel is None:
             form = self.form
@@ -383,7 +383,7 @@ class EncodedFeed:
             self._wakes[page] = wake
 
     def unsubscribe(self, page: object) -> None:
-        """Show it on one page less; after the last one the stream is no longer subscribed to."""
+        """Remove a page that shows it; the last unsubscribes from the stream."""
         with self._lock:
             self._wakes.pop(page, None)
         if not self.wanted:
@@ -398,16 +398,16 @@ class EncodedFeed:
                 self._pictures.clear()
 
     def after(self, serial: int, *, follows: bool) -> tuple[list[Numbered[EncodedFrame]], int]:
-        """Return the pictures that a page is to get next, in order, and how many it misses before them.
+        """Return the next pictures for a page, in order, and the number that it misses before them.
 
         Args:
-            serial: The picture that it was sent last; 0: none yet.
-            follows: Whether it can decode the one after that; else it goes on with a key picture.
+            serial: The last picture sent to it; 0: none yet.
+            follows: Whether it can decode the picture after that; if not, it resumes at a key picture.
         """
         with self._lock:
             newer = [one for one in self._pictures if one.serial > serial]
         for first in range(len(newer) - 1, 0, -1):
-            if newer[first].picture.key:  # nothing before it is of use any more
+            if newer[first].picture.key:  # no earlier picture is needed
                 break
         else:
             first = 0
@@ -420,12 +420,12 @@ class EncodedFeed:
         return chosen, chosen[0].serial - serial - 1 if serial else 0
 
     def ask_for_key(self) -> None:
-        """Ask the proxy for a key picture; at most some times a second."""
+        """Request a key picture from the proxy, at most a few times a second."""
         if self._channel is not None:
             self._channel.report(0, wants_key=True)
 
     def acknowledge(self, seq: int) -> None:
-        """Tell the proxy what the page has, where the rate follows that."""
+        """Report the pictures that the page has to the proxy, if the rate depends on that."""
         if self._channel is not None and self.form.subscriber:
             self._channel.report(seq)
 

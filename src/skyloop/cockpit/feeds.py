@@ -1,7 +1,7 @@
-"""From the client's threads to the event loop, and to pages at a steady rate: what a drone sends besides frames.
+"""From the client's threads to the event loop, and to pages at a steady rate: everything but frames.
 
-That is the newest drawing of each source, the last events, what applications log, and what is commanded. Everything
-here but the callbacks given to the drone runs on the event loop.
+That is the newest drawing of each source, the last events, applications' logs, and the commands applied. All of it
+runs on the event loop, except for the callbacks registered with the drone.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from skyloop.messages.relayed import MOCAP as SERIES
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-ROW_HZ: Final = 2.0  #: of a drone's feedback while pages show it only as a row among others
+ROW_HZ: Final = 2.0  #: of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
 KEPT_EVENTS = 256
-KEPT_S = 10.0  #: what was drawn or logged longer ago is no longer shown
-MAX_SERIES = 256  #: logged numbers that are shown of one drone
-MAX_SOURCES = 64  #: sources of drawings that are shown of one drone; all of its cameras together
-MAX_WAYPOINTS = 256  #: of one path that are shown
-WAYPOINTS = "waypoints"  #: name under which a controller logs where it flies to
-MOCAP_S = 0.5  #: a pose of motion capture that is older is not shown
+KEPT_S = 10.0  #: older drawings and logs are no longer shown
+MAX_SERIES = 256  #: logged numbers shown of one drone
+MAX_SOURCES = 64  #: sources of drawings shown of one drone, over all its cameras
+MAX_WAYPOINTS = 256  #: shown of one path
+WAYPOINTS = "waypoints"  #: name under which a controller logs its goals
+MOCAP_S = 0.5  #: older poses of motion capture are not shown
 
 _KEPT_NS = round(KEPT_S * 1e9)
 
@@ -40,7 +40,7 @@ V = TypeVar("V")
 
 
 class Cancellable(Protocol):
-    """What registering a callback with a drone returns."""
+    """The result of registering a callback with a drone."""
 
     def cancel(self) -> None: ...
 
@@ -76,7 +76,7 @@ class PeriodicBroadcast:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and now: the message is fresh, unless this is closed."""
+        """Call ``wake`` for each new message, and now with a fresh one, unless the broadcast is closed."""
         if self.closed:
             wake()
             return
@@ -88,7 +88,7 @@ class PeriodicBroadcast:
         wake()
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Call ``wake`` no longer; does nothing for one that has not subscribed."""
+        """Stop calling ``wake``; does nothing if it is not subscribed."""
         if wake in self._wakes:
             self._wakes.discard(wake)
             if not self._wakes:
@@ -96,7 +96,7 @@ class PeriodicBroadcast:
                 self._on_change(False)
 
     def close(self) -> None:
-        """End it for good, and wake all subscribers."""
+        """End the broadcast for good, and wake all subscribers."""
         self.closed = True
         self._stop()
         for wake in list(self._wakes):
@@ -111,7 +111,7 @@ class PeriodicBroadcast:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            due = max(due + self._period_s, loop.time())  # a late one is not made up for
+            due = max(due + self._period_s, loop.time())  # missed periods are not made up for
             await asyncio.sleep(due - loop.time())
             self.message = self._make()
             for wake in list(self._wakes):
@@ -121,18 +121,18 @@ class PeriodicBroadcast:
 class Newest(Generic[K, V]):
     """The newest value of each of at most ``most`` keys, forgotten after :data:`KEPT_S`.
 
-    A key that is there keeps its place as long as it is renewed, however many others ask for one. One thread calls
-    :meth:`put`, others read.
+    A key keeps its place while its value is renewed, however many others compete for one. One thread calls :meth:`put`,
+    others read.
     """
 
     def __init__(self, most: int, clock: Clock) -> None:
-        self.refused = 0  #: values that found no place
+        self.refused = 0  #: values refused for lack of a place
         self._most = most
         self._clock = clock
-        self._values: dict[K, tuple[int, V]] = {}  # with when it came; what was renewed last is last
+        self._values: dict[K, tuple[int, V]] = {}  # with the time of arrival; the last renewed comes last
 
     def put(self, key: K, value: V) -> None:
-        """Set a key's value; it is refused, and counted, if there is no place for a new key."""
+        """Set a key's value; a new key without a free place is refused and counted."""
         now_ns = self._clock()
         if self._values.pop(key, None) is None and len(self._values) >= self._most:
             oldest = next(iter(self._values))
@@ -143,7 +143,7 @@ class Newest(Generic[K, V]):
         self._values[key] = now_ns, value
 
     def items(self) -> list[tuple[K, V]]:
-        """Return the values that were set within :data:`KEPT_S`, with their keys."""
+        """Return the keys and values set within :data:`KEPT_S`."""
         oldest_ns = self._clock() - _KEPT_NS
         return [(key, value) for key, (at_ns, value) in list(self._values.items()) if at_ns > oldest_ns]
 
@@ -153,7 +153,7 @@ class Newest(Generic[K, V]):
 
 
 class Drawing:
-    """A drawing on its way to pages; encoded once for all of them."""
+    """A drawing for pages; encoded once for all of them."""
 
     __slots__ = ("_text", "annotation")
 
@@ -163,7 +163,7 @@ class Drawing:
 
     @property
     def text(self) -> str:
-        """The message to pages, in JSON."""
+        """The JSON message for pages."""
         if self._text is None:
             self._text = _encode(drawing_values(self.annotation)).decode()
         return self._text
@@ -192,7 +192,7 @@ def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
 class EventFeed:
     """The drone's annotations and events.
 
-    Events are numbered here, as those that the client makes have no number.
+    Events are numbered here, because events made by the client have no number.
 
     Args:
         drone: The drone.
@@ -205,7 +205,7 @@ class EventFeed:
         self._next = len(self.events) + 1
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
-        self._waking = False  # pages are about to be woken
+        self._waking = False  # a wake-up of the pages is scheduled
         self._listeners: list[Cancellable] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
@@ -216,11 +216,11 @@ class EventFeed:
         self._wakes.add(wake)
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Call ``wake`` no longer."""
+        """Stop calling ``wake``."""
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Return the events with greater numbers and those numbers, the oldest first."""
+        """Return the events with higher numbers, and those numbers, the oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
@@ -229,7 +229,7 @@ class EventFeed:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        """Keep a drawing. On the client's thread: however many come, they put one call on the loop."""
+        """Keep a drawing. On the client's thread; any number of drawings schedules one call on the loop."""
         self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
         if not self._waking:
             self._waking = True
@@ -246,10 +246,10 @@ class EventFeed:
 
 
 class LogFeed:
-    """What applications log, and which command was applied last.
+    """The logs of applications, and the command applied last.
 
-    It is subscribed to only while somebody wants it, as it costs the proxy something. The client's receiving thread
-    replaces the values as a whole.
+    Subscribed only on demand, because it costs the proxy something. The client's receiving thread replaces the values
+    as a whole.
 
     Args:
         drone: The drone.
@@ -280,25 +280,25 @@ class LogFeed:
             self._waypoints, self._mocap, self.applied = None, None, None
 
     def numbers(self) -> dict[str, float]:
-        """Return the newest value of each series that was logged within :data:`KEPT_S`."""
+        """Return the newest value of each series logged within :data:`KEPT_S`."""
         return dict(self._numbers.items())
 
     @property
     def refused(self) -> int:
-        """Logged numbers for which there was no place."""
+        """Logged numbers refused for lack of a place."""
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the array named ``waypoints`` that was logged last, if within :data:`KEPT_S`.
+        """Return the array ``waypoints`` logged last, if within :data:`KEPT_S`.
 
         Returns:
-            A row each of x, y, z [m] and perhaps yaw [rad], in world axes; empty if there is none.
+            Rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are none.
         """
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
 
     def mocap(self) -> tuple[float, ...] | None:
-        """Return the pose that motion capture has given last.
+        """Return the newest pose from motion capture.
 
         Returns:
             x, y, z [m], quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.

@@ -1,9 +1,9 @@
-"""All drones that the cockpit knows: found, observed, shown as lost, forgotten; and commands to all of them.
+"""All drones known to the cockpit: found, observed, shown as lost, forgotten; and commands to all of them.
 
-There is one connection per drone, for all pages. A drone that vanishes is searched for by its own connection, and comes
-back by itself; only when it was gone for long, and no page shows it, it is removed. All of this is on the event loop;
-connecting and closing, which may wait, are on threads. A page's commands to all drones, land all and stop all, need no
-drone to be opened or chosen.
+Each drone has one connection for all pages. If a drone vanishes, its connection searches for it and brings it back;
+it is removed only if it was gone for long and no page shows it. All of this runs on the event loop, except for
+connecting and closing, which may block and run on threads. A page's commands to all drones, land all and stop all,
+need no open or selected drone.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
 
 LOOK_S: Final = 0.5
-FORGET_S: Final = 60.0  #: gone for so long, a drone is no longer shown as lost
+FORGET_S: Final = 60.0  #: after this time a lost drone is no longer shown
 CONNECT_S: Final = 3.0
-OVERVIEW_S: Final = 0.5  #: period of what pages are sent of all drones
-FIRST_LOOK_S: Final = 2.0  #: how long the first pages wait for those that are slow to answer
+OVERVIEW_S: Final = 0.5  #: period of the overview sent to pages
+FIRST_SEARCH_S: Final = 2.0  #: how long the first pages wait for drones that answer slowly
 
 Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
-LANDING_S: Final = 60.0  #: as long as a landing is repeated
-BEGIN_S: Final = 2.0  #: a landing for which there is no connection by then is not begun
+LANDING_S: Final = 60.0  #: how long a landing is repeated
+BEGIN_S: Final = 2.0  #: a landing without a connection by then is not begun
 _POLL_S: Final = 0.05
 
 Json = dict[str, Any]
@@ -50,7 +50,7 @@ def observe(found: Found) -> Drone:
     """Connect to a proxy as an observer.
 
     Raises:
-        SkyloopError: It can't be connected to within :data:`CONNECT_S`.
+        SkyloopError: No connection within :data:`CONNECT_S`.
     """
     from skyloop.client.drone import open_drone
 
@@ -58,12 +58,12 @@ def observe(found: Found) -> Drone:
 
 
 class Fleet:
-    """The stations, by name.
+    """The stations, by drone name.
 
     Args:
         finder: Finds proxies.
         connect: Connects to one; called on threads.
-        kept: Names that are shown for ever once they were there.
+        kept: Names that stay listed once they were found.
         clock: The monotonic clock [ns].
         look_s: Time between two searches [s].
     """
@@ -79,27 +79,27 @@ class Fleet:
     ) -> None:
         self.finder = finder
         self.stations: dict[str, Station] = {}
-        self.problems: dict[str, str] = {}  #: those found that could not be connected to: why
+        self.problems: dict[str, str] = {}  #: proxies that were found but not connected, with the reason
         self._connect = connect
         self._kept = frozenset(kept)
         self._clock = clock
-        self._look_s = look_s
+        self._search_period_s = look_s
         self._seen_ns: dict[str, int] = {}
-        self._found: dict[str, Found] = {}  # as each was found last
+        self._found: dict[str, Found] = {}  # as last found
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
         self._begun: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
-        """Search for the first time, wait up to :data:`FIRST_LOOK_S` for the proxies found, and go on searching."""
-        await self.look()
+        """Search once, wait up to :data:`FIRST_SEARCH_S` for the proxies found, and keep searching."""
+        await self.search()
         if self._connecting:
-            await asyncio.wait(list(self._connecting.values()), timeout=FIRST_LOOK_S)
+            await asyncio.wait(list(self._connecting.values()), timeout=FIRST_SEARCH_S)
         self._watching = asyncio.create_task(self._watch())
 
     async def close(self) -> None:
-        """End all connections and wait for that."""
+        """Close all connections and wait for that."""
         waiting = [self._watching, *self._connecting.values()]
         if self._watching is not None:
             self._watching.cancel()
@@ -111,16 +111,16 @@ class Fleet:
         await asyncio.gather(*self._closing, return_exceptions=True)
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Start work that goes on when the page that wanted it is gone."""
+        """Start work that continues after the page that requested it is gone."""
         task = asyncio.create_task(work)
         self._begun.add(task)
         task.add_done_callback(self._begun.discard)
 
-    async def look(self) -> None:
-        """Search once: begin to connect to new proxies, and remove those that are gone for good.
+    async def search(self) -> None:
+        """Search once: begin to connect to new proxies, and remove those gone for good.
 
         Raises:
-            SkyloopError: The search is not possible now.
+            SkyloopError: The search is impossible now.
             OSError: The same.
         """
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
@@ -143,16 +143,16 @@ class Fleet:
 
     @property
     def unreached(self) -> dict[str, str]:
-        """Why nothing can be commanded to drones that were found, by name: there is no connection to them."""
+        """Drones that were found but can't be commanded for lack of a connection, with the reason, by name."""
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
     def want(self, name: str) -> None:
-        """Show this drone too, where only certain names are shown."""
+        """Also show this drone, if the view is limited to certain names."""
         self.finder.add_name(name)
 
     def let_go(self, name: str) -> None:
-        """Remove a drone; found again, it comes back. Does nothing for an unknown name."""
+        """Remove a drone; if found again, it comes back. Does nothing for an unknown name."""
         if name in self.stations:
             task = asyncio.create_task(self.stations.pop(name).close())
             self._closing.add(task)
@@ -164,19 +164,19 @@ class Fleet:
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(self._look_s)
+            await asyncio.sleep(self._search_period_s)
             try:
-                await self.look()
+                await self.search()
             except (SkyloopError, OSError) as error:
-                _log.warning("can't look for drones: %s", error)
+                _log.warning("can't search for drones: %s", error)
 
     async def _join(self, found: Found) -> None:
-        # A drone may move to another host under its name: connections that are made again lead to where it is then.
+        # A drone may move to another host under its name: new connections follow it.
         found = found._replace(dial=lambda handler: self._found[found.name].dial(handler))
         try:
             drone = await asyncio.to_thread(self._connect, found)
         except SkyloopError as error:
-            self.problems[found.name] = str(error)  # tried again with the next look
+            self.problems[found.name] = str(error)  # retried with the next search
         else:
             self.problems.pop(found.name, None)
             self.stations[found.name] = Station(found, drone)
@@ -189,7 +189,7 @@ class Overview:
 
     Args:
         fleet: The drones.
-        recordings: Of the same drones.
+        recordings: The recordings of the same drones.
         period_s: Between two messages [s].
     """
 
@@ -199,7 +199,7 @@ class Overview:
         self.broadcast = PeriodicBroadcast(period_s, self._make, lambda _: None)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each drone, by name, also for those that were found and did not answer."""
+        """Return a row for each drone, by name, including drones that were found and did not answer."""
         recorded = self._recordings.drones()
         rows = []
         for name, station in self._fleet.stations.items():
@@ -235,15 +235,15 @@ def _silent(name: str, problem: str) -> dict[str, Any]:
 
 
 class FleetSession:
-    """Serves one socket of a pilot's page; what it began goes on when the page is gone. On the event loop."""
+    """Serves one socket of a pilot's page; its commands complete even if the page is gone. On the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
         """Prepare the session; :meth:`run` serves it.
 
         Args:
-            socket: Accepted already.
+            socket: Already accepted.
             fleet: The drones.
-            person: The name of who flies, if it is known.
+            person: The name of the person who flies, if known.
             clock: The monotonic clock [ns].
         """
         self._page = PageSocket(socket)
@@ -253,7 +253,7 @@ class FleetSession:
         self._clock = clock
 
     async def run(self) -> None:
-        """Serve the page until it is gone."""
+        """Serve the page until it disconnects."""
         await self._page.serve(self._on_messages)
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:
@@ -273,7 +273,7 @@ class FleetSession:
             self._send({"type": "refused", "do": command.do, "n": command.n, "why": problem})
         else:
             stations = [station for _, station in sorted(self._fleet.stations.items()) if station.flies]
-            unreached = self._fleet.unreached  # a person who stops all must know of whom that is not true
+            unreached = self._fleet.unreached  # a person who stops all drones must know which ones were not reached
             names = sorted([*(station.found.name for station in stations), *unreached])
             self._send({"type": "sent", "do": command.do, "n": command.n, "drones": names})
             for name, why in unreached.items():
@@ -304,7 +304,7 @@ class FleetSession:
             await station.pilot_went()
 
     async def _land(self, station: Station, subject: Json) -> None:
-        """Take control with the highest priority, land, and give control back."""
+        """Take control with the highest priority, land, and release control."""
         if station.drone.link.application in (LinkState.LOST, LinkState.CLOSED):
             raise LinkError("the link to the proxy is lost")
         station.check_stop()
@@ -316,7 +316,7 @@ class FleetSession:
         pilot = await station.open_pilot(self._app)
         try:
             if seconds(monotonic_ns() - begun_ns) > BEGIN_S:
-                raise LinkError(f"there was no connection within {BEGIN_S:g} s")
+                raise LinkError(f"no connection within {BEGIN_S:g} s")
             await asyncio.to_thread(pilot.acquire, HIGHEST_PRIORITY)
             station.check_stop()
             from_ns = pilot.proxy_now_ns + SETTLED_NS

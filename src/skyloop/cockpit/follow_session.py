@@ -1,8 +1,8 @@
-"""One page's flight after a target that it marked: from its box to set-points, and what the page is told. On the loop.
+"""One page's flight after a target it marked: from its box to set-points and messages to the page. On the event loop.
 
-A box is tracked first, and nothing flies before the page says how (:meth:`FollowSession.fly`), or said so with the
-box. While it flies, each report of the :class:`~skyloop.cockpit.target_tracker.TargetTracker` is one set-point; without
-a new frame for :data:`STOPPED_S` it is hover, until they come back.
+A box is only tracked until the page sets a mode, with the box or later (:meth:`FollowSession.fly`). In flight, each
+report of the :class:`~skyloop.cockpit.target_tracker.TargetTracker` is one set-point; after :data:`STOPPED_S` without
+a new frame the vehicle hovers until frames come back.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import PilotConnection
     from skyloop.messages import AnyAction
 
-STOPPED_S: Final = 0.5  #: without a new frame for so long it hovers
-OLD_S: Final = 1.0  #: frames that are older when they are tracked are not flown by either
+STOPPED_S: Final = 0.5  #: the vehicle hovers after this long without a new frame
+OLD_S: Final = 1.0  #: frames older than this when tracked are not flown by either
 OLD_FEEDBACK_S: Final = 1.0
-#: What was pressed longer ago sets off no more: the tracker was stuck, or caught up for longer than anybody remembers.
+#: A request older than this no longer sets off: the tracker was stuck, or took longer to catch up than anyone expects.
 SET_OFF_S: Final = 10.0
-WATCH_S: Final = 0.1  #: between looks whether the tracker still reports
-TELL_S: Final = 0.2  #: between two messages of which only numbers differ
+WATCH_S: Final = 0.1  #: between checks that the tracker still reports
+NUMBERS_PERIOD_S: Final = 0.2  #: between two messages that differ only in numbers
 JOIN_S: Final = 2.0
-NO_CONTROL: Final = "this page has no control any more"
+NO_CONTROL: Final = "this page has lost control"
 _WHAT: Final = "following a target"
 
 Json = dict[str, Any]
 
 
 class FollowerFactory(Protocol):
-    """Makes a follower for one target; as :class:`skyloop.control.target_follower.TargetFollower` is made."""
+    """Creates a follower for one target, as :class:`skyloop.control.target_follower.TargetFollower` is created."""
 
     def __call__(
         self,
@@ -62,10 +62,10 @@ class FollowSession:
     """Tracks one target at a time for a page, and flies after it. On the event loop.
 
     Args:
-        drone: Whose frames are tracked; may be an observer's.
+        drone: Provides the frames; may be an observer.
         send: Sends a message to the page.
-        clear: Ends whatever else the page flies; called before the first set-point.
-        make: Makes followers; called on a thread.
+        clear: Ends any other flight of the page; called before the first set-point.
+        make: Creates followers; called on a thread.
         clock: This process's monotonic clock [ns].
     """
 
@@ -82,33 +82,33 @@ class FollowSession:
         self._clear = clear
         self._make = make
         self._clock = clock
-        self._keeper: FrameKeeper | None = None  # while a box is drawn
+        self._keeper: FrameKeeper | None = None  # while a person draws a box
         self._tracker: TargetTracker | None = None
         self._camera = ""
         self._mode = ""
         self._distance_m = 0.0
-        self._limits: dict[str, Value] = {}  # of the drone, when the target was marked
-        self._pilot: PilotConnection | None = None  # while it flies, or is about to
+        self._limits: dict[str, Value] = {}  # the drone's, read when the target was marked
+        self._pilot: PilotConnection | None = None  # while it flies or is about to
         self._flying = False
-        self._waits = ""  # why it hovers meanwhile
+        self._waits = ""  # why it hovers for now
         self._action: AnyAction | None = None  # the last set-point
         self._report: TrackReport | None = None
         self._reported_ns = 0
-        self._asked_ns = 0  # when to fly was asked for
-        self._told: tuple[Any, ...] = ()
-        self._told_ns = 0
+        self._asked_ns = 0  # when the flight was requested
+        self._last_sent: tuple[Any, ...] = ()
+        self._last_sent_ns = 0
         self._watch: asyncio.TimerHandle | None = None
         self._ending: set[asyncio.Task[None]] = set()
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it commands the vehicle, or is about to."""
+        """Whether it commands the vehicle or is about to."""
         return self._pilot is not None
 
-    # What the page asks for ------------------------------------------------------------------------------------
+    # Requests of the page --------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
-        """Keep the frames of a camera, until a box comes or the page changes its mind.
+        """Keep the frames of a camera until a box arrives or the page cancels.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -127,17 +127,17 @@ class FollowSession:
         )
 
     async def begin(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
-        """Track what is in a box; fly after it, once the tracker has caught up, if there is a mode.
+        """Track the content of a box; with a mode, fly after it once the tracker has caught up.
 
         Args:
-            command: The page's.
-            held: Returns the connection that holds the authority, unless something newer was commanded; called if
-                there is a mode, at the beginning and when all is known.
+            command: The page's command.
+            held: Returns the connection that holds the authority, and raises if there is none or a newer command was
+              given; called only with a mode, at the beginning and before the flight.
 
         Raises:
-            AuthorityError: There is a mode, and none does.
-            RefusedError: The frame is not kept, the vehicle is not in the air, or something newer was commanded.
-            UsageError: The box, mode, distance or camera can't be used.
+            AuthorityError: There is a mode, and this page does not hold the authority.
+            RefusedError: The frame was not kept, the vehicle is not in the air, or a newer command was given.
+            UsageError: The box, mode, distance or camera is invalid.
             MissingExtraError: OpenCV is not installed.
         """
         camera = self._camera_info(command.camera)
@@ -149,12 +149,12 @@ class FollowSession:
         self._limits = await asyncio.to_thread(lambda: dict(self._drone.config.items()))
         keeper = self._keeper
         if keeper is None or keeper.camera != camera.name:
-            raise RefusedError(f"no frames of {camera.name} are kept: choose the camera first (follow_select)")
+            raise RefusedError(f"no frames of {camera.name} were kept: select the camera first (follow_select)")
         first = keeper.find(int(command.captured_ns))
         box = checked_box(in_frame(command, first.header), (first.header.height, first.header.width))
         pilot = None if command.mode is None else held()
         self.end("another target was marked")
-        self._keeper = None  # it is the tracker's now
+        self._keeper = None  # the tracker owns it now
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
         self._distance_m = settings.distance_m
         settings = settings.within(self._limits)
@@ -170,14 +170,14 @@ class FollowSession:
         tracker = self._tracker = TargetTracker(self._drone, keeper, first, make, report, self._clock)
         tracker.steers = pilot is not None
         tracker.start()
-        self._tell()
+        self._send_state()
 
     def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
-        """Fly after the target that is tracked, or go on in another mode.
+        """Fly after the tracked target, or change the mode of following.
 
         Raises:
             RefusedError: Nothing is tracked, or the vehicle is not in the air.
-            UsageError: The mode or distance can't be used.
+            UsageError: The mode or distance is invalid.
         """
         tracker = self._tracker
         if tracker is None:
@@ -189,12 +189,12 @@ class FollowSession:
             tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
-        self._pilot, self._asked_ns = pilot, self._clock()  # sets off with the next report, once that has caught up
+        self._pilot, self._asked_ns = pilot, self._clock()  # sets off with the report after catching up
         tracker.steers = True
-        self._tell()
+        self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End a flight, as something else is commanded or the control is gone; what is only tracked goes on."""
+        """End a flight because something else is commanded or control was lost; tracking alone continues."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -202,8 +202,8 @@ class FollowSession:
         """Forget the target.
 
         Args:
-            why: For the page; empty if the person wanted it.
-            hover: Hover, if it was flown after; False because something else is commanded.
+            why: The reason for the page; empty if the person wanted it.
+            hover: Hover, if the vehicle was following; False if something else is commanded.
         """
         tracker, pilot, flying = self._tracker, self._pilot, self._flying
         if tracker is None:
@@ -219,7 +219,7 @@ class FollowSession:
             self._watch = None
         if hover and flying and pilot is not None:
             pilot.let_go(why or "following was ended")
-        self._tell("ended", why)
+        self._send_state("ended", why)
         self._report = None
 
     async def close(self) -> None:
@@ -230,10 +230,10 @@ class FollowSession:
             self._keeper = None
         await asyncio.gather(*self._ending, return_exceptions=True)
 
-    # While it is tracked ---------------------------------------------------------------------------------------
+    # While tracking --------------------------------------------------------------------------------------------
 
     def _on_report(self, tracker: TargetTracker, report: TrackReport) -> None:
-        if tracker is not self._tracker:  # of one that has ended
+        if tracker is not self._tracker:  # from a tracker that has ended
             return
         self._report, self._reported_ns = report, self._clock()
         if report.problem or report.over:
@@ -247,11 +247,11 @@ class FollowSession:
                 return
             else:
                 self._set_off()
-        self._tell()
+        self._send_state()
 
     def _set_off(self) -> None:
-        """Send the first set-point; whatever else flew until now ends."""
-        pilot, self._pilot = self._pilot, None  # or this would end, too
+        """Send the first set-point, which ends any other flight."""
+        pilot, self._pilot = self._pilot, None  # or clearing would end this flight, too
         self._clear()
         self._pilot, self._flying, self._action = pilot, True, None
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
@@ -259,20 +259,20 @@ class FollowSession:
             self._steer(self._report.action)
 
     def _steer(self, action: AnyAction | None) -> None:
-        """Send a set-point, or hover without new frames or known motion; ends with the first thing that goes wrong."""
+        """Send a set-point, or hover without new frames or a known motion; raises on the first problem."""
         pilot = self._pilot
         assert pilot is not None
-        waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker does not report")
+        waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker is not reporting")
         try:
             if _check_in_air(pilot).failsafe is not Failsafe.NONE or (self._action and pilot.has_ended(self._action)):
-                raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+                raise RefusedError("a failsafe or a lost link ended it on the way")
             if self._waits or action is None:
                 self._action = None
                 if not waited:
                     pilot.let_go(self._waits)
                 return
             if not pilot.command(action):
-                pilot.idle()  # or it would be done after all when the link is back soon
+                pilot.idle()  # or it would still be carried out if the link came back soon
                 raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
             self._action = action
         except AuthorityError:
@@ -281,7 +281,7 @@ class FollowSession:
             self.end(str(error))
 
     def _stopped(self) -> str:
-        """Return why there is nothing to fly by: no frames, or no motion of the vehicle; empty if there is."""
+        """Return why nothing can be flown: no frames, or no known motion of the vehicle; empty if it can."""
         report = self._report
         if report is None:
             return ""
@@ -295,20 +295,20 @@ class FollowSession:
         return ""
 
     def _on_watch(self) -> None:
-        """Hover if the tracker has not reported for too long: its thread is stuck, or starved."""
+        """Hover if the tracker has not reported for too long: its thread is stuck or starved."""
         self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
         if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
             self._steer(None)
-            self._tell()
+            self._send_state()
 
-    # What the page is told -------------------------------------------------------------------------------------
+    # Messages to the page --------------------------------------------------------------------------------------
 
     def _selecting(self, camera: str, since_ns: int) -> None:
         if self._keeper is not None and self._keeper.camera == camera:
             self._send({"type": "follow", "state": "selecting", "camera": camera, "since_ns": str(since_ns)})
 
-    def _tell(self, state: str = "", why: str = "") -> None:
-        """Send the state: each change at once, numbers no more often than every :data:`TELL_S`."""
+    def _send_state(self, state: str = "", why: str = "") -> None:
+        """Send the state: each change at once, numbers at most every :data:`NUMBERS_PERIOD_S`."""
         if not state:
             if self._tracker is None:
                 return
@@ -317,14 +317,14 @@ class FollowSession:
         status = None if report is None else report.status
         phase = "starting" if status is None or report is None or not report.caught_up else str(status.phase)
         if phase != "starting" and not self._flying and state != "ended":
-            phase = ""  # of a law that does not fly
+            phase = ""  # a law without set-points has no phase
         problem = why if state == "ended" or status is None else self._waits or status.problem
         now_ns = self._clock()
-        # Of what waits the age grows: that is no change.
-        told = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
-        if told == self._told and now_ns - self._told_ns < nanoseconds(TELL_S):
+        # While it waits, only the age grows: that is no change.
+        sent = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
+        if sent == self._last_sent and now_ns - self._last_sent_ns < nanoseconds(NUMBERS_PERIOD_S):
             return
-        self._told, self._told_ns = told, now_ns
+        self._last_sent, self._last_sent_ns = sent, now_ns
         message: Json = {"type": "follow", "state": state, "camera": self._camera, "mode": self._mode or None}
         message |= {"phase": phase, "problem": problem, "distance_m": number(self._distance_m)}
         message["size"] = None if report is None else list(report.size)
@@ -343,11 +343,11 @@ class FollowSession:
 
 
 def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
-    """Return the box of a command in pixels of the frame, where the page was sent the picture in another size.
+    """Return a command's box in pixels of the frame, also if the page received the picture in another size.
 
     Args:
-        command: The page's.
-        header: Of the frame that it was drawn on.
+        command: The page's command.
+        header: The header of the frame under the box.
     """
     x, y, width, height = command.box
     if command.size is None:
@@ -366,7 +366,7 @@ def _settings(distance_m: float | None) -> ChaseSettings:
 
 
 def _check_in_air(pilot: PilotConnection) -> Feedback:
-    """Return the newest feedback of a vehicle that is in the air, and in nobody else's hands."""
+    """Return the newest feedback of a vehicle that is in the air and not in others' hands."""
     feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
     if feedback.others:
         raise RefusedError(f"{feedback.others}: hover first to take it over")

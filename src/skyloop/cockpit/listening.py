@@ -1,13 +1,13 @@
-"""Accepts connections at the listening socket: how many may be open, and for how long one may be silent.
+"""Accepts connections at the listening socket, and limits their number and their silence.
 
-A connection is *anonymous* until a request of a person who may come in was read from it. Anonymous connections have few
-places, and the newest always has one: another of the address that has most gives up its own, one that has asked in vain
-before the oldest. So a flood of strangers displaces itself, and somebody who sends a request at once is served in the
-midst of it. People who are logged in have places of their own, some of them for pilots alone, and nobody else's
-connections take those away. What decides that takes times as arguments.
+A connection is *anonymous* until it has sent a request of an admitted person. Anonymous connections have few places,
+and the newest always gets one: a connection of the address with most of them is closed, one whose request was not
+admitted before the oldest. A flood of strangers therefore displaces itself, and a person who sends a request at once
+is served in the midst of it. Logged-in people have separate places, some reserved for pilots, which no other
+connection can take away. These decisions take the time as an argument.
 
-asyncio's own way of listening accepts whatever comes until there are no descriptors left, and then logs errors without
-end; so this one accepts, and hands connections to the HTTP server.
+asyncio's own listener accepts connections until no descriptors are left, and then logs errors without end; therefore
+this module accepts, and hands connections to the HTTP server.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.access import Person
 from skyloop.messages import Role
 
-MAX_ANONYMOUS: Final = 128  #: enough for everybody who logs in at one time
+MAX_ANONYMOUS: Final = 128  #: enough for everyone logging in at one time
 MAX_ANONYMOUS_OF_ADDRESS: Final = 32  #: a browser opens six, and several may share an address
 MAX_KNOWN: Final = 512  #: a page that shows a drone with two cameras has about eight
 MAX_KNOWN_OF_ADDRESS: Final = 192  #: of one role; a page, a class-room behind one router, a measuring program
-_PILOTS_SHARE: Final = 0.25  # of the known: kept for pilots
-DESCRIPTORS_LEFT: Final = 128  #: for drones, recordings, children and files; connections take none of these
+_PILOTS_SHARE: Final = 0.25  # of the known, reserved for pilots
+DESCRIPTORS_LEFT: Final = 128  #: reserved for drones, recordings, children and files
 
 HEADER_S: Final = 5.0  #: for a TLS handshake and a whole request
-NEXT_S: Final = 10.0  #: for the next request of a connection; the server itself closes those that stay idle before
-ANSWER_S: Final = 30.0  #: for a request of somebody unknown, and its answer
+NEXT_S: Final = 10.0  #: for the next request of a connection; the server closes idle ones sooner
+ANSWER_S: Final = 30.0  #: for a stranger's request and its answer
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """How many connections there may be of each sort."""
+    """How many connections of each kind are allowed."""
 
     anonymous: int = MAX_ANONYMOUS
     anonymous_of_address: int = MAX_ANONYMOUS_OF_ADDRESS
@@ -50,12 +50,12 @@ class Places:
 
     @property
     def observers(self) -> int:
-        """How many of the known may be observers: the others are kept for pilots."""
+        """The known connections allowed to observers: the others are reserved for pilots."""
         return self.known - round(self.known * _PILOTS_SHARE)
 
     @classmethod
     def within(cls, descriptors: int) -> Places:
-        """Return as many places as a process with so many descriptors can have."""
+        """Return the places for a process that may open this many descriptors."""
         share = min(1.0, max(descriptors - DESCRIPTORS_LEFT, descriptors // 4) / (MAX_ANONYMOUS + MAX_KNOWN))
         most = (MAX_ANONYMOUS, MAX_ANONYMOUS_OF_ADDRESS, MAX_KNOWN, MAX_KNOWN_OF_ADDRESS)
         return cls(*(max(1, int(number * share)) for number in most))
@@ -63,22 +63,22 @@ class Places:
 
 @dataclass(eq=False, slots=True)
 class Connection:
-    """An open connection. ``end`` closes it at once; ``person`` is who was let in over it."""
+    """An open connection. ``end`` closes it at once; ``person`` was admitted over it."""
 
     address: str
     end: Callable[[], None]
     person: Person | None = None
-    deadline_ns: int | None = None  #: by then something must have happened
-    asked: bool = False  #: whether a request came over it of somebody who is not known
+    deadline_ns: int | None = None  #: closed if nothing happens by then
+    asked: bool = False  #: whether it has sent a stranger's request
 
 
 @dataclass(slots=True)
 class AdmissionCounts:
     """Counts since the start."""
 
-    displaced: int = 0  #: anonymous connections that gave their place up to a newer one
-    timed_out: int = 0  #: connections that were silent for too long
-    refused: int = 0  #: requests of people who had too many connections
+    displaced: int = 0  #: anonymous connections closed in favour of a newer one
+    timed_out: int = 0  #: connections closed for their silence
+    refused: int = 0  #: requests refused because the person had too many connections
 
 
 @dataclass
@@ -89,21 +89,21 @@ class Admission:
     counts: AdmissionCounts = field(default_factory=AdmissionCounts)
 
     def __post_init__(self) -> None:
-        self._anonymous: dict[str, dict[Connection, None]] = {}  # by address; the oldest first
+        self._anonymous: dict[str, dict[Connection, None]] = {}  # by address, the oldest first
         self._known: dict[Connection, None] = {}
 
     @property
     def anonymous(self) -> int:
-        """How many anonymous connections are open."""
+        """The number of open anonymous connections."""
         return sum(len(connections) for connections in self._anonymous.values())
 
     @property
     def known(self) -> int:
-        """How many connections of known people are open."""
+        """The number of open connections of known people."""
         return len(self._known)
 
     def opened(self, connection: Connection, now_ns: int) -> None:
-        """Add a new connection, and end the one whose place it takes, if any."""
+        """Add a new connection, and close the one whose place it takes, if any."""
         if len(self._anonymous.get(connection.address, ())) >= self.places.anonymous_of_address:
             self._displace(connection.address)
         elif self.anonymous >= self.places.anonymous:
@@ -112,16 +112,16 @@ class Admission:
         connection.deadline_ns = now_ns + nanoseconds(HEADER_S)
 
     def shed(self) -> None:
-        """End an anonymous connection of the address that has most of them."""
+        """Close an anonymous connection of the address that has most of them."""
         if self._anonymous:
             self._displace(max(self._anonymous, key=lambda address: len(self._anonymous[address])))
 
     def requested(self, connection: Connection, person: Person | None, now_ns: int) -> str:
-        """Note that a whole request has come.
+        """Record that a complete request has arrived.
 
         Args:
-            connection: Over which it came.
-            person: Who sent it, None for nobody known.
+            connection: The request's connection.
+            person: Who sent it, None for a stranger.
             now_ns: The monotonic clock [ns].
 
         Returns:
@@ -143,11 +143,11 @@ class Admission:
         return ""
 
     def answered(self, connection: Connection, now_ns: int) -> None:
-        """Note that the answer was sent, and the next request is waited for."""
+        """Record that the answer was sent: the connection now waits for the next request."""
         connection.deadline_ns = now_ns + nanoseconds(NEXT_S)
 
     def closed(self, connection: Connection) -> None:
-        """Remove a connection that is closed; does nothing for one that is not listed."""
+        """Remove a closed connection; does nothing for one that is not listed."""
         self._known.pop(connection, None)
         of_address = self._anonymous.get(connection.address, {})
         of_address.pop(connection, None)
@@ -155,7 +155,7 @@ class Admission:
             self._anonymous.pop(connection.address, None)
 
     def end_overdue(self, now_ns: int) -> None:
-        """End the connections that were silent for too long."""
+        """Close the connections that were silent for too long."""
         everybody = [*self._known, *(one for connections in self._anonymous.values() for one in connections)]
         for connection in everybody:
             if connection.deadline_ns is not None and now_ns >= connection.deadline_ns:
@@ -163,7 +163,7 @@ class Admission:
                 self._end(connection)
 
     def _full(self, connection: Connection, person: Person) -> str:
-        """Return why this person can have no further connection from this address; empty if it can."""
+        """Return why this person gets no further connection from this address; empty if they do."""
         role, places = person.role, self.places
         roles = Counter(one.person.role for one in self._known if one.person is not None and one is not connection)
         here = sum(
@@ -172,17 +172,17 @@ class Admission:
         )
         if here >= places.known_of_address:
             return (
-                f"{here} connections of {role}s are open from {connection.address}, and at most "
-                f"{places.known_of_address} may be: close some pages"
+                f"{here} {role} connections are open from {connection.address}, at most "
+                f"{places.known_of_address} are allowed: close some pages"
             )
         open_ = sum(roles.values())
         if open_ >= places.known or (role is Role.OBSERVER and roles[role] >= places.observers):
-            return f"{open_} connections are open, which is all that this cockpit takes of {role}s: close some pages"
+            return f"{open_} {role} connections are open, the most that this cockpit accepts: close some pages"
         return ""
 
     def _displace(self, address: str) -> None:
-        # Whoever has asked and is not known, such as with a wrong token, goes before those who have not asked yet: else
-        # a guesser whose answers wait would end the handshakes of people at the same address.
+        # Strangers that have sent a request, such as a wrong token, go first: otherwise a guesser whose answers are
+        # delayed would end the handshakes of people at the same address.
         self.counts.displaced += 1
         of_address = self._anonymous[address]
         self._end(next((one for one in of_address if one.asked), next(iter(of_address))))
@@ -192,22 +192,22 @@ class Admission:
         connection.end()
 
 
-BACKLOG: Final = 1024  #: connections that the kernel keeps until they are taken; a dropped one is tried again after 1 s
-AT_ONCE: Final = 16  #: connections accepted before open ones have their turn
-PAUSE_S: Final = 0.1  #: after the system had no room for a connection
-SWEEP_S: Final = 0.5  #: how often connections that were silent for too long are ended
+BACKLOG: Final = 1024  #: connections queued by the kernel; clients retry a dropped one after 1 s
+AT_ONCE: Final = 16  #: connections accepted before the open ones get a turn
+PAUSE_S: Final = 0.1  #: after the system refused a connection for lack of resources
+SWEEP_S: Final = 0.5  #: between two sweeps that close silent connections
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
-_MAX_MESSAGES: Final = 256  # kept in mind by a limit; they are the program's own, so there are fewer
+_MAX_MESSAGES: Final = 256  # remembered by a filter; enough, as the program has fewer
 
 _log = logging.getLogger(__name__)
 
-#: Makes what speaks HTTP with one connection.
+#: Creates the HTTP protocol of one connection.
 ProtocolFactory = Callable[[Connection], asyncio.Protocol]
 
 
 class _Accepted(socket.socket):
-    """A connection's socket, which reports when it is closed, whichever protocol had it last."""
+    """A connection's socket, which reports when it is closed, whichever protocol used it last."""
 
     on_close: Callable[[], None] | None = None
 
@@ -219,12 +219,12 @@ class _Accepted(socket.socket):
 
 
 class Listener:
-    """Accepts connections while :meth:`run` runs, as many as the admission has places for. On the event loop.
+    """Accepts connections while :meth:`run` runs, as far as the admission has places. On the event loop.
 
     Args:
-        listening: Bound already.
+        listening: Already bound.
         admission: Counts the connections.
-        protocol: Makes the HTTP protocol of a connection.
+        protocol: Creates the HTTP protocol of a connection.
         tls: For HTTPS.
         clock: The monotonic clock [ns].
     """
@@ -245,7 +245,7 @@ class Listener:
         self._handing_over: set[asyncio.Task[None]] = set()
 
     async def run(self) -> None:
-        """Accept connections until it is cancelled; connections that are open stay so."""
+        """Accept connections until cancelled; open connections stay open."""
         self._listening.setblocking(False)
         self._listening.listen(BACKLOG)
         sweeping = asyncio.create_task(self._sweep())
@@ -264,16 +264,16 @@ class Listener:
                 bare, address = await loop.sock_accept(self._listening)
             except OSError as error:
                 if error.errno == errno.EBADF:
-                    raise  # nobody listens any more
+                    raise  # the listening socket was closed
                 if error.errno in _NO_ROOM:
                     self._admission.shed()
-                    _log.warning("no connection can be taken: %s", error.strerror)
-                # Other errors are of the one connection that was to be taken, which is gone again.
+                    _log.warning("can't accept connections: %s", error.strerror)
+                # Other errors concern the one connection to accept, which is gone again.
                 await asyncio.sleep(PAUSE_S if error.errno in _NO_ROOM else 0)
                 continue
             self._open(bare, str(address[0]))
             taken += 1
-            if taken % AT_ONCE == 0:  # a flood of them must not keep pages waiting
+            if taken % AT_ONCE == 0:  # a flood must not keep pages waiting
                 await asyncio.sleep(0)
 
     def _open(self, bare: socket.socket, address: str) -> None:
@@ -293,7 +293,7 @@ class Listener:
                 lambda: self._protocol(connection), accepted, ssl=self._tls, ssl_handshake_timeout=timeout_s
             )
         except OSError:
-            accepted.close()  # the handshake failed, or the other end is gone
+            accepted.close()  # the handshake failed, or the client has disconnected
         except BaseException:
             accepted.close()
             raise
@@ -305,7 +305,7 @@ class Listener:
 
 
 def places_here() -> Places:
-    """Return as many places as this process's limit of descriptors leaves room for."""
+    """Return the places that this process's limit of descriptors allows."""
     try:
         import resource
     except ImportError:  # Windows has no such limit
@@ -316,24 +316,24 @@ def places_here() -> Places:
 
 def _shut(accepted: socket.socket) -> None:
     """Shut a connection down; its protocol, or the handshake, then reads the end of file and closes it."""
-    with suppress(OSError):  # it is closed already
+    with suppress(OSError):  # already closed
         accepted.shutdown(socket.SHUT_RDWR)
 
 
 def limit_messages() -> None:
-    """Limit the log messages that strangers can cause: each once in a while, and not for each connection."""
+    """Limit the log messages that strangers can cause to one of each kind per period."""
     for name in (__name__, "uvicorn.error", "asyncio"):
         logging.getLogger(name).addFilter(_REPEATS)
 
 
 class RepeatLimit(logging.Filter):
-    """A log filter that lets each message through once in ``every_s`` [s], with the count of those left out.
+    """A log filter that passes each message once in ``every_s`` [s], with the number of those dropped since.
 
-    Messages count as equal if they differ in their values only. Of more than 256 different ones, the one that was let
-    through longest ago is forgotten.
+    Messages that differ only in their values count as equal. It remembers 256 messages, and forgets the one passed
+    longest ago first.
 
     Args:
-        every_s: The time [s].
+        every_s: The period [s].
         clock: The monotonic clock [ns].
     """
 
@@ -341,7 +341,7 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._logged: dict[str, tuple[int, int]] = {}  # by the message without its values: when, and how many since
+        self._logged: dict[str, tuple[int, int]] = {}  # by message without values: when, and how many since
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to log a record."""
@@ -352,7 +352,7 @@ class RepeatLimit(logging.Filter):
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        self._logged.pop(key, None)  # so that they stand in the order in which they were let through
+        self._logged.pop(key, None)  # keeps them ordered by the time they were passed
         if len(self._logged) >= _MAX_MESSAGES:
             del self._logged[next(iter(self._logged))]
         self._logged[key] = now_ns, 0

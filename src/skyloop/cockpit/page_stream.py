@@ -1,7 +1,7 @@
-"""One camera as H.264 on one page: in which form it gets it, and which of the pictures. On the event loop.
+"""One camera as H.264 on one page: selects its form and its pictures. On the event loop.
 
-Pages that keep up share a form. One whose acknowledgements come late gets a stream of its own, whose rate and size
-follow the path to this page, until all was quiet for a while.
+Pages that keep up share a form. A page whose acknowledgements come late gets its own stream, whose rate and size
+follow the path to this page, until nothing has been late for a while.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from skyloop.messages import CameraInfo, EncodedFrame
 if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
 
-LATE_S: Final = 0.25  #: a picture that takes longer to be acknowledged is late
-FALLS_BEHIND_S: Final = 1.0  #: a page of which all have been late for so long gets a stream of its own
-QUIET_S: Final = 10.0  #: with nothing late for so long it shares one again; twice as long after each relapse
+LATE_S: Final = 0.25  #: a picture acknowledged later than this is late
+FALLS_BEHIND_S: Final = 1.0  #: a page whose pictures were all late for this long gets its own stream
+QUIET_S: Final = 10.0  #: without a late picture for this long it shares one again; doubled by each relapse
 MOST_QUIET_S: Final = 160.0
-SILENT_S: Final = 3.0  #: a form of which nothing comes for so long is not to be had
-RETRY_S: Final = 10.0  #: after so long it is tried again, the next time after twice as long …
-MOST_RETRY_S: Final = 300.0  #: … up to this: a proxy that refuses it says so each time
-MOST_UNDER_WAY: Final = 8  #: pictures that were sent and not acknowledged
-MOST_BYTES: Final = 1_000_000  #: of these, unless one alone has more
+SILENT_S: Final = 3.0  #: give up on a form after this much silence
+RETRY_S: Final = 10.0  #: until it is retried, doubled each time …
+MOST_RETRY_S: Final = 300.0  #: … up to this: each retry makes a refusing proxy report it
+MOST_UNDER_WAY: Final = 8  #: pictures sent and not yet acknowledged
+MOST_BYTES: Final = 1_000_000  #: of these, unless a single one is larger
 
 
 class PagePath:
-    """Judges whether a page keeps up, by what it acknowledges. Pure: the time is an argument."""
+    """Judges by its acknowledgements whether a page keeps up. Pure: the time is an argument."""
 
     def __init__(self) -> None:
-        self.behind = False  #: it needs less than what others get
-        self.late_here = False  #: and that is no fault of the page: pictures were late when they came to the cockpit
-        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, when it was sent
+        self.behind = False  #: it needs less than other pages get
+        self.late_here = False  #: and not by its own path: pictures reached the cockpit late
+        self._under_way: deque[tuple[int, int, int]] = deque()  # number, bytes, time of sending
         self._trip_s = 0.0  # of the newest acknowledged
         self._changed_ns: int | None = None  # since when all are late, or none is
         self._was_late = False
@@ -52,15 +52,15 @@ class PagePath:
 
     @property
     def waiting(self) -> int:
-        """How many pictures are under way."""
+        """The number of pictures under way."""
         return len(self._under_way)
 
     def sent(self, number: int, size: int, now_ns: int) -> None:
-        """Note a picture, with its bytes."""
+        """Record a picture that was sent, with its size in bytes."""
         self._under_way.append((number, size, now_ns))
 
     def acknowledged(self, number: int, now_ns: int) -> int:
-        """Note that the page has a picture, and all before it; return how many that were new."""
+        """Record that the page has a picture and all before it; return how many were new."""
         count = 0
         while self._under_way and self._under_way[0][0] <= number:
             self._trip_s = seconds(now_ns - self._under_way.popleft()[2])
@@ -68,11 +68,11 @@ class PagePath:
         return count
 
     def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
-        """Judge anew; return whether the page is behind.
+        """Update the judgement; return whether the page is behind.
 
         Args:
             now_ns: The present time.
-            extra_s: How long pictures take up to here [s].
+            extra_s: How long pictures take to reach the cockpit [s].
         """
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
@@ -92,12 +92,12 @@ class PagePath:
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A picture that a page is to get."""
+    """A picture for a page."""
 
     picture: EncodedFrame
     form: Form
     age_s: float
-    late_here: bool = False  #: where the form is the page's own: not for the page's sake
+    late_here: bool = False  #: the form is the page's own because pictures reach the cockpit late
 
 
 class PageStream:
@@ -108,7 +108,7 @@ class PageStream:
         camera: The camera.
         width: Of the pane [device pixels]; 0: full size.
         max_fps: Most pictures a second; None: all.
-        wake: Called on the event loop for each picture; None: the page looks by itself.
+        wake: Called on the event loop for each picture; None: the page polls.
         clock: The monotonic clock [ns].
     """
 
@@ -122,35 +122,35 @@ class PageStream:
         clock: Clock = monotonic_ns,
     ) -> None:
         self.path = PagePath()
-        self.skipped = 0  #: pictures that were not sent, as the page could not have decoded them
+        self.skipped = 0  #: pictures not sent, because the page could not have decoded them
         self._station = station
         self._camera = camera
         self._width = width
         self._max_fps = max_fps
         self._wake = wake
         self._clock = clock
-        self._name = ""  # of the stream of its own, while it has one
+        self._name = ""  # of the page's own stream, while it has one
         self._feed: EncodedFeed | None = None
-        self._next: EncodedFeed | None = None  # takes the place of it with its first key picture
-        self._serial = 0  # of the picture sent last
+        self._next: EncodedFeed | None = None  # replaces it at its first key picture
+        self._serial = 0  # of the last picture sent
         self._follows = True  # the page can decode the one after it
-        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # of messages, with the newest picture in each
-        self._late_s = 0.0  # of the newest picture when it came here
-        self._missed = 0  # pictures before those that are ready
+        self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message numbers, with the newest picture of each
+        self._late_s = 0.0  # of the newest picture when it reached the cockpit
+        self._missed = 0  # pictures missed before those that are ready
         self._refused_ns: int | None = None
         self._retry_s = RETRY_S
 
     @property
     def shows(self) -> bool:
-        """Whether the page is shown it: as long as it is not, other pictures are of use."""
+        """Whether the page receives it; until it does, it still needs other pictures."""
         return self._feed is not None
 
     def resize(self, width: int) -> None:
-        """Note that the pane has another width [device pixels] now."""
+        """Set the new width of the pane [device pixels]."""
         self._width = width
 
     def take(self) -> list[Sent]:
-        """Return the pictures to send now, in order: they are taken as sent. :meth:`sent` says under which number."""
+        """Return the pictures to send now, in order, and mark them as sent; report their numbers to :meth:`sent`."""
         self._choose()
         if self._next is not None and self._ready(self._next, 0):
             self._release(self._feed)
@@ -172,13 +172,13 @@ class PageStream:
         return [Sent(one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures]
 
     def sent(self, number: int, one: Sent) -> None:
-        """Note under which number a picture that was taken is sent."""
+        """Record the message number of a picture from :meth:`take`."""
         if self._feed is not None:
             self._numbers.append((number, self._feed, one.picture.seq))
             self.path.sent(number, len(one.picture.data), self._clock())
 
     def acknowledged(self, number: int) -> int:
-        """Handle what the page has drawn, or left out; return how many pictures that were new."""
+        """Handle the page's report that it drew or skipped pictures; return how many were new."""
         newest = None
         while self._numbers and self._numbers[0][0] <= number:
             newest = self._numbers.popleft()
@@ -187,11 +187,11 @@ class PageStream:
         return self.path.acknowledged(number, self._clock())
 
     def restart(self) -> None:
-        """The page can't decode what comes next: go on with a key picture."""
+        """Resume at a key picture, because the page can't decode the next one."""
         self._follows = False
 
     def close(self) -> None:
-        """Show it no longer. Idempotent."""
+        """Release the streams. Idempotent."""
         for feed in (self._feed, self._next):
             self._release(feed)
         self._feed = self._next = None
@@ -201,14 +201,14 @@ class PageStream:
             self._name = ""
 
     def _ready(self, feed: EncodedFeed, serial: int) -> list[Numbered[EncodedFrame]]:
-        """Return the pictures of a form after one that the page can decode; ask for a key picture if there is none."""
+        """Return the pictures of a form that the page can decode after ``serial``; request a key picture if none."""
         pictures, self._missed = feed.after(serial, follows=self._follows)
         if not pictures and self._missed:
             feed.ask_for_key()
         return pictures
 
     def _choose(self) -> None:
-        """Subscribe to the form that this page is to have now; what it has stays until a key picture of it is here."""
+        """Subscribe to the form that suits the page now; the present one stays until a key picture of it arrives."""
         form = form_for(self._camera, self._width, self._max_fps)
         if self.path.update(self._clock(), self._late_s):
             self._name = self._name or self._station.own_name()
@@ -224,9 +224,9 @@ class PageStream:
         self._release(self._next)
         self._next = None
         if self._feed is not None and self._feed.form == form:
-            return  # back before the other one came
+            return  # back to the present form before the other one arrived
         feed = self._station.encoded(self._camera.name, form)
-        with suppress(SkyloopError):  # it is going away
+        with suppress(SkyloopError):  # the drone is being closed
             feed.subscribe(self, self._wake)
             self._next = feed
 

@@ -1,6 +1,6 @@
-"""One page's flights, to a place, back to the start, along a route: what is commanded, and when it is over.
+"""One page's flights to a place, back to the start or along a route: their commands and their end.
 
-The course of a route is :class:`skyloop.control.route_law.RouteLaw`'s. On the event loop.
+:class:`skyloop.control.route_law.RouteLaw` decides the course of a route. On the event loop.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import PilotConnection, Station
     from skyloop.control.route import Route
 
-GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
-PERIOD_S: Final = 0.05  #: between looks whether it is there
+GOTO_M_S: Final = 1.0  #: maximum speed on the way to a place
+PERIOD_S: Final = 0.05  #: between checks whether it has arrived
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
 
@@ -34,9 +34,9 @@ class Leg:
     """A flight to one place.
 
     Attributes:
-        action: What is commanded.
-        goal: Where it leads.
-        is_over: Whether it is over, by the newest feedback.
+        action: The command to send.
+        goal: The place it leads to.
+        is_over: Returns whether the newest feedback shows that it is over.
     """
 
     action: Position | ReturnToStart
@@ -45,12 +45,12 @@ class Leg:
 
 
 def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
-    """Return the flight to the place of a command.
+    """Return the flight to the place in a command.
 
     Raises:
         RefusedError: The vehicle can't be flown to places now.
         UsageError: A coordinate is out of range.
-        LinkError: Nothing is known of the vehicle.
+        LinkError: No feedback is known.
     """
     _fit_for_places(pilot, "it can't be flown to a place")
     goal = Waypoint(command.x, command.y, command.z, command.yaw)
@@ -59,15 +59,15 @@ def to_place(command: GoTo, pilot: PilotConnection) -> Leg:
 
 
 def to_start(pilot: PilotConnection) -> Leg:
-    """Return the flight back to where the vehicle took off.
+    """Return the flight back to the place of take-off.
 
     Raises:
-        RefusedError: The vehicle can't be flown to places now, or its start is not known.
-        LinkError: Nothing is known of the vehicle.
+        RefusedError: The vehicle can't be flown to places now, or its start is unknown.
+        LinkError: No feedback is known.
     """
     start = _fit_for_places(pilot, "it can't return to its start").start_position_m
     if start is None:
-        raise RefusedError("it can't return to its start: where it took off is not known")
+        raise RefusedError("it can't return to its start: the place of take-off is unknown")
     over = ReturnWatch()
     return Leg(
         ReturnToStart(),
@@ -79,13 +79,13 @@ def to_start(pilot: PilotConnection) -> Leg:
 class PlaceFlight:
     """Watches one flight to a place at a time, and shows its goal.
 
-    It ends there, and with the first thing that goes wrong.
+    It ends on arrival, and on the first problem.
 
     Args:
         station: The drone.
         app: The name under which the page flies.
-        done: Called when it is there, with the command's kind and number.
-        refused: Called when it was ended on the way, with the command's kind and number, and why.
+        done: Called on arrival, with the command's kind and number.
+        refused: Called if the flight ended on the way, with the command's kind and number, and the reason.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class PlaceFlight:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether it flies there now."""
+        """Whether a flight is under way."""
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
@@ -109,7 +109,7 @@ class PlaceFlight:
         self._job = asyncio.create_task(self._watch(command, pilot, leg))
 
     def cancel(self) -> None:
-        """End it, as something else is commanded."""
+        """Stop watching, because something else is commanded."""
         self._station.goals.pop(self._app, None)
         if self._job is not None:
             self._job.cancel()
@@ -121,11 +121,11 @@ class PlaceFlight:
                 if feedback.others:
                     raise RefusedError(feedback.others)
                 if pilot.has_ended(leg.action):
-                    raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+                    raise RefusedError("a failsafe or a lost link ended it on the way")
                 await asyncio.sleep(PERIOD_S)
-            lands = feedback.return_phase is ReturnPhase.LANDING  # which ends by itself from here on
+            lands = feedback.return_phase is ReturnPhase.LANDING  # a landing completes without further commands
             if lands or feedback.state in UP:
-                pilot.let_go("it is there", land=lands)
+                pilot.let_go("it has arrived", land=lands)
             self._done(command.do, command.n)
         except SkyloopError as error:
             self._refused(command.do, command.n, str(error))
@@ -154,12 +154,12 @@ class RouteSession:
     """A page's flight along a route.
 
     Args:
-        route: Checked.
+        route: Already checked.
         pilot: Holds the authority.
-        drone: Whose frames are saved.
+        drone: Provides the frames to save.
         folder: Where photos are saved.
         send: Sends a message to the page.
-        aim: Called with where it flies to now; None for nowhere.
+        aim: Called with the present goal; None for none.
     """
 
     def __init__(
@@ -187,16 +187,16 @@ class RouteSession:
         return self.law.is_under_way
 
     def begin(self) -> None:
-        """Fly to the first waypoint, and watch the flight on a task until :meth:`end`.
+        """Fly to the first waypoint, and watch the flight in a task until :meth:`end`.
 
         Raises:
-            SkyloopError: The drone is on the ground, its position is not known, or the command was not sent.
+            SkyloopError: The drone is on the ground, its position is unknown, or the command was not sent.
         """
         self._carry_out(self.law.start(self._pilot.feedback(max_age_s=OLD_S)))
         self._job = asyncio.create_task(self._watch())
 
     def pause(self, why: str = "", *, hover: bool = True) -> None:
-        """Pause; without ``hover`` because something else was commanded, or the control is gone."""
+        """Pause; without ``hover`` because something else is commanded or control was lost."""
         self._carry_out(self.law.pause(why), send=hover)
 
     def resume(self) -> None:
@@ -204,11 +204,11 @@ class RouteSession:
         self._ask(self.law.resume)
 
     def skip(self) -> None:
-        """Leave the present waypoint out."""
+        """Skip the present waypoint."""
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
-        """End it for good; without ``hover`` because something else was commanded, or the control is gone."""
+        """End it for good; without ``hover`` because something else is commanded or control was lost."""
         if self._job is not None:
             self._job.cancel()
         self._carry_out(self.law.stop(), send=hover)
@@ -229,7 +229,7 @@ class RouteSession:
     def _step(self) -> None:
         try:
             if self._action is not None and self._pilot.has_ended(self._action):
-                raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+                raise RefusedError("a failsafe or a lost link ended it on the way")
             feedback = self._pilot.feedback(max_age_s=OLD_S)
             if feedback.others:
                 raise RefusedError(feedback.others)
@@ -249,22 +249,22 @@ class RouteSession:
                 self._photos.add(task)
                 task.add_done_callback(self._photos.discard)
             else:
-                self._tell(effect)
+                self._send_progress(effect)
         if effects:
             self._aim(self.law.goal if self.law.is_under_way else None)
 
     def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
-        if automatic and not isinstance(action, Position):  # nobody decides that now
-            pilot.let_go("of its route", land=isinstance(action, Land))
+        if automatic and not isinstance(action, Position):  # the route ends so, not a person
+            pilot.let_go("its route ended", land=isinstance(action, Land))
             return
         if pilot.command(action):
             return
         with suppress(SkyloopError):
-            pilot.idle()  # or it would be done after all when the link is back soon
+            pilot.idle()  # or it would still be carried out if the link came back soon
         raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
 
-    def _tell(self, step: Progress) -> None:
+    def _send_progress(self, step: Progress) -> None:
         law = self.law
         self._send(
             {

@@ -1,7 +1,7 @@
-"""The files of the folder of recordings: renamed, noted about, thrown into the trash and brought back. Blocking.
+"""The files in the folder of recordings: rename, annotate, move to the trash and restore. Blocking.
 
-Beside ``flight.mcap`` lies what people wrote about it, ``flight.notes.json``; what was thrown away is in the folder
-``trash``, until that is emptied. Nothing here overwrites a file.
+Notes on ``flight.mcap`` are kept beside it in ``flight.notes.json``; deleted recordings go to the folder ``trash``
+until it is emptied. Nothing here overwrites a file.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from skyloop.recording.reader import ENDING
 TRASH: Final = "trash"
 NOTES_ENDING: Final = ".notes.json"
 MAX_NAME: Final = 100  #: characters
-MAX_NAME_BYTES: Final = 200  #: file systems take 255, with what is put before and after a name
+MAX_NAME_BYTES: Final = 200  #: file systems allow 255, including prefixes and suffixes
 MAX_TEXT: Final = 4000  #: characters of a note
 MAX_MARK: Final = 200  #: characters of a mark
 MAX_MARKS: Final = 200  #: of a recording
 MAX_AT_S: Final = 1e6
-_MOST_BYTES: Final = 1 << 20  #: of a file of notes
-_NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and what other systems don't take
+_MOST_BYTES: Final = 1 << 20  #: of a notes file
+_NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and characters forbidden on other systems
 
 
 class Mark(msgspec.Struct, frozen=True):
-    """A place in a recording to come back to."""
+    """A marked position in a recording."""
 
     at_s: float  #: position in the recording, as ``replay.position_s``
     text: str = ""
@@ -48,20 +48,20 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def check_name(text: str) -> str:
-    """Return the name of a recording's file as a person gave it, with its ending.
+    """Return the file name, with its suffix, for a recording's name typed by a person.
 
     Raises:
-        UsageError: It can't be a name here, with the reason.
+        UsageError: It is not a valid name; with the reason.
     """
     name = unicodedata.normalize("NFC", text).strip()
     name = name.removesuffix(ENDING).rstrip()
     for character in name:
         if character in _NOT_IN_NAMES:
-            raise UsageError(f"a name can't have {character!r} in it: letters, digits, spaces and -_.,()+ are fine")
+            raise UsageError(f"a name can't contain {character!r}: letters, digits, spaces and -_.,()+ are fine")
         if unicodedata.category(character)[0] == "C":
-            raise UsageError(f"a name can't have the character U+{ord(character):04X} in it, which is not visible")
+            raise UsageError(f"a name can't contain the invisible character U+{ord(character):04X}")
     if not name:
-        raise UsageError("a name is needed")
+        raise UsageError("the name is empty")
     if name[0] in ".-":
         raise UsageError(f"a name can't begin with {name[0]!r}")
     if len(name) > MAX_NAME or len(name.encode()) > MAX_NAME_BYTES:
@@ -70,27 +70,27 @@ def check_name(text: str) -> str:
 
 
 def notes_path(path: Path) -> Path:
-    """Return where the notes of a recording are."""
+    """Return the path of a recording's notes."""
     return path.with_name(path.name.removesuffix(ENDING) + NOTES_ENDING)
 
 
 def read_notes(path: Path) -> Notes:
-    """Return what was written about a recording.
+    """Return the notes of a recording.
 
     Raises:
-        FileFormatError: The file of notes can't be read.
+        FileFormatError: The notes file can't be read.
     """
     if not notes_path(path).exists():
         return Notes()
-    return files.read_json(notes_path(path), Notes, "notes about a recording", _MOST_BYTES)
+    return files.read_json(notes_path(path), Notes, "notes of a recording", _MOST_BYTES)
 
 
 def write_text(path: Path, text: str) -> Notes:
     """Write the note of a recording; an empty one is removed.
 
     Raises:
-        UsageError: It is too long, or can't be written.
-        FileFormatError: The present file of notes can't be read: it is not overwritten.
+        UsageError: It is too long or can't be written.
+        FileFormatError: The present notes file can't be read, so it is not overwritten.
     """
     if len(text) > MAX_TEXT:
         raise UsageError(f"a note has at most {MAX_TEXT} characters, not {len(text)}")
@@ -101,15 +101,15 @@ def add_mark(path: Path, at_s: float, text: str) -> Notes:
     """Add a mark to a recording.
 
     Raises:
-        UsageError: It is nowhere, or too long, or one too many.
-        FileFormatError: As :func:`write_text`.
+        UsageError: The position is invalid, the text too long, or there are too many marks.
+        FileFormatError: As for :func:`write_text`.
     """
     if not (math.isfinite(at_s) and 0.0 <= at_s <= MAX_AT_S):
         raise UsageError(f"a mark is at 0 to {MAX_AT_S:g} s of the recording, not at {at_s!r}")
     check_mark(text)
     notes = read_notes(path)
     if len(notes.marks) >= MAX_MARKS:
-        raise UsageError(f"this recording has {MAX_MARKS} marks, which is all that it can have: remove one first")
+        raise UsageError(f"this recording already has {MAX_MARKS} marks, the maximum: remove one first")
     marks = sorted((*notes.marks, Mark(round(at_s, 3), text.strip())), key=lambda mark: mark.at_s)
     return _write(path, msgspec.structs.replace(notes, marks=tuple(marks)))
 
@@ -119,7 +119,7 @@ def remove_mark(path: Path, mark: Mark) -> Notes:
 
     Raises:
         UnknownNameError: It has no such mark.
-        FileFormatError: As :func:`write_text`.
+        FileFormatError: As for :func:`write_text`.
     """
     notes = read_notes(path)
     if mark not in notes.marks:
@@ -140,14 +140,14 @@ def check_mark(text: str) -> None:
 
 
 def rename(path: Path, name: str) -> str:
-    """Rename a recording, and its notes.
+    """Rename a recording and its notes.
 
     Returns:
         The new name.
 
     Raises:
-        UsageError: It can't be a name here, or the file can't be moved.
-        RefusedError: There is a file of that name.
+        UsageError: The name is invalid, or the file can't be moved.
+        RefusedError: A file of that name exists.
     """
     target = path.with_name(check_name(name))
     if target != path:
@@ -156,10 +156,10 @@ def rename(path: Path, name: str) -> str:
 
 
 def throw_away(path: Path) -> str:
-    """Move a recording, and its notes, to the trash.
+    """Move a recording and its notes to the trash.
 
     Returns:
-        Its name there, which has a number if another one of its name is there.
+        Its name there, with a number if that name was taken.
 
     Raises:
         UsageError: It can't be moved.
@@ -168,20 +168,20 @@ def throw_away(path: Path) -> str:
     try:
         trash.mkdir(exist_ok=True)
     except OSError as error:
-        raise UsageError(f"the folder {trash} can't be made: {error.strerror}") from None
+        raise UsageError(f"the folder {trash} can't be created: {error.strerror}") from None
     for target in _numbered(trash / path.name):
         if not target.exists() and not notes_path(target).exists():
             _move(path, target)
             return target.name
-    raise AssertionError("there are endless numbers")
+    raise AssertionError("unreachable: numbers don't run out")
 
 
 def bring_back(folder: Path, name: str) -> str:
-    """Move a recording, and its notes, from the trash back into the folder.
+    """Move a recording and its notes from the trash back into the folder.
 
     Raises:
         UnknownNameError: It is not in the trash.
-        RefusedError: There is a file of that name in the folder.
+        RefusedError: A file of that name exists in the folder.
         UsageError: It can't be moved.
     """
     thrown = {path.name: path for path in _recordings(folder / TRASH)}
@@ -192,7 +192,7 @@ def bring_back(folder: Path, name: str) -> str:
 
 
 def trash_of(folder: Path) -> dict[str, int]:
-    """Return how many recordings are in the trash, and how many bytes they take."""
+    """Return the number of recordings in the trash and their bytes."""
     sizes = []
     for path in _recordings(folder / TRASH):
         with suppress(OSError):
@@ -201,7 +201,7 @@ def trash_of(folder: Path) -> dict[str, int]:
 
 
 def empty_trash(folder: Path) -> None:
-    """Delete what is in the trash, for good.
+    """Delete everything in the trash for good.
 
     Raises:
         UsageError: A file can't be deleted.
@@ -236,16 +236,16 @@ def _write(path: Path, notes: Notes) -> Notes:
 
 
 def _move(path: Path, target: Path) -> None:
-    """Move a recording and its notes, and overwrite nothing."""
+    """Move a recording and its notes without overwriting anything."""
     if notes_path(target).exists():
-        raise RefusedError(f"there are notes of a recording {target.name} already", code=Refusal.BUSY)
+        raise RefusedError(f"notes for {target.name} already exist", code=Refusal.BUSY)
     try:
         _move_one(path, target)
         if notes_path(path).exists():
             _move_one(notes_path(path), notes_path(target))
     except FileExistsError:
         raise RefusedError(
-            f"there is a recording {target.name} already: choose another name", code=Refusal.BUSY
+            f"a recording {target.name} already exists: choose another name", code=Refusal.BUSY
         ) from None
     except OSError as error:
         raise UsageError(f"{path.name} can't be moved: {error.strerror}") from None
@@ -253,7 +253,7 @@ def _move(path: Path, target: Path) -> None:
 
 def _move_one(path: Path, target: Path) -> None:
     try:
-        os.link(path, target, follow_symlinks=False)  # unlike a renaming this never overwrites
+        os.link(path, target, follow_symlinks=False)  # unlike a rename, this never overwrites
     except FileExistsError:
         raise
     except OSError:  # a file system without hard links

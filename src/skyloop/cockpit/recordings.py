@@ -1,8 +1,8 @@
-"""Recordings from the page: started, stopped, listed, reported on and played again.
+"""Recordings on the page: start, stop, list, report and replay them.
 
-Each is done by a process of its own, and nothing of it on the event loop: the recorder is a child that the flight does
-not feel, so is the process that makes a report, and a replay is a private proxy. All of them end with this process,
-however that ends; the number of each is bounded, and they are started one by one.
+Each runs in its own process, and nothing blocks the event loop: the recorder is a child that does not disturb the
+flight, as is the process that makes a report, and a replay is a private proxy. All of them end with this process,
+however it ends; the number of each is bounded, and they start one at a time.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.recording import Status
 
-REPLAY_S: Final = 60.0  #: for the proxy of a replay to answer: on a busy computer it takes long, and the page says so
+REPLAY_S: Final = 60.0  #: for the proxy of a replay to answer: slow on a busy computer, as the page explains
 
 
 class Recorder(Protocol):
-    """What records; :class:`skyloop.recording.Recorder` is one."""
+    """A recorder, such as :class:`skyloop.recording.Recorder`."""
 
     @property
     def status(self) -> Status: ...
@@ -42,14 +42,14 @@ class Recorder(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """A recording that goes on."""
+    """A recording in progress."""
 
     drones: tuple[str, ...]
     recorder: Recorder
 
 
 def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
-    """Record proxies to a new file of a folder.
+    """Record proxies to a new file in a folder.
 
     Raises:
         SkyloopError: It can't start.
@@ -64,7 +64,7 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
 
     Args:
         path: The file.
-        drone: Which of the recorded ones; None for the first.
+        drone: The recorded drone to play; None for the first.
 
     Raises:
         SkyloopError: It can't start.
@@ -83,15 +83,15 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A recording that is played again."""
+    """A running replay."""
 
-    drone: Drone  #: the observer that keeps its proxy running
+    drone: Drone  #: the observer whose connection keeps its proxy running
     path: Path
     recorded: str | None  #: the drone's name in the recording; None: the first
 
 
 def progress(status: Status) -> dict[str, Any]:
-    """Return how far a recording is, as JSON values."""
+    """Return the progress of a recording, as JSON values."""
     return {
         "path": status.path,
         "state": str(status.state),
@@ -106,16 +106,16 @@ def progress(status: Status) -> dict[str, Any]:
 Json = dict[str, Any]
 T = TypeVar("T")
 
-MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays: each is a process
+MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays; each is a process
 MOST_LISTED: Final = 500
 NOTE_SHOWN: Final = 200  #: characters of a note in the list
 
 
 class Recordings:
-    """The recordings of one folder. On the event loop.
+    """The recordings in one folder. On the event loop.
 
     Args:
-        folder: Made when it is needed.
+        folder: Created when needed.
         record: Starts a recorder; called on a thread.
         replay: Starts a replay; called on a thread.
     """
@@ -132,16 +132,16 @@ class Recordings:
         self._replay = replay
         self.reports = Reports()
         self._timelines = Reports(timeline_command, "time line")
-        self._made: dict[tuple[Path, float, str | None], str] = {}  # time lines, the newest last
+        self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, the newest last
         self._changing = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._looking = asyncio.Lock()
         self._running: dict[str, Running] = {}
         self._numbers = itertools.count(1)
-        self._known: dict[tuple[Path, int, int], Described] = {}  # what is in a file, by its name, size and time
+        self._known: dict[tuple[Path, int, int], Described] = {}  # descriptions of files, by name, size and time
 
     def drones(self) -> set[str]:
-        """Return the names of the drones that are being recorded."""
+        """Return the names of the drones being recorded."""
         return {name for running in self._running.values() for name in running.drones}
 
     async def start(self, drones: Sequence[str]) -> Json:
@@ -154,12 +154,12 @@ class Recordings:
             The recording, as JSON values.
 
         Raises:
-            UsageError: No drone is named, or the folder can't be made.
-            RefusedError: :data:`MAX_CHILDREN` recordings run already.
+            UsageError: No drone is named, or the folder can't be created.
+            RefusedError: :data:`MAX_CHILDREN` recordings are already running.
             SkyloopError: The recorder can't start.
         """
         if not drones:
-            raise UsageError("no drone to record: name one at least")
+            raise UsageError("no drone to record: name at least one")
 
         def start() -> Recorder:
             self._make_folder()
@@ -173,13 +173,13 @@ class Recordings:
             return self._entry(number)
 
     async def stop(self, number: str) -> Json:
-        """Stop a recording, and wait until its file is closed.
+        """Stop a recording and wait until its file is closed.
 
         Returns:
             The recording, as JSON values.
 
         Raises:
-            UnknownNameError: No such recording runs.
+            UnknownNameError: No such recording is running.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -189,19 +189,19 @@ class Recordings:
         return {**entry, **progress(running.recorder.status)}
 
     async def listing(self) -> Json:
-        """Return the running recordings, and those in the folder, the newest first."""
+        """Return the running recordings and those in the folder, the newest first."""
         running = [self._entry(number) for number in self._running]
-        async with self._looking:  # many who ask at one time cost as much as one
+        async with self._looking:  # simultaneous requests cost as much as one
             past = await asyncio.to_thread(self._past)
             trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
         return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
 
     def mark(self, number: str, text: str) -> tuple[str, ...]:
-        """Check a mark for a running recording, and return the drones that it is for.
+        """Check a mark for a running recording, and return the drones it applies to.
 
         Raises:
-            UnknownNameError: No such recording runs.
-            UsageError: It is too long.
+            UnknownNameError: No such recording is running.
+            UsageError: The text is too long.
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
@@ -211,7 +211,7 @@ class Recordings:
     # Files -----------------------------------------------------------------------------------------------------
 
     async def path(self, name: str) -> Path:
-        """Return where a recording is.
+        """Return the path of a recording.
 
         Raises:
             UnknownNameError: There is no such file, or it is being recorded.
@@ -219,47 +219,47 @@ class Recordings:
         return await asyncio.to_thread(self._path, name)
 
     async def move(self, name: str, change: Callable[[Path], str]) -> str:
-        """Rename a recording that nobody here writes or plays, or throw it away; return its name then.
+        """Rename or delete a recording that is neither being written nor replayed; return its new name.
 
         Raises:
             UnknownNameError: There is no such file.
-            RefusedError: It is in use, or ``change`` refuses it.
+            RefusedError: It is in use, or ``change`` refuses.
         """
         async with self._starting, self._changing:
             for running in self._running.values():
                 if name in (Path(file).name for file in running.recorder.status.files):
-                    raise RefusedError(f"{name} is being recorded: stop that first", code=Refusal.BUSY)
+                    raise RefusedError(f"{name} is being recorded: stop the recording first", code=Refusal.BUSY)
             path = (await self.path(name)).absolute()
             for played, replay in self.replays.items():
                 if replay.path == path:
-                    raise RefusedError(f"{name} is being replayed as {played}: end that first", code=Refusal.BUSY)
+                    raise RefusedError(f"{name} is being replayed as {played}: end the replay first", code=Refusal.BUSY)
             return await asyncio.to_thread(change, path)
 
     async def annotate(self, name: str, write: Callable[[Path], Notes]) -> Notes:
-        """Change what people wrote about a recording; :class:`UnknownNameError` if there is no such file."""
+        """Change the notes of a recording; :class:`UnknownNameError` if there is no such file."""
         async with self._changing:
             return await asyncio.to_thread(write, await self.path(name))
 
     async def in_trash(self, work: Callable[[Path], T]) -> T:
-        """Bring something back from the trash of the folder, or empty it."""
+        """Restore something from the folder's trash, or empty it."""
         async with self._changing:
             return await asyncio.to_thread(work, self.folder)
 
     # Replays ---------------------------------------------------------------------------------------------------
 
     async def replay(self, name: str, recorded: str | None = None) -> str:
-        """Play a recording again.
+        """Replay a recording.
 
         Args:
-            name: The file's, in the folder.
-            recorded: Which of the recorded drones; None for the first.
+            name: The file's name in the folder.
+            recorded: The recorded drone to play; None for the first.
 
         Returns:
             The name of the proxy.
 
         Raises:
             UnknownNameError: There is no such file.
-            RefusedError: :data:`MAX_CHILDREN` replays run already.
+            RefusedError: :data:`MAX_CHILDREN` replays are already running.
             SkyloopError: The replay can't start.
         """
         path = (await self.path(name)).absolute()
@@ -270,14 +270,14 @@ class Recordings:
             return drone.name
 
     async def replayed(self, name: str) -> Json:
-        """Return what a replay's bar shows of its recording.
+        """Return the recording's data for a replay bar.
 
         Returns:
-            The file's name, what :func:`skyloop.cockpit.reports.timeline` returns, and the notes, as JSON values.
+            The file's name, the result of :func:`skyloop.cockpit.reports.timeline`, and the notes, as JSON values.
 
         Raises:
             UnknownNameError: No such replay was started here.
-            SkyloopError: What :meth:`skyloop.cockpit.reports.Reports.make` raises.
+            SkyloopError: Any error of :meth:`skyloop.cockpit.reports.Reports.make`.
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
@@ -293,7 +293,7 @@ class Recordings:
         """End a replay.
 
         Raises:
-            UnknownNameError: No such replay runs.
+            UnknownNameError: No such replay is running.
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
@@ -319,7 +319,7 @@ class Recordings:
         return known[name]
 
     def _files(self) -> list[Path]:
-        """Return the recordings in the folder that nobody here is writing."""
+        """Return the recordings in the folder, except those being written here."""
         written = {
             Path(file).name for running in list(self._running.values()) for file in running.recorder.status.files
         }
@@ -345,11 +345,11 @@ class Recordings:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"the folder of recordings {self.folder} can't be made: {error.strerror}") from None
+            raise UsageError(f"the folder of recordings {self.folder} can't be created: {error.strerror}") from None
 
 
 def _noted(path: Path) -> Json:
-    """Return the beginning of what people wrote about a recording, for its row."""
+    """Return the beginning of a recording's notes, for its row."""
     try:
         notes = recording_files.read_notes(path)
     except FileFormatError as error:
@@ -359,4 +359,4 @@ def _noted(path: Path) -> Json:
 
 def _check_number(what: str, end: str, running: int) -> None:
     if running >= MAX_CHILDREN:
-        raise RefusedError(f"{running} {what}, which is all that may at one time: {end} one first", code=Refusal.BUSY)
+        raise RefusedError(f"{running} {what}, the maximum at one time: {end} one first", code=Refusal.BUSY)

@@ -1,4 +1,4 @@
-"""Requests about recordings and replays: observers read, watch and download, pilots change."""
+"""Requests about recordings and replays: observers read, watch and download, pilots also change."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
     from skyloop.cockpit.station import Station
 
-#: A report is a page of its own, with its script in it: it runs without this page's rights.
+#: A report is a complete page with an inline script: it runs without this page's rights.
 _REPORT_POLICY: Final = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-#: Parameters of a replay, as ``docs/replay.md`` lists them. The driver itself is imported only where a replay runs.
+#: Parameters of a replay, as listed in ``docs/replay.md``. The driver itself is imported only where a replay runs.
 PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
-_MOST_CHARACTERS: Final = 16_384  #: of any text in a request; what it is for has its own limit, and says so
+_MOST_CHARACTERS: Final = 16_384  #: of any text in a request; its use has a lower limit and reports it
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
 
@@ -96,7 +96,7 @@ class RecordingsApi:
 
     @answered
     async def recordings(self, _: Request) -> Response:
-        """Answer with the recordings, running and past."""
+        """Answer with the running and finished recordings."""
         return answer_json(await self._recordings.listing())
 
     @answered
@@ -115,7 +115,7 @@ class RecordingsApi:
 
     @answered
     async def mark(self, request: Request) -> Response:
-        """Put a mark into a running recording: a log entry of each of its drones."""
+        """Add a mark to a running recording: a log entry for each of its drones."""
         text = (await body_of(request, _Words)).text
         drones = self._recordings.mark(request.path_params["number"], text)
         for name in drones:
@@ -127,7 +127,7 @@ class RecordingsApi:
 
     @answered
     async def file(self, request: Request) -> Response:
-        """Answer with a recording's file, or the range of it that is asked for."""
+        """Answer with a recording's file, or the requested range of it."""
         path = await self._recordings.path(request.path_params["name"])
         return FileResponse(path, filename=path.name, media_type="application/octet-stream")
 
@@ -140,7 +140,7 @@ class RecordingsApi:
 
     @answered
     async def notes(self, request: Request) -> Response:
-        """Answer with what people wrote about a recording."""
+        """Answer with the notes of a recording."""
         path = await self._recordings.path(request.path_params["name"])
         return answer_json(await asyncio.to_thread(recording_files.read_notes, path))
 
@@ -179,7 +179,7 @@ class RecordingsApi:
 
     @answered
     async def restore(self, request: Request) -> Response:
-        """Bring a recording back from the trash."""
+        """Restore a recording from the trash."""
         check_json(request)
         name = request.path_params["name"]
         back = await self._recordings.in_trash(lambda folder: recording_files.bring_back(folder, name))
@@ -187,7 +187,7 @@ class RecordingsApi:
 
     @answered
     async def empty_trash(self, request: Request) -> Response:
-        """Delete what is in the trash."""
+        """Empty the trash."""
         check_json(request)
         await self._recordings.in_trash(recording_files.empty_trash)
         return answer_json({})
@@ -196,30 +196,30 @@ class RecordingsApi:
 
     @answered
     async def replay(self, request: Request) -> Response:
-        """Play a recording again."""
+        """Replay a recording."""
         wanted = await body_of(request, _Replay)
         name = await self._recordings.replay(request.path_params["name"], wanted.drone)
         self._fleet.want(name)
-        await self._fleet.look()
+        await self._fleet.search()
         return answer_json({"drone": name}, 201)
 
     @answered
     async def replayed(self, request: Request) -> Response:
-        """Answer with what is known of the recording that a replay plays."""
+        """Answer with the timeline and notes of a replay's recording."""
         return answer_json(await while_wanted(request, self._recordings.replayed(request.path_params["name"])))
 
     @answered
     async def play(self, request: Request) -> Response:
-        """Pause a replay, let it go on, move it, change its speed. The answer comes when the replay has been told."""
+        """Pause, resume or move a replay, or change its speed; answer once the replay has accepted that."""
         wanted = await body_of(request, _Playback)
         name = request.path_params["name"]
         station = self._station(name)
         if not station.drone.uri.startswith("replay:"):
-            raise UsageError(f"{name} is no replay: it can't be paused or moved")
+            raise UsageError(f"{name} is not a replay: it can't be paused or moved")
         values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
-        # Held before it is moved, moved before it goes on: or it would play where it was, or is not to begin.
+        # Pause before moving, and move before resuming: otherwise it would play on from the old position.
         values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
-        pilot = await station.stopper()  # a pilot's connection without the authority, which this does not need
+        pilot = await station.stopper()  # a pilot's connection; this needs no authority
         for parameter, value in values.items():
             if value is not None:
                 await asyncio.to_thread(pilot.config.__setitem__, parameter, value)

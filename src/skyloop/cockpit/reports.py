@@ -1,9 +1,9 @@
-"""Reports on recordings: one at a time, by a child process that ends with who wanted it, and with this process.
+"""Reports on recordings: one at a time, in a child process that ends with its request and with this process.
 
-A report keeps a core busy for seconds, and everybody who may watch may ask for one. So requests wait in a short queue,
-and are refused when it is full; if who asked goes away, the request leaves the queue, or the work ends.
+A report keeps a core busy for seconds, and every observer may request one. Requests therefore wait in a short queue,
+and are refused when it is full; if the client disconnects, its request leaves the queue or its child ends.
 
-What a replay's bar shows, a *timeline*, is made in the same way: events and marks, and how the flight went, thinned.
+A *timeline*, the data of a replay bar, is made in the same way: events, marks and the thinned course of the flight.
 
 ``python -m skyloop.cockpit.reports report|timeline FILE TARGET [DRONE]`` is the child.
 """
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 REPORT: Final = "report"
 TIMELINE: Final = "timeline"
-REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
-MAX_WAITING: Final = 4  #: who comes later would wait for minutes
-NICENESS: Final = 10  #: of the child: pages and flights come before reports
-_TAKEN: Final = 4096  # bytes of what a child complains about
+REPORT_S: Final = 120.0  #: time limit for one report
+MAX_WAITING: Final = 4  #: requests; a longer queue would take minutes
+NICENESS: Final = 10  #: of the child: pages and flights have priority over reports
+_TAKEN: Final = 4096  # bytes kept of a child's error output
 
-#: What is run for a report of FILE, to be written to TARGET, of DRONE if one is named.
+#: Returns the command that reports on FILE, writing to TARGET, for DRONE if one is named.
 Command = Callable[[Path, Path, str | None], Sequence[str]]
 
 
@@ -49,7 +49,7 @@ def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
 
 
 def timeline_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the same for what :func:`timeline` returns, as JSON."""
+    """Return the command of the child that writes the result of :func:`timeline` as JSON."""
     return _child(TIMELINE, file, target, drone)
 
 
@@ -59,37 +59,37 @@ def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[s
 
 
 class Reports:
-    """Makes reports, or whatever else a child makes of a recording. On the event loop.
+    """Makes reports, or any other product of a recording, in a child process. On the event loop.
 
     Args:
-        command: Makes the command line of a child, in place of :func:`child_command`.
-        what: Is made, for error messages.
+        command: Returns a child's command line; by default :func:`child_command`.
+        what: The name of the product, for error messages.
     """
 
     def __init__(self, command: Command | None = None, what: str = "report") -> None:
         self._command = command or child_command
         self._what = what
         self._turn = asyncio.Lock()
-        self._wanted = 0  # being made, or waited for
+        self._wanted = 0  # reports in progress or queued
 
     async def make(self, file: Path, drone: str | None = None) -> str:
-        """Make a report; cancelled, it leaves nothing behind.
+        """Make a report; if cancelled, it leaves nothing behind.
 
         Args:
             file: The recording.
-            drone: Which of the recorded ones; None for the only one.
+            drone: The recorded drone; None for the only one.
 
         Returns:
-            What the child made: the page that ``skyloop log report`` makes.
+            The child's output: a page as made by ``skyloop log report``.
 
         Raises:
-            RefusedError: Too many requests wait already.
-            UsageError: The child failed; with its message.
-            LinkError: It takes more than :data:`REPORT_S`.
+            RefusedError: The queue is full.
+            UsageError: The child failed; includes its message.
+            LinkError: It took longer than :data:`REPORT_S`.
         """
         if self._wanted > MAX_WAITING:
             raise RefusedError(
-                f"a {self._what} is being made and {self._wanted - 1} wait, which is all that may: try again later",
+                f"a {self._what} is being made and {self._wanted - 1} are waiting, the maximum: try again later",
                 code=Refusal.BUSY,
             )
         self._wanted += 1
@@ -104,7 +104,7 @@ class Reports:
             target = Path(folder) / "report.html"
             child = await asyncio.create_subprocess_exec(
                 *self._command(file.absolute(), target, drone),
-                stdin=asyncio.subprocess.PIPE,  # which ends when this process does
+                stdin=asyncio.subprocess.PIPE,  # closes when this process ends
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=asyncio.subprocess.PIPE,
             )
@@ -116,7 +116,7 @@ class Reports:
                         pass
                     await child.wait()
             except TimeoutError:
-                raise LinkError(f"the {self._what} of {file.name} was not made within {REPORT_S:g} s") from None
+                raise LinkError(f"the {self._what} of {file.name} took longer than {REPORT_S:g} s") from None
             finally:
                 if child.returncode is None:
                     child.kill()
@@ -128,10 +128,10 @@ class Reports:
 
 
 def run_child(arguments: Sequence[str]) -> int:
-    """Make a file of a recording, unless standard input ends before: then who wanted it is gone.
+    """Write a report or timeline, unless standard input closes first: then the requester is gone.
 
     Args:
-        arguments: ``report`` or ``timeline``, FILE TARGET [DRONE], of the command line.
+        arguments: ``report`` or ``timeline``, FILE TARGET [DRONE], from the command line.
 
     Returns:
         The exit code: 0, or 2 with a line of explanation.
@@ -157,19 +157,19 @@ def _report(recording: Recording, drone: str, target: Path) -> None:
     write_report(recording, drone, target, pictures=8)
 
 
-MARK: Final = "mark"  #: name of a logged text that is a mark
-MAX_EVENTS: Final = 300  #: the most severe ones
+MARK: Final = "mark"  #: log name of a mark
+MAX_EVENTS: Final = 300  #: the most severe are kept
 MAX_MARKS: Final = 300
 MAX_SAMPLES: Final = 1200
-PERIOD_S: Final = 0.1  #: between samples, at least
+PERIOD_S: Final = 0.1  #: minimum time between samples
 MAX_TEXT: Final = 200
 _SEVERITIES: Final = (Severity.ERROR, Severity.WARNING)
-#: Events that tell nothing about the flight.
+#: Events that say nothing about the flight.
 _LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})
 
 
 def timeline(recording: Recording, drone: str) -> dict[str, Any]:
-    """Return what happened in a recording, with positions as ``replay.position_s``, as JSON values.
+    """Return the events and course of a recording as JSON values, with positions as in ``replay.position_s``.
 
     Args:
         recording: The recording.
@@ -185,7 +185,7 @@ def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     channels = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.LOGS)
     for item in recording.items(drone, channels):
         if isinstance(item.value, LogEntry) and course.first_ns is None:
-            continue  # replays don't play logs: they begin with another sample
+            continue  # replays don't play logs, so a replay does not begin with one
         at_s = round(seconds(course.follow(item.value, item.entry.log_ns) - (course.first_ns or 0)), 3)
         value = item.value
         if isinstance(value, Event) and value.kind not in _LEFT_OUT:

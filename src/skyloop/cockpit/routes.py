@@ -1,4 +1,4 @@
-"""Routes of the page: files in one folder, and those that were checked and may be flown."""
+"""Routes of the page: files in one folder, and checked routes that are ready to fly."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ Json = dict[str, Any]
 
 
 class RouteFiles:
-    """The routes of one folder, ``NAME.route.json`` each. Its methods read and write files: call them on a thread.
+    """The routes in one folder, ``NAME.route.json`` each. Its methods read and write files: call them on a thread.
 
     Args:
-        folder: Made when it is needed.
+        folder: Created when needed.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def listing(self) -> Json:
-        """Return the routes as JSON values, by name; a file that is none has a problem."""
+        """Return the routes as JSON values, by name; an unreadable file has a problem instead."""
         files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
         return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
 
@@ -39,8 +39,8 @@ class RouteFiles:
         """Read a route.
 
         Raises:
-            UnknownNameError: There is none of that name.
-            SkyloopError: It can't be read.
+            UnknownNameError: There is no route of that name.
+            SkyloopError: The file can't be read.
         """
         path = self._path(name)
         if not path.is_file():
@@ -48,11 +48,11 @@ class RouteFiles:
         return load_route(path)
 
     def save(self, name: str, route: Route) -> None:
-        """Write a route; one that is there is replaced.
+        """Write a route, replacing one of the same name.
 
         Raises:
-            UsageError: The name can't be one, or it can't be written.
-            RefusedError: There are :data:`MOST_FILES` already.
+            UsageError: The name is invalid, or the file can't be written.
+            RefusedError: There are already :data:`MOST_FILES` routes.
         """
         path = self._path(name)
         if not path.exists() and len(self._files()) >= MOST_FILES:
@@ -60,15 +60,15 @@ class RouteFiles:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise UsageError(f"{self.folder} can't be made: {error.strerror or error}") from None
+            raise UsageError(f"{self.folder} can't be created: {error.strerror or error}") from None
         save_route(msgspec.structs.replace(route, name=name), path)
 
     def delete(self, name: str) -> None:
         """Delete a route.
 
         Raises:
-            UnknownNameError: There is none of that name.
-            UsageError: The name can't be one, or the file can't be deleted.
+            UnknownNameError: There is no route of that name.
+            UsageError: The name is invalid, or the file can't be deleted.
         """
         path = self._path(name)
         try:
@@ -83,7 +83,7 @@ class RouteFiles:
 
     def _path(self, name: str) -> Path:
         if not _NAME.fullmatch(name):
-            raise UsageError(f"{name!r:.60} is no name of a route: up to 48 letters, digits, spaces and _ . -")
+            raise UsageError(f"{name!r:.60} is not a valid route name: up to 48 letters, digits, spaces and _ . -")
         return self.folder / f"{name}{ENDING}"
 
     def _entry(self, path: Path) -> Json:
@@ -95,13 +95,13 @@ class RouteFiles:
 
 
 class CheckedRoutes:
-    """The routes of one drone that were checked last, by a number of their content: what is flown was checked."""
+    """The last checked routes of one drone, by a hash of their content, so that only checked routes are flown."""
 
     def __init__(self) -> None:
         self._routes: OrderedDict[str, Route] = OrderedDict()
 
     def add(self, route: Route, check: RouteCheck) -> Json:
-        """Keep a route, and return what was found as JSON values, with the ``id`` by which it is flown."""
+        """Keep a route, and return the check's findings as JSON values, with the ``id`` to fly it by."""
         number = hashlib.sha256(checked(route).to_json()).hexdigest()[:16]
         self._routes[number] = route
         self._routes.move_to_end(number)
@@ -113,8 +113,8 @@ class CheckedRoutes:
         """Return a route.
 
         Raises:
-            RefusedError: It was not checked, or too many others were since.
+            RefusedError: It was not checked, or too many others have been since.
         """
         if number not in self._routes:
-            raise RefusedError("this route was not checked, or long ago: check it again")
+            raise RefusedError("this route was not checked recently: check it again")
         return self._routes[number]

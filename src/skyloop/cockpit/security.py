@@ -1,13 +1,13 @@
-"""Which requests are answered: from whose page, and by whom. Every route passes here.
+"""Decides which requests are answered, by the page they come from and the person who sent them. Guards every route.
 
-A page from elsewhere can make a browser send requests here. Three things stop it: the ``Host`` header must be this
-server's own (or a foreign name was made to point at it: DNS rebinding); the ``Origin``, which browsers add to every
-WebSocket and to every request that changes something, and which pages can't forge, must be this page's (for a link,
-which has none, ``Sec-Fetch-Site`` shows where it stood: it may lead to the page, and to nothing else); and the
-page may load nothing but its own files and can't be framed (Content-Security-Policy).
+A page from elsewhere can make a browser send requests here. Three checks stop it: the ``Host`` header must be this
+server's own (otherwise a foreign name was pointed at it: DNS rebinding); the ``Origin``, which browsers add to every
+WebSocket and to every request that changes something, and which pages can't forge, must be this page's (a link has
+none; there ``Sec-Fetch-Site`` shows its origin: it may lead to the page and nowhere else); and the page may load only
+its own files and can't be framed (Content-Security-Policy).
 
-Then the person's role decides (:mod:`skyloop.cockpit.access`). What a route needs is decided here for all of them: by
-default a route needs an observer, and one that changes something a pilot.
+Then the person's role decides (:mod:`skyloop.cockpit.access`). This module sets the role for every route: by default
+an observer's, and a pilot's for routes that change something.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from skyloop.cockpit.access import Gate, Person, TokenGate, has_token
 from skyloop.errors import UsageError
 from skyloop.messages import Role
 
-LOG_IN: Final = 4401  #: close code of a WebSocket: nobody known, log in
-NOT_ALLOWED: Final = 4403  #: close code: this needs a pilot
-ADMIT: Final = "admit"  #: in the connection's state: called with the person, it returns why there is no place
-_FOREIGN: Final = 1008  # close code: another page
-_LATER: Final = 1013  # close code: no place now
+LOG_IN: Final = 4401  #: close code of a WebSocket: not logged in
+NOT_ALLOWED: Final = 4403  #: close code: only a pilot may do this
+ADMIT: Final = "admit"  #: key in the connection's state; called with the person, returns why there is no place
+_FOREIGN: Final = 1008  # close code: a foreign page
+_LATER: Final = 1013  # close code: no place at present
 
-#: Answered without a role: the page itself, and what is needed to get one.
+#: Answered without a role: the page itself, and the routes for logging in.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout|/api/authority")
 _CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
 _ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")
-_OWN_SITE: Final = {"same-origin", "none"}  # none: the person typed it, or it is a bookmark
+_OWN_SITE: Final = {"same-origin", "none"}  # none: typed by the person, or a bookmark
 _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
 def bind_address(host: str) -> tuple[str, bool]:
-    """Return the address to bind to, and whether it is of this machine's loopback.
+    """Return the address to bind to, and whether it is a loopback address.
 
     Raises:
         UsageError: It is not an address.
@@ -52,7 +52,7 @@ def bind_address(host: str) -> tuple[str, bool]:
         address = ipaddress.ip_address(host.strip("[]"))
     except ValueError:
         raise UsageError(
-            f"host is {host!r} and must be an address to listen on: 127.0.0.1 or ::1 for this machine only, 0.0.0.0 "
+            f"host must be an address to listen on, got {host!r}: 127.0.0.1 or ::1 for this machine only, 0.0.0.0 "
             "or :: for the network"
         ) from None
     return str(address), address.is_loopback
@@ -60,10 +60,10 @@ def bind_address(host: str) -> tuple[str, bool]:
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """What a browser may have in ``Host`` when it really means this server.
+    """The values of ``Host`` that browsers send when they really mean this server.
 
-    ``any_address``: any IP address with the right port too, for a server that listens on all of the machine's: nobody
-    can make an address point elsewhere, as they can a name.
+    ``any_address``: also accept any IP address with the right port, for a server that listens on all of the machine's
+    addresses: unlike a name, an address can't be pointed elsewhere.
     """
 
     exact: frozenset[str]
@@ -89,8 +89,8 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
     """Return the names of a server.
 
     Args:
-        address: Where it listens.
-        port: The same.
+        address: The address it listens on.
+        port: The port it listens on.
         more: Host names by which browsers reach it.
         scheme: ``http`` or ``https``.
     """
@@ -105,15 +105,15 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
 
 
 def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names, path: str = "") -> str:
-    """Return why a request does not come from our page; empty if it may."""
+    """Return why a request can't come from this page; empty if it may."""
     given: dict[str, list[str]] = {"host": [], "origin": [], "sec-fetch-site": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
             given[key].append(value.decode("latin-1").lower())
     if len(given["host"]) != 1 or not names.own(given["host"][0]):
-        return "this server answers to its own address only"
+        return "this server only answers to its own address"
     if not {*given["sec-fetch-site"]} <= _OWN_SITE and not (method in _READING and path == "/"):
-        return "what another page links to, or loads, is refused: open the cockpit's own page"
+        return "links and resources in other pages are refused: open the cockpit's own page"
     if not given["origin"]:
         must = kind == "websocket" or method not in _READING
         return "a WebSocket, or a request that changes something, must have an Origin header" if must else ""
@@ -123,7 +123,7 @@ def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], name
 
 
 def needed(kind: str, method: str, path: str) -> Role | None:
-    """Return the role that a request needs; None if everybody may send it."""
+    """Return the role that a request needs; None if anyone may send it."""
     if kind == "websocket":
         return Role.PILOT if _CONTROL.fullmatch(path) else Role.OBSERVER
     if _PUBLIC.fullmatch(path):
@@ -132,10 +132,10 @@ def needed(kind: str, method: str, path: str) -> Role | None:
 
 
 class Guard:
-    """ASGI middleware: decides which requests are answered, and puts the protecting headers on every answer.
+    """ASGI middleware that decides which requests are answered, and adds the protective headers to every answer.
 
-    It refuses what :func:`foreign` and :func:`needed` say; the others find in ``scope["person"]`` who asks (None: not
-    known).
+    It refuses requests by :func:`foreign` and :func:`needed`; others carry their sender in ``scope["person"]`` (None: a
+    stranger).
     """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
@@ -161,13 +161,13 @@ class Guard:
         reason = admit(person)
         if person is None and isinstance(self._gate, TokenGate) and has_token(scope):
             if not await gone_within(receive, self._gate.wrong_token_s(scope)):
-                await _refuse(kind, _connected, send, 401, LOG_IN, "this token is not known here")
+                await _refuse(kind, _connected, send, 401, LOG_IN, "this token is unknown here")
         elif reason:
             await _refuse(kind, receive, send, 503, _LATER, reason)
         elif role is not None and person is None:
             await _refuse(kind, receive, send, 401, LOG_IN, self._gate.hint)
         elif role is not None and person is not None and not person.may(role):
-            await _refuse(kind, receive, send, 403, NOT_ALLOWED, "this needs a pilot, and you are an observer")
+            await _refuse(kind, receive, send, 403, NOT_ALLOWED, "only a pilot may do this, and you are an observer")
         else:
             scope["person"] = person
             await self._app(scope, receive, send)
@@ -175,7 +175,7 @@ class Guard:
     def _policy(self, scope: Scope) -> str:
         hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
         socket = "wss" if self._names.scheme == "https" else "ws"
-        # What is no host of ours gets no answer that a browser would show.
+        # A host that is not ours gets no answer that a browser would show.
         host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
         connect = f"connect-src 'self' {socket}://{host}; " if host else ""
         return (
@@ -185,20 +185,20 @@ class Guard:
 
 
 def person_of(scope: Scope) -> Person | None:
-    """Return who sent this request, as the guard has found."""
+    """Return who sent this request, as found by the guard."""
     person: Person | None = scope["person"]
     return person
 
 
 async def gone_within(receive: Receive, within_s: float) -> bool:
-    """Wait until who asked is gone.
+    """Wait until the client has disconnected.
 
     Args:
-        receive: Of the request; other messages are dropped.
+        receive: The request's; other messages are dropped.
         within_s: How long to wait [s].
 
     Returns:
-        Whether that happened in time.
+        Whether it did so in time.
     """
     try:
         async with asyncio.timeout(within_s):
@@ -210,12 +210,12 @@ async def gone_within(receive: Receive, within_s: float) -> bool:
 
 
 async def _connected() -> Message:
-    """Return the first message of a WebSocket again: it was received already."""
+    """Return the first message of a WebSocket again: it has already been received."""
     return {"type": "websocket.connect"}
 
 
 def _everybody(_: Person | None) -> str:
-    """Admit everybody, where nobody counts connections."""
+    """Admit everyone, if connections are not counted."""
     return ""
 
 
@@ -226,7 +226,7 @@ async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: in
         await send({"type": "http.response.body", "body": reason.encode()})
         return
     await receive()
-    if code != _FOREIGN:  # our own page gets the reason; a browser hides that of a socket that was not opened
+    if code != _FOREIGN:  # our own page gets the reason; browsers hide it for a socket that never opened
         await send({"type": "websocket.accept"})
     await send({"type": "websocket.close", "code": code, "reason": reason})
 

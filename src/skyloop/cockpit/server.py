@@ -1,4 +1,4 @@
-"""Runs the cockpit: binds its address, finds drones, serves until it is to stop."""
+"""Runs the cockpit: binds its address, finds drones and serves until stopped."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
 
-RECORDINGS = Path("recordings")  #: where recordings go by default
+RECORDINGS = Path("recordings")  #: the default folder for recordings
 _LARGEST_MESSAGE = 4096  # bytes from a page
-_LOOK_S = 0.05  # how often it is asked whether to end
-_PING_S = 10.0  # a connection whose other end does not answer for this long is ended
+_LOOK_S = 0.05  # between checks whether to stop
+_PING_S = 10.0  # a connection without an answer for this long is closed
 
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """Who may come in, and from where. The defaults: this user, on this machine, as a pilot.
+    """The people to admit, and their origin. By default: this user, on this machine, as a pilot.
 
-    ``host``: the address to listen on; one that is not of this machine's loopback needs ``token_file`` or
-    ``client_ca``. ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
-    certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
-    may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates decide it.
-    ``hostnames``: names by which browsers reach this machine, where they don't use its address. ``pair``: lets in, as
-    ``role``, whoever opens the address in the QR code that is shown, which each time works once. ``page_authority``:
-    PEM file of the authority that signed ``tls_cert``, offered to browsers that are to trust it.
+    ``host``: the address to listen on; one beyond loopback needs ``token_file``, ``client_ca`` or ``pair``.
+    ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's certificate and
+    key, for TLS. ``client_ca``: PEM file of the authority that signed the clients' certificates; their OU is the role.
+    ``role``: everyone's role, unless tokens or certificates decide it. ``hostnames``: names by which browsers reach
+    this machine if they don't use its address. ``pair``: admit, as ``role``, the first browser that opens the address
+    in the QR code shown; each code works once. ``page_authority``: PEM file of the authority that signed ``tls_cert``,
+    offered to browsers that should trust it.
 
     Raises:
         UsageError: The options contradict one another.
@@ -74,14 +74,14 @@ class Access:
             raise UsageError("TLS needs both a certificate and its key: --tls-cert FILE and --tls-key FILE")
         if self.page_authority is not None and self.tls_cert is None:
             raise UsageError(
-                "an authority for the page needs the page's certificate: give --tls-cert and --tls-key too"
+                "an authority for the page needs the page's certificate: also give --tls-cert and --tls-key"
             )
         if self.client_ca is not None and self.tls_cert is None:
-            raise UsageError("certificates of clients need TLS: give --tls-cert and --tls-key too")
+            raise UsageError("client certificates need TLS: also give --tls-cert and --tls-key")
         if self.client_ca is not None and self.token_file is not None:
-            raise UsageError("roles come from tokens or from certificates, not from both")
+            raise UsageError("roles come from either tokens or certificates, not both")
         if self.client_ca is not None and self.pair:
-            raise UsageError("a browser is paired, or has a certificate, not both: leave out --pair or --client-ca")
+            raise UsageError("browsers are either paired or have certificates: leave out --pair or --client-ca")
 
     @property
     def scheme(self) -> str:
@@ -101,24 +101,24 @@ def serve_cockpit(
     world: str | Path | None = None,
     metrics: str | None = None,
 ) -> None:
-    """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
+    """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) arrives.
 
     Args:
-        names: The drones to show; none: all that there are, as they come and go.
-        port: The TCP port; 0 takes a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
+        names: The drones to show; none: all, as they come and go.
+        port: The TCP port; 0 selects a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
             free one).
-        access: Who may come in, and from where; by default this user, on this machine, as a pilot.
-        recordings: The folder for recordings, made when it is needed.
-        on_ready: Called once on this thread with the page's address (default: it is printed, and a QR code of it where
-            others reach it and standard output is a terminal).
-        stop: Ends the server when it is set, from any thread.
-        network: Shows drones that can be reached over it, too.
-        world: File (or the name of a shipped one) of what stands around drones that don't know it themselves.
+        access: The people to admit, and their origin; by default this user, on this machine, as a pilot.
+        recordings: The folder for recordings, created when needed.
+        on_ready: Called once on this thread with the page's address (default: print it, with a QR code if others reach
+          it and standard output is a terminal).
+        stop: Stops the server when set, from any thread.
+        network: Also show drones reachable over it.
+        world: File or name of a shipped world: the surroundings of drones that don't report them.
         metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: none.
 
     Raises:
-        UsageError: An address, port or file can't be used.
-        UnknownNameError: There is no proxy of a name in ``names``.
+        UsageError: An address, port or file is invalid.
+        UnknownNameError: No proxy has a name in ``names``.
         MissingExtraError: The extra ``cockpit``, or with ``metrics`` the extra ``metrics``, is not installed.
     """
     try:
@@ -137,7 +137,7 @@ def serve_cockpit(
     if not loopback and access.token_file is None and access.client_ca is None and not access.pair:
         raise UsageError(
             f"{access.host} can be reached by others: give --pair, --token-file, or --tls-cert, --tls-key and "
-            "--client-ca, so that not everybody can watch and fly; or listen on loopback (127.0.0.1) and forward the "
+            "--client-ca, so that not everyone can watch and fly; or listen on loopback (127.0.0.1) and forward the "
             "port over SSH"
         )
     tls = None if access.tls_cert is None else _tls(access)
@@ -157,21 +157,21 @@ def serve_cockpit(
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
-    """Return the same access over https, with a certificate for this machine that is made or renewed where needed.
+    """Return the same access over https, with a certificate for this machine that is made or renewed as needed.
 
     Args:
-        access: Without a certificate.
-        directory: Where certificates and their authority are kept (:mod:`skyloop.network.keys.lab`).
+        access: Has no certificate.
+        directory: Holds certificates and their authority (:mod:`skyloop.network.keys.lab`).
 
     Raises:
-        UsageError: There is a certificate already, the address can't be certified, or a file can't be used.
+        UsageError: There is already a certificate, the address can't be certified, or a file is invalid.
         MissingExtraError: The extra ``network`` is not installed.
     """
     from skyloop.cockpit.security import bind_address
     from skyloop.network.keys.lab import page_certificate
 
     if access.tls_cert is not None:
-        raise UsageError("--https makes a certificate, and --tls-cert names one: give one of them")
+        raise UsageError("--https makes a certificate and --tls-cert names one: give one of them")
     address, loopback = bind_address(access.host)
     own = (
         ["localhost", "127.0.0.1"] if loopback else [*reachable(address), *own_addresses(), *host_names(), "127.0.0.1"]
@@ -179,8 +179,8 @@ def with_certificate(access: Access, directory: Path) -> Access:
     made = page_certificate(directory, own, access.hostnames)
     if made.left_out:
         print(
-            f"cockpit: its certificate is not for {', '.join(made.left_out)}, which is not private: for browsers that "
-            "use it give --tls-cert and --tls-key",
+            f"cockpit: the certificate does not cover {', '.join(made.left_out)}, which is not private: for browsers "
+            "that use it, give --tls-cert and --tls-key",
             file=sys.stderr,
         )
     return replace(access, tls_cert=made.certificate, tls_key=made.key, page_authority=made.authority)
@@ -216,40 +216,40 @@ def _gate(access: Access, port: int) -> Gate:
         return CertificateGate()
     if access.token_file is not None or access.pair:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
-        cookie = f"skyloop-cockpit-{port}"  # browsers don't distinguish cookies by port
+        cookie = f"skyloop-cockpit-{port}"  # browsers don't separate cookies by port
         pairing = Pairing(access.role) if access.pair else None
         return TokenGate(tokens, cookie, pairing=pairing, kept=_session_file(cookie))
     if sys.platform != "linux":
         raise UsageError(
-            f"on {sys.platform} the cockpit can't see whose program connects to it, so it asks for a token: give one "
-            "with --token-file FILE, lines of ROLE TOKEN [NAME]"
+            f"on {sys.platform} the cockpit can't see whose program connects, so it needs a token: give "
+            "--token-file FILE with lines of ROLE TOKEN [NAME]"
         )
     return OpenGate(access.role)
 
 
 def _session_file(cookie: str) -> SessionFile | None:
-    """Where log-ins outlive this process; None where no folder is this user's alone."""
+    """Return the file where sessions outlive this process; None if no folder belongs to this user alone."""
     if sys.platform != "linux":
         return None
     from skyloop.cockpit.sessions import SessionFile
     from skyloop.transport.local.directory import find_directory
 
     folder = find_directory()
-    with suppress(LinkError, OSError):  # then log-ins last as long as this process, which says so
+    with suppress(LinkError, OSError):  # then sessions last as long as this process, which logs that
         folder.create()
     return SessionFile(folder.path / f"{cookie}.sessions")
 
 
 def _tls(access: Access) -> ssl.SSLContext:
-    """Make the server's TLS context.
+    """Create the server's TLS context.
 
     Raises:
-        UsageError: A file can't be used.
+        UsageError: A file is invalid.
     """
     assert access.tls_cert is not None
     for file in filter(None, (access.tls_cert, access.tls_key)):
         if not file.exists():
-            raise UsageError(f"there is no {file}: make certificate and key with openssl, as docs/cockpit.md shows")
+            raise UsageError(f"{file} does not exist: make certificate and key with openssl, as docs/cockpit.md shows")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(access.tls_cert, access.tls_key)
@@ -304,17 +304,17 @@ def _serve(
             endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
             print(endpoint.announcement, file=sys.stderr, flush=True)
         pairing = gate.pairing if isinstance(gate, TokenGate) else None
-        look = _idle if pairing is None else pairing.expire
+        expire_codes = _idle if pairing is None else pairing.expire
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, look))
+        asyncio.run(_run(server, listener, lambda: on_ready(page), stop, expire_codes))
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
-    """Return what makes the HTTP protocol of a connection, for a server that has been started.
+    """Return a factory for the HTTP protocol of connections to a started server.
 
     Args:
         server: The server.
-        admission: Is notified how far each connection has come.
+        admission: Receives the progress of each connection.
         clock: The monotonic clock [ns].
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -325,8 +325,8 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
     class Protocol(H11Protocol):
         """uvicorn's protocol, which also reports to the application and to the admission.
 
-        The application gets the certificate of the other end, which uvicorn keeps to itself; the admission how far a
-        connection has come.
+        The application gets the client's certificate, which uvicorn does not pass on; the admission learns about the
+        progress of the connection.
         """
 
         def __init__(self, connection: Connection) -> None:
@@ -335,7 +335,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            self.client = self.client or (self._connection.address, 0)  # it may be gone already
+            self.client = self.client or (self._connection.address, 0)  # the client may have disconnected
             self._connection.end = transport.abort
             tls = transport.get_extra_info("ssl_object")
             self.app_state = {
@@ -352,9 +352,9 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
 
 def quiet_server(app: Starlette) -> uvicorn.Server:
-    """Make a server for the cockpit that neither listens itself nor handles signals.
+    """Create a server for the cockpit that neither listens itself nor handles signals.
 
-    uvicorn would raise the signals again at its end, which would cut short our own.
+    uvicorn would raise the signals again at its end, which would cut the cockpit's own shutdown short.
     """
     import uvicorn
 
@@ -369,13 +369,13 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
         log_level="warning",
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # the client's address comes from the kernel, not from a header
+        proxy_headers=False,  # trust the kernel for the client's address, not a header
         ws_max_size=_LARGEST_MESSAGE,
         ws_ping_interval=_PING_S,
         ws_ping_timeout=_PING_S,
-        ws_per_message_deflate=False,  # pictures are packed already
+        ws_per_message_deflate=False,  # pictures are already compressed
         lifespan="on",
-        # What a page that stopped reading leaves in buffers must not hold up the end.
+        # Data that a stalled page leaves in buffers must not delay the end.
         timeout_graceful_shutdown=2,
     )
     return QuietServer(config)
@@ -400,7 +400,7 @@ async def _run(
     while not server.started and not serving.done():
         await asyncio.sleep(_LOOK_S / 10)
     listening = asyncio.create_task(listener.run())
-    await asyncio.sleep(0)  # it listens from its first step on
+    await asyncio.sleep(0)  # the first step starts listening
     if not serving.done():
         on_ready()
     while not serving.done():
@@ -412,11 +412,11 @@ async def _run(
     await asyncio.gather(listening, return_exceptions=True)
     await serving
     if not listening.cancelled():
-        await listening  # what ended it
+        await listening  # raises what ended it
 
 
 def fleet_sources(fleet: Fleet) -> list[Source]:
-    """Return what there is to read of a fleet now: one source for each drone, and one for the fleet."""
+    """Return the current sources of metrics: one for each drone, and one for the fleet."""
     stations = fleet.stations.copy()
     return [partial(_fleet_readings, fleet), *(partial(_readings, name, one) for name, one in stations.items())]
 

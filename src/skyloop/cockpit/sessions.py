@@ -1,7 +1,7 @@
-"""Log-ins that outlive the cockpit's process, so that a page comes back by itself after a restart.
+"""Sessions that outlive the cockpit's process, so that a page reconnects after a restart without a new log-in.
 
-They are kept in a file that only this user may read, beside the sockets of proxies. It has the hashes of cookies and
-tokens, which let nobody in, and counts until the machine is started again only: times are of its monotonic clock.
+They are kept in a file that only this user may read, beside the sockets of proxies. It holds hashes of cookies and
+tokens, which can't be used to log in, and is valid until the next reboot, because its times are on the monotonic clock.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _log = logging.getLogger(__name__)
 class Session(msgspec.Struct, frozen=True):
     """One log-in."""
 
-    cookie: bytes  #: its hash
-    origin: bytes  #: the hash of the token that began it; empty: a code to pair with
+    cookie: bytes  #: the cookie's hash
+    origin: bytes  #: hash of the token it was given for; empty: a pairing code
     role: Role
     name: str
     until_ns: int  #: on the monotonic clock
@@ -39,11 +39,11 @@ class _Content(msgspec.Struct):
 
 
 class SessionFile:
-    """The file of the sessions of one cockpit.
+    """The file with the sessions of one cockpit.
 
     Args:
         path: The file; its folder may be missing.
-        boot: Names the run of this machine since it was started (default: as the kernel does).
+        boot: Identifies the machine's uptime since its last boot (default: the kernel's boot id).
     """
 
     def __init__(self, path: Path, boot: str | None = None) -> None:
@@ -51,7 +51,7 @@ class SessionFile:
         self._boot = _boot() if boot is None else boot
 
     def load(self) -> list[Session]:
-        """Return the sessions; none if there is no file, or it is damaged, another user's or of before a restart."""
+        """Return the sessions; none if the file is missing, damaged, another user's or from before a reboot."""
         try:
             descriptor = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             with os.fdopen(descriptor, "rb") as file:
@@ -63,7 +63,7 @@ class SessionFile:
         return content.sessions if content is not None and self._boot and content.boot == self._boot else []
 
     def save(self, sessions: Iterable[Session]) -> None:
-        """Replace the file; that it is not possible only means that people log in again after a restart."""
+        """Replace the file; on failure people only have to log in again after a restart."""
         new = self._path.with_name(f"{self._path.name}.new")
         try:
             with suppress(FileNotFoundError):
@@ -73,7 +73,7 @@ class SessionFile:
                 file.write(msgspec.json.encode(_Content(self._boot, list(sessions))))
             new.replace(self._path)
         except OSError as error:
-            _log.warning("log-ins are not kept beyond this run of the cockpit: %s", error)
+            _log.warning("log-ins will not survive a restart of the cockpit: %s", error)
 
 
 def _boot() -> str:

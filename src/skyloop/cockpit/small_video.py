@@ -1,6 +1,6 @@
 """Small video of many drones for one page: over one socket, at a steady rate, in one message for all cameras.
 
-A page that shows twelve drones would otherwise have twelve sockets, and would be woken and painted for every frame.
+Otherwise a page that shows twelve drones would have twelve sockets, and would wake and paint for every frame.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
-SEND_HZ: Final = 60.0  #: messages in a second, at most
-GATHER_S: Final = 0.005  #: a picture waits so long for those of other cameras, which often come together
-MAX_SHOWN: Final = 64  #: cameras that one page can show at a time
+SEND_HZ: Final = 60.0  #: messages per second, at most
+GATHER_S: Final = 0.005  #: how long a picture waits for other cameras', which often arrive together
+MAX_SHOWN: Final = 64  #: cameras shown on one page at a time
 _BAD_MESSAGE: Final = 1008
 
 
@@ -40,10 +40,10 @@ class _Place(msgspec.Struct, frozen=True):
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """What a page sends.
+    """A message from a page.
 
-    A camera that it shows from now on (``width`` pixels wide, ``h264`` if it decodes that), or no longer; one whose
-    pictures it can't decode up to the next ``key``; or what it drew.
+    It starts to show a camera (``width`` pixels wide, ``h264`` if it decodes that) or stops; it can't decode a camera's
+    pictures until the next ``key``; or it acknowledges what it drew.
     """
 
     show: _Place | None = None
@@ -68,7 +68,7 @@ class _Shown:
     def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
         """Subscribe to the camera, and again after the drone came back or was replaced.
 
-        To JPEGs only while the page is shown nothing else.
+        JPEGs are subscribed only while nothing else is shown.
         """
         if station is not self.station:
             self.release()
@@ -84,7 +84,7 @@ class _Shown:
         elif self.feed is None:
             feed = station.small_video(camera, rounded_width(self.width))
             if feed is not None:
-                with suppress(SkyloopError):  # it is going away
+                with suppress(SkyloopError):  # the drone is being closed
                     feed.subscribe()
                     self.feed, self.sent = feed, 0
 
@@ -103,10 +103,10 @@ class _Shown:
 
 
 class SmallVideoSender:
-    """Sends one page the newest frame of each camera that it shows, all in one message, until the page goes away.
+    """Sends one page the newest frame of each camera it shows, in one message, until the page disconnects.
 
-    The next message is sent when the page has drawn the one before: a slow page gets fewer frames, never older ones,
-    and holds nobody else up.
+    The next message is sent once the page has drawn the previous one: a slow page gets fewer frames, never older ones,
+    and delays no other page.
     """
 
     def __init__(self, socket: WebSocket, stations: Mapping[str, Station], counts: PageCounts) -> None:
@@ -114,19 +114,19 @@ class SmallVideoSender:
         self._stations = stations
         self._counts = counts
         self._shown: dict[_Place, _Shown] = {}
-        self._number = 0  # of the last message
-        self._waiting = 0  # for the acknowledgement of so many frames
+        self._number = 0  # number of the last message
+        self._waiting = 0  # frames not yet acknowledged
         self._problem = ""
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page is gone."""
+        """Send until the page disconnects."""
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
         due_s = time.monotonic()
         try:
             while not receiver.done():
-                with suppress(TimeoutError):  # JPEGs wake nobody
+                with suppress(TimeoutError):  # JPEGs don't wake this task
                     await asyncio.wait_for(self._wake.wait(), 1.0 / SEND_HZ)
                 self._wake.clear()
                 await asyncio.sleep(max(due_s - time.monotonic(), GATHER_S))
@@ -136,7 +136,7 @@ class SmallVideoSender:
             if self._problem:
                 await self._socket.close(_BAD_MESSAGE, self._problem)
         except WebSocketDisconnect:
-            pass  # while sending: the page went away
+            pass  # the page disconnected while sending
         finally:
             for shown in self._shown.values():
                 shown.release()
@@ -160,7 +160,7 @@ class SmallVideoSender:
         self._counts.frames_sent += len(heads)
 
     def _pictures(self, shown: _Shown) -> Iterator[tuple[dict[str, Any], bytes]]:
-        """Yield what is to be sent of a camera, with its data; several of H.264, which build on one another."""
+        """Yield the unsent pictures of a camera with their data; several of H.264, which depend on one another."""
         stream, feed, station = shown.stream, shown.feed, shown.station
         if station is None:
             return
@@ -183,7 +183,7 @@ class SmallVideoSender:
             yield picture_values(frame, age_s, frame.width, frame.height), frame.jpeg
 
     async def _receive(self) -> None:
-        """Handle what the page sends until it is gone, or sends what makes no sense."""
+        """Handle the page's messages until it disconnects or sends an invalid one."""
         while not self._problem:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -191,7 +191,7 @@ class SmallVideoSender:
             self._problem = self._handle(message.get("text") or "")
 
     def _handle(self, text: str) -> str:
-        """Handle a message; return what is wrong with it."""
+        """Handle a message; return its problem, empty if valid."""
         try:
             message = msgspec.json.decode(text, type=_Message)
         except msgspec.DecodeError as error:
@@ -211,6 +211,6 @@ class SmallVideoSender:
                 hidden.release()
         if message.show is not None:
             if len(self._shown) >= MAX_SHOWN:
-                return f"at most {MAX_SHOWN} cameras are shown at a time"
+                return f"at most {MAX_SHOWN} cameras can be shown at a time"
             self._shown[message.show] = _Shown(message.width, message.h264)
         return ""

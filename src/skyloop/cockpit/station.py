@@ -1,4 +1,4 @@
-"""One drone of the cockpit, with what all its pages share, and each page's own connection to fly it."""
+"""One drone of the cockpit: the state shared by its pages, and each page's own connection for flying it."""
 
 from __future__ import annotations
 
@@ -28,48 +28,48 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
-FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
-PILOT_S: Final = 2.0  #: for a pilot's connection to be made
-RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
-SHOWN_S: Final = 8.0  #: for the vehicle to show that its motors are stopped: as long as the stop may be repeated
+FRESH_S: Final = 0.2  #: time limit for fresh feedback
+PILOT_S: Final = 2.0  #: time limit for opening a pilot's connection
+RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recordings
+SHOWN_S: Final = 8.0  #: time limit for the vehicle to show stopped motors; the stop is repeated as long
 STOPPER: Final = "cockpit stop"  #: the application that sends emergency stops, and nothing else
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
 _log = logging.getLogger(__name__)
 
 
 class PilotConnection(Drone):
-    """A pilot's connection that asks for the authority when ``request`` is called, and not when it is opened.
+    """A pilot's connection that requests the authority in :meth:`acquire`, not when it is opened.
 
-    Without the authority it can stop the motors in an emergency, and nothing else.
+    Without the authority it can only stop the motors in an emergency.
     """
 
-    _newest: tuple[AnyAction, int] = Idle(), 0  # what :meth:`command` sent last, and its number
+    _newest: tuple[AnyAction, int] = Idle(), 0  # the last :meth:`command` and its number
 
     @classmethod
     def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
         """Connect, without the authority.
 
         Args:
-            dial: Makes a connection to the proxy each time one is needed.
-            app: The name under which it connects.
+            dial: Opens a new connection to the proxy on each call.
+            app: The name to connect under.
             timeout_s: Time for the proxy to answer [s].
 
         Raises:
-            SkyloopError: It can't be opened.
+            SkyloopError: The connection can't be opened.
         """
         return open_unasked(cls, dial, app=app, timeout_s=timeout_s, on_exit="hover")
 
     def set_flown_by_person(self) -> None:
-        """Hold nothing on its own, only while the page is known to be there, as a person flies by it."""
+        """Repeat commands only while the page is known to be present, because a person flies through it."""
         commands(self).flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
-        """Count the page as present until then, on this process's monotonic clock; afterwards this pilot is silent."""
+        """Count the page as present until this time of the process's monotonic clock, and then as silent."""
         commands(self).present_until(until_ns)
 
     @property
     def is_silent(self) -> bool:
-        """Whether the page was not known to be there for too long."""
+        """Whether the page has been absent for too long."""
         return not commands(self).is_present(monotonic_ns())
 
     @property
@@ -78,35 +78,35 @@ class PilotConnection(Drone):
         return self.link.application in (LinkState.UP, LinkState.DEGRADED)
 
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
-        """Ask for the authority now.
+        """Request the authority now.
 
         Args:
             priority: 0 is the highest, 31 the lowest.
-            ask: Whether the holder is asked first; this then waits in the queue instead of failing.
+            ask: Ask the holder first, and wait in the queue instead of failing.
 
         Raises:
-            AuthorityError: Another application has it; the message names which.
+            AuthorityError: Another application holds it; the message names that application.
         """
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer who asks for the authority, and wait until the proxy has the answer.
+        """Answer a request for the authority, and wait until the proxy has the answer.
 
         Args:
             lease: The lease under which this connection holds the authority.
-            app_id: Who asked.
-            grant: Whether to hand it over.
-            reason: Why not, for a person.
+            app_id: The application that asked.
+            grant: Whether to hand the authority over.
+            reason: The reason for a refusal, shown to a person.
 
         Raises:
-            RefusedError: The authority is not held any more.
+            RefusedError: This connection no longer holds the authority.
             LinkError: The proxy does not answer.
         """
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
     @property
     def proxy_now_ns(self) -> int:
-        """The time on the proxy's clock, as estimated."""
+        """The estimated time on the proxy's clock."""
         return monotonic_ns() + self.clock_offset_ns
 
     def command(self, action: AnyAction) -> bool:
@@ -123,30 +123,30 @@ class PilotConnection(Drone):
 
     @property
     def intent(self) -> int:
-        """Number of the newest command."""
+        """The number of the newest command."""
         return commands(self).intent
 
     def refusal(self, first: int) -> Outcome | None:
-        """What the proxy refused, or ended, of the commands from this number on; None but for :meth:`has_ended`."""
+        """The first command from this number on that the proxy refused or ended; None except for :meth:`has_ended`."""
         told = commands(self).told
         if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
             return None
         return told
 
     @property
-    def is_told(self) -> bool:
-        """Whether the proxy tells what becomes of the newest command: it has arrived there."""
+    def is_acknowledged(self) -> bool:
+        """Whether the proxy reports the fate of the newest command, so it has arrived there."""
         newest, (_, intent) = Known(self).newest, self._newest
         outcome = None if newest is None else newest.outcome
         return outcome is not None and outcome.app_id == self.app_id and outcome.intent >= intent
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover, or land, because the cockpit finds that it has to; see :func:`skyloop.extend.let_go`."""
+        """Hover or land because the cockpit has to, not a person; see :func:`skyloop.extend.let_go`."""
         return let_go(self, reason, land=land)
 
     @property
     def is_flying(self) -> bool:
-        """Whether the vehicle is under way, as far as is known."""
+        """Whether the vehicle is under way, as far as known."""
         try:
             return self.feedback().state is FlightState.FLYING
         except LinkError:
@@ -154,26 +154,26 @@ class PilotConnection(Drone):
 
 
 class FlyingSession(Protocol):
-    """What a page flies the drone by."""
+    """A page's control of the drone."""
 
-    app: str  #: the name under which everybody sees who flies
+    app: str  #: the name that other applications see
 
     @property
     def waits(self) -> bool:
         """Whether the page waits for the authority."""
 
     def stand_down(self, why: str) -> None:
-        """Command nothing any more."""
+        """Send no more commands."""
 
     def let_go(self, why: str) -> None:
         """Hover, if the page has the vehicle under way."""
 
 
 class Station:
-    """One drone, with what all its pages share. Made and closed on the event loop.
+    """One drone, with the state shared by its pages. Created and closed on the event loop.
 
     Args:
-        found: Where the proxy is.
+        found: The address of the proxy.
         drone: Connected as an observer; closed by :meth:`close`.
     """
 
@@ -185,24 +185,24 @@ class Station:
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
         self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: as H.264, by camera and form
-        self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
+        self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by application name
         self.routes = CheckedRoutes()
         self.sessions: set[FlyingSession] = set()  #: of pages that may fly it
-        self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
+        self.pilots: set[PilotConnection] = set()  #: the pages' connections for pilots
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
-        drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # until the drone is closed
-        self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows it
+        drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # registered until the drone is closed
+        self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows the drone
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
         self._stops = 0  # emergency stops under way
-        self._names: list[str] = []  # of streams for one page each, that are not in use
+        self._names: list[str] = []  # unused subscriber names for streams to one page
         self._named = 0
 
     @property
     def flies(self) -> bool:
-        """Whether there is anything to fly: a recording is none, and takes every command without effect."""
+        """Whether there is a vehicle to fly: a recording accepts every command without effect."""
         return bool(self.drone.capabilities.actions) and not self.drone.uri.startswith(RECORDINGS)
 
     @property
@@ -216,41 +216,41 @@ class Station:
         return [*self.cameras.values(), *self.small.values(), *self.streams.values()]
 
     def camera(self, name: str) -> CameraFeed | None:
-        """Return the feed of a camera; None if the vehicle has none of that name."""
+        """Return the feed of a camera; None if the vehicle has no such camera."""
         if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
 
     def small_video(self, name: str, width: int) -> SmallFeed | None:
-        """Return the feed of a camera scaled down to a width [pixels]; None if the vehicle has none of that name."""
+        """Return the feed of a camera scaled down to a width [pixels]; None if the vehicle has no such camera."""
         camera = next((info for info in self.drone.capabilities.cameras if info.name == name), None)
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
 
     def encoded(self, name: str, form: Form) -> EncodedFeed:
-        """Return the feed of a camera's H.264 in one form; :meth:`forget` it when no page wants it."""
+        """Return the feed of a camera's H.264 in one form; :meth:`forget` it once no page shows it."""
         if (name, form) not in self.streams:
             self.streams[name, form] = EncodedFeed(self.drone, name, form)
         return self.streams[name, form]
 
     def forget(self, feed: EncodedFeed) -> None:
-        """Forget a feed that no page wants any more."""
+        """Forget a feed that no page shows."""
         self.streams.pop((feed.camera, feed.form), None)
 
     def own_name(self) -> str:
-        """Return a subscriber's name for a stream to one page; :meth:`free_name` gives it to another one."""
+        """Return a subscriber's name for a stream to one page; :meth:`free_name` makes it available again."""
         if not self._names:
             self._named += 1
             self._names.append(f"{secrets.token_hex(6)}-{self._named}")
         return self._names.pop()
 
     def free_name(self, name: str) -> None:
-        """Take back a name of :meth:`own_name`."""
+        """Return a name from :meth:`own_name`."""
         self._names.append(name)
 
     def feedback(self) -> Feedback:
-        """Return the newest feedback, which is sent slowly while no page shows more of the drone than its row.
+        """Return the newest feedback, which arrives slowly while pages show only the drone's row.
 
         Raises:
             LinkError: There is none, or the drone was closed.
@@ -258,21 +258,21 @@ class Station:
         return self.drone.feedback(max_hz=ROW_HZ)
 
     def fresh_feedback(self) -> Feedback:
-        """Wait for a state of the vehicle from now on: the newest may be from before a take-off.
+        """Wait for a state captured from now on: the newest feedback may predate a take-off.
 
         Raises:
-            LinkError: None comes within :data:`FRESH_S`.
+            LinkError: None arrives within :data:`FRESH_S`.
         """
         now_ns = self.drone.now_ns
         return self.drone.wait(lambda feedback: feedback.captured_ns >= now_ns, FRESH_S)
 
     @property
     def feedback_period_s(self) -> float:
-        """Time between two samples of feedback as it was asked for [s]; 0 while all come."""
+        """The requested time between two samples of feedback [s]; 0 for all samples."""
         return 1.0 / ROW_HZ if self._whole is None else 0.0
 
     def _on_shown(self, shown: bool) -> None:
-        """A page shows the whole drone, or none does any more."""
+        """Subscribe to all feedback while a page shows the whole drone."""
         self.log_feed.want(shown)
         if shown and self._whole is None:
             self._whole = self.drone.on_feedback(_nothing, inline=True)
@@ -286,10 +286,10 @@ class Station:
         """Open a pilot's connection that holds nothing yet.
 
         Args:
-            app: The name under which it connects.
+            app: The name to connect under.
 
         Raises:
-            SkyloopError: It can't be opened within :data:`PILOT_S`.
+            SkyloopError: The connection can't be opened within :data:`PILOT_S`.
         """
 
         def connect() -> PilotConnection:
@@ -300,19 +300,19 @@ class Station:
         return pilot
 
     async def close_pilot(self, pilot: PilotConnection) -> None:
-        """Close a pilot's connection, and give back what it holds."""
+        """Close a pilot's connection, which releases what it holds."""
         await asyncio.to_thread(pilot.close)
         self.pilots.discard(pilot)
 
     def pilot_came(self) -> None:
-        """Prepare the connection for emergency stops, as a page that may stop the motors is there."""
+        """Prepare the connection for emergency stops for a page that may stop the motors."""
         self._may_stop += 1
         if self._stopper is None:
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
             self._stopper.add_done_callback(_ignore_error)
 
     async def pilot_went(self) -> None:
-        """Close the connection for emergency stops, if no page is there any more that may use it."""
+        """Close the connection for emergency stops once no page is left that may use it."""
         self._may_stop -= 1
         if not self._may_stop and self._stopper is not None:
             stopper, self._stopper = self._stopper, None
@@ -322,22 +322,22 @@ class Station:
         """Return the pilot's connection for emergency stops, which never holds the authority.
 
         Raises:
-            SkyloopError: It can't be opened.
+            SkyloopError: The connection can't be opened.
         """
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
             self._stopper = asyncio.create_task(self.open_pilot(STOPPER))
         return await asyncio.shield(self._stopper)
 
     async def stop_motors(self, until_ns: int, sent: Callable[[], None]) -> None:
-        """Stop the motors, over the connection that nothing else uses; no page flies the vehicle meanwhile.
+        """Stop the motors, over a connection used for nothing else; no page flies the vehicle meanwhile.
 
         Args:
-            until_ns: Until when it may be sent for the first time, on this process's monotonic clock.
+            until_ns: Latest time for sending it first, on this process's monotonic clock.
             sent: Called when it was sent.
 
         Raises:
             LinkError: It was not sent, and never will be.
-            NoAnswerError: The vehicle does not show within :data:`SHOWN_S` that its motors are stopped.
+            NoAnswerError: The vehicle does not show stopped motors within :data:`SHOWN_S`.
             UnsupportedError: The vehicle has no emergency stop.
         """
         self._stops += 1
@@ -345,22 +345,22 @@ class Station:
             for session in self.sessions:
                 try:
                     session.stand_down("the motors were stopped")
-                except Exception:  # noqa: BLE001  (whatever is wrong with one page, the motors are stopped)
+                except Exception:  # noqa: BLE001  (the motors are stopped whatever fails in one page)
                     _log.exception("%s could not stand down", session.app)
             stopper = await self._send_stop(until_ns)
             sent()
             await asyncio.to_thread(_wait_until_stopped, stopper, stopper.now_ns)
         except SkyloopError:
-            for session in self.sessions:  # what it flew is not flown any more
-                session.let_go("the emergency stop does not show")
+            for session in self.sessions:  # their flights are not resumed
+                session.let_go("the vehicle does not show the emergency stop")
             raise
         finally:
             self._stops -= 1
 
     def check_stop(self) -> None:
-        """Raise :class:`RefusedError` while an emergency stop is under way that the vehicle does not show yet."""
+        """Raise :class:`RefusedError` while an emergency stop is under way and the vehicle does not show it yet."""
         if self._stops:
-            raise RefusedError("an emergency stop is under way: nothing else is commanded before it shows")
+            raise RefusedError("an emergency stop is under way: other commands wait until the vehicle shows it")
 
     async def _send_stop(self, until_ns: int) -> PilotConnection:
         why = "the proxy does not answer"
@@ -373,7 +373,7 @@ class Station:
                     return stopper
                 why = f"the link to the proxy is {stopper.link.application}"
                 with suppress(SkyloopError):
-                    stopper.idle()  # or it would be sent whenever the link is back: it is tried again here instead
+                    stopper.idle()  # or it would be sent whenever the link comes back: this loop retries instead
             except LinkError as error:
                 why = str(error)
             except TimeoutError:
@@ -408,8 +408,8 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
     try:
         stopper.wait(shows, SHOWN_S)
     except NoAnswerError:
-        why = f"the vehicle has not shown for {SHOWN_S:g} s that its motors are stopped: stop them again, or land it"
-        since_ns = from_ns - nanoseconds(PILOT_S)  # it may have been refused before this began to wait
+        why = f"the vehicle has not shown stopped motors for {SHOWN_S:g} s: stop them again, or land it"
+        since_ns = from_ns - nanoseconds(PILOT_S)  # it may have been refused before this wait began
         refused = (
             event.text
             for event in reversed(stopper.recent_events())
@@ -419,10 +419,10 @@ def _wait_until_stopped(stopper: PilotConnection, from_ns: int) -> None:
 
 
 def _nothing(_: Feedback) -> None:
-    """Take feedback in, so that all of it comes; what is shown is the newest."""
+    """Consume feedback, so that all of it arrives; pages show the newest."""
 
 
 def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:
-    """Its error is raised when somebody wants to stop, which tries again."""
+    """Ignore the error: it is raised for the next emergency stop, which tries again."""
     if not task.cancelled():
         task.exception()

@@ -1,8 +1,8 @@
-"""What is sent to pages: one object per open socket. A page that does not keep up gets less, never anything older.
+"""Sends data to pages: one object per open socket. A page that does not keep up gets less, never anything older.
 
-Video: one JPEG is on its way at a time; the page acknowledges it when it has drawn it, and only then gets the newest.
-Of H.264, whose pictures build on one another, a few are; a page that leaves out one goes on with a key picture.
-Telemetry: the newest state about twenty times a second, as far as the socket takes it; made once for all pages.
+Video: one JPEG is on its way at a time; the page acknowledges it after drawing it, and only then gets the newest. Of
+H.264, whose pictures depend on one another, several are; a page that skips one resumes at a key picture.
+Telemetry: the newest state about 20 times a second, as fast as the socket accepts it; made once for all pages.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from skyloop.cockpit.page_stream import PageStream, Sent
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 
-DRAWN_BYTES = 65_536  #: of drawings that are sent to a page with one frame: about what the frame itself has
-MAX_WAITING: Final = 256  #: answers to a page that does not read; what comes on top is not sent
-MAX_COUNTED = 256  #: sources of drawings that are named in the counts
+DRAWN_BYTES = 65_536  #: of drawings sent to a page with one frame: about the size of the frame itself
+MAX_WAITING: Final = 256  #: queued answers to a page that does not read; further ones are dropped
+MAX_COUNTED = 256  #: sources of drawings named in the counts
 
 _BAD_MESSAGE = 1008
 _LOOK_S: Final = 0.2
@@ -34,17 +34,17 @@ UNKNOWN = 4404  #: close code: no such drone or camera
 
 @dataclass(slots=True)
 class PageCounts:
-    """What all pages were sent since the start."""
+    """Counts over all pages since the start."""
 
     pages: int = 0  #: open now
     frames_sent: int = 0
     frames_acknowledged: int = 0
-    frames_skipped: int = 0  #: not sent because the page still had one to draw
-    sources: set[str] = field(default_factory=set)  #: of drawings that were sent
+    frames_skipped: int = 0  #: not sent because the page was still drawing
+    sources: set[str] = field(default_factory=set)  #: of drawings sent
 
 
 class VideoSender:
-    """Sends one camera to one page until the page goes away: as JPEGs, or as H.264 to a page that decodes it."""
+    """Sends one camera to one page until it disconnects: as JPEGs, or as H.264 if the page decodes that."""
 
     def __init__(self, socket: WebSocket, station: Station, feed: CameraFeed, counts: PageCounts) -> None:
         self._socket = socket
@@ -55,14 +55,14 @@ class VideoSender:
         self._wake = asyncio.Event()
         self._stream: PageStream | None = None  # for a page that decodes H.264
         self._as_jpeg = False  # JPEGs are subscribed to
-        self._number = 0  # of the last message
+        self._number = 0  # number of the last message
         self._sent = 0  # serial of the last JPEG sent; not the frame, which would keep its memory from the proxy
-        self._sent_ns = 0  # capture of the picture sent last
-        self._waiting = 0  # number of the JPEG whose acknowledgement is waited for
-        self._drawn: dict[str, int] = {}  # capture of the newest drawing sent, by source; what was sent last is last
+        self._sent_ns = 0  # capture time of the last picture sent
+        self._waiting = 0  # number of the JPEG that is not yet acknowledged
+        self._drawn: dict[str, int] = {}  # capture time of the newest drawing sent, by source; the last sent comes last
 
     async def run(self) -> None:
-        """Send until the page is gone."""
+        """Send until the page disconnects."""
         self._event_feed.subscribe(self._wake.set)
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
@@ -70,7 +70,7 @@ class VideoSender:
             while not receiver.done():
                 self._choose()
                 with suppress(TimeoutError):
-                    # Without pictures, too, it must be seen that none come, or that the page takes none.
+                    # Even without pictures this must notice that none arrive, or that the page accepts none.
                     await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
                 self._wake.clear()
                 await self._send_pictures()
@@ -79,7 +79,7 @@ class VideoSender:
             if not receiver.result():
                 await self._socket.close(_BAD_MESSAGE, 'expected {"ack": number of a frame}')
         except WebSocketDisconnect:
-            pass  # while sending: the page went away
+            pass  # the page disconnected while sending
         finally:
             if self._as_jpeg:
                 self._feed.unsubscribe(self._wake.set)
@@ -99,7 +99,7 @@ class VideoSender:
             self._wake.set()
 
     async def _receive(self) -> bool:
-        """Receive acknowledgements until the page is gone (True) or sends something else (False)."""
+        """Receive acknowledgements until the page disconnects (True) or sends something else (False)."""
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -171,10 +171,10 @@ class VideoSender:
         self._counts.frames_skipped += skipped
 
     async def _send_drawings(self) -> None:
-        """Send drawings of the frame sent last, or older ones, so that there are never more of them than of frames.
+        """Send drawings for the frame sent last or earlier ones, so that there are never more of them than of frames.
 
-        At most :data:`DRAWN_BYTES` are sent for each frame, in pieces, first those that were sent longest ago: what
-        many sources draw keeps neither this page's pictures nor anybody else waiting.
+        At most :data:`DRAWN_BYTES` are sent with each frame, in pieces, those sent longest ago first: many sources
+        delay neither this page's pictures nor other pages.
         """
         newest = self._event_feed.drawings.items()
         drawings = {source: one for (camera, source), one in newest if camera == self._feed.camera}
@@ -188,7 +188,7 @@ class VideoSender:
             text = drawings[source].text
             left -= len(text)
             if left < 0 and left + len(text) < DRAWN_BYTES:
-                break  # with the next frame; one that is larger than all that is sent alone
+                break  # the rest follows with the next frame; a drawing over the limit is sent alone
             self._drawn.pop(source, None)
             self._drawn[source] = captured
             if len(self._counts.sources) < MAX_COUNTED:
@@ -198,7 +198,7 @@ class VideoSender:
 
 
 class BroadcastSender:
-    """Sends the messages of a broadcast to one page until the page goes away."""
+    """Sends the messages of a broadcast to one page until it disconnects."""
 
     def __init__(self, socket: WebSocket, broadcast: PeriodicBroadcast) -> None:
         self._socket = socket
@@ -206,10 +206,10 @@ class BroadcastSender:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page is gone."""
+        """Send until the page disconnects."""
         gone = asyncio.create_task(self._until_gone())
         gone.add_done_callback(lambda _: self._wake.set())
-        wake = self._wake.set  # the same object to subscribe and to unsubscribe with
+        wake = self._wake.set  # unsubscribing needs the same object
         self._broadcast.subscribe(wake)
         try:
             while not gone.done() and not self._broadcast.closed:
@@ -218,11 +218,11 @@ class BroadcastSender:
                 if not gone.done() and not self._broadcast.closed:
                     await self._send()
             if not gone.done():
-                await self._socket.close(UNKNOWN, "it is not here any more")
+                await self._socket.close(UNKNOWN, "this drone is gone")
             elif gone.result() != "websocket.disconnect":
-                await self._socket.close(_BAD_MESSAGE, "nothing is expected here")
+                await self._socket.close(_BAD_MESSAGE, "no messages are expected here")
         except WebSocketDisconnect:
-            pass  # while sending: the page went away
+            pass  # the page disconnected while sending
         finally:
             self._broadcast.unsubscribe(wake)
             gone.cancel()
@@ -232,12 +232,12 @@ class BroadcastSender:
         await self._socket.send_text(self._broadcast.message.decode())
 
     async def _until_gone(self) -> str:
-        """Return the type of whatever comes: nothing is expected from the page here."""
+        """Return the type of the next message: none are expected from the page here."""
         return str((await self._socket.receive())["type"])
 
 
 class TelemetrySender(BroadcastSender):
-    """Sends a drone's state and events; before them the vehicle, whenever it is another one."""
+    """Sends a drone's state and events, preceded by the vehicle whenever it changes."""
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
         super().__init__(socket, station.broadcast)
@@ -258,21 +258,21 @@ class TelemetrySender(BroadcastSender):
 
 
 class PageSocket:
-    """Sends messages to one page, and passes on the commands that it sends. On the event loop."""
+    """Sends messages to one page, and passes on its commands. On the event loop."""
 
     def __init__(self, socket: WebSocket) -> None:
         self._socket = socket
         self._outbox: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Queue a message; it is dropped if the page has not read the :data:`MAX_WAITING` before."""
+        """Queue a message; drop it if the page has not read the last :data:`MAX_WAITING`."""
         with suppress(asyncio.QueueFull):
             self._outbox.put_nowait(message)
 
     async def serve(self, handle: Callable[[Sequence[str | bytes]], None]) -> None:
-        """Call ``handle`` with what the page has sent since the last call, oldest first, until the page is gone.
+        """Call ``handle`` with the messages received since the last call, oldest first, until the page disconnects.
 
-        More than one message where this process got to none for a while: the newest is known before the oldest acts.
+        After a pause of this process there are several: the newest is known before the oldest acts.
         """
         came: list[str | bytes] = []
         some = asyncio.Event()
@@ -281,7 +281,7 @@ class PageSocket:
             with suppress(WebSocketDisconnect):
                 while (message := await self._socket.receive())["type"] != "websocket.disconnect":
                     came.append(message.get("text") or message.get("bytes") or "")
-                    some.set()  # what has come already is received without a turn of the loop
+                    some.set()  # messages already here are received without a turn of the loop
 
         reading, writing = asyncio.create_task(read()), asyncio.create_task(self._write())
         reading.add_done_callback(lambda _: some.set())
@@ -297,13 +297,13 @@ class PageSocket:
             writing.cancel()
 
     async def _write(self) -> None:
-        with suppress(WebSocketDisconnect):  # the receiving side detects it too
+        with suppress(WebSocketDisconnect):  # the receiving side also detects it
             while True:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 
 
 class _FromPage(msgspec.Struct):
-    """What a page sends: what it has drawn, which pictures it takes, or that it can't decode what comes."""
+    """A page's message: drawn pictures, accepted kinds of pictures, or a picture it can't decode."""
 
     ack: int | None = None
     h264: bool | None = None
@@ -312,7 +312,7 @@ class _FromPage(msgspec.Struct):
 
 
 def _said(text: str) -> _FromPage | None:
-    """Return what a page says; None if it is something else."""
+    """Decode a page's message; None if it is invalid."""
     try:
         said = msgspec.json.decode(text, type=_FromPage)
     except msgspec.DecodeError:
@@ -321,7 +321,7 @@ def _said(text: str) -> _FromPage | None:
 
 
 class Captured(Protocol):
-    """A picture, by as much of it as pages are told."""
+    """The part of a picture that pages learn about."""
 
     @property
     def seq(self) -> int: ...
@@ -330,7 +330,7 @@ class Captured(Protocol):
 
 
 def picture_values(picture: Captured, age_s: float, width: int, height: int) -> dict[str, Any]:
-    """Return what a page is told of a picture, as JSON values."""
+    """Return a picture's description for pages, as JSON values."""
     captured = str(picture.captured_ns)  # too large for JavaScript's numbers
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 

@@ -1,7 +1,7 @@
-"""What a page is told of the authority: who has it, how it was lost, who asks for it, and where the page waits.
+"""The authority as a page sees it: its holder, its loss, requests for it, and the page's place in the queue.
 
-:class:`TakeoverQuestions` and :class:`QueueTracker` are pure, the time is an argument; :class:`TakeoverDialog` joins
-them to one page, and :class:`AuthorityReport` says what has changed.
+:class:`TakeoverQuestions` and :class:`QueueTracker` are pure, with the time as an argument; :class:`TakeoverDialog`
+connects them to one page, and :class:`AuthorityReport` reports changes.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuestion:
-    """Somebody asks for the authority that this page holds."""
+    """Another application asks for the authority that this page holds."""
 
     query: TakeoverQuery
-    until_ns: int  #: when the time to ask is over, on the proxy's clock
-    declined: bool = False  #: by this page; who is of higher priority gets it all the same when the time is over
+    until_ns: int  #: when the question expires, on the proxy's clock
+    declined: bool = False  #: by this page; a higher priority gets it anyway when the question expires
 
     def to_json(self, now_ns: int) -> Json:
-        """Return it as JSON values; ``now_ns`` is the proxy's clock."""
+        """Return the question as JSON values; ``now_ns`` is the proxy's clock."""
         return {
             "id": self.query.by_id,
             "by": self.query.request.by,
@@ -46,16 +46,16 @@ class TakeoverQuestion:
 
 
 class TakeoverQuestions:
-    """The open questions to a page, by the number of who asks. Times are on the proxy's clock.
+    """The open questions to a page, by the asking application's number. Times are on the proxy's clock.
 
-    Each method that changes them returns whether anything has changed.
+    Methods that change them return whether anything changed.
     """
 
     def __init__(self) -> None:
         self._open: dict[int, TakeoverQuestion] = {}
 
     def find(self, by_id: int) -> TakeoverQuestion | None:
-        """Return the question of an application, None if there is none."""
+        """Return the question of an application, None if it asks nothing."""
         return self._open.get(by_id)
 
     def on_event(self, event: Event, app_id: int) -> bool:
@@ -70,7 +70,7 @@ class TakeoverQuestions:
         return True
 
     def decline(self, by_id: int) -> bool:
-        """Note that the page keeps control."""
+        """Record that the page keeps control."""
         question = self._open.get(by_id)
         if question is None:
             return False
@@ -78,43 +78,43 @@ class TakeoverQuestions:
         return True
 
     def update(self, lease: int, now_ns: int) -> bool:
-        """Drop the questions of another lease, and those whose time is over."""
+        """Drop the questions about another lease, and expired ones."""
         left = {by_id: one for by_id, one in self._open.items() if one.query.lease == lease and now_ns < one.until_ns}
         changed, self._open = len(left) != len(self._open), left
         return changed
 
     def to_json(self, now_ns: int) -> Json:
-        """Return the message to the page; who would get the authority first comes first."""
+        """Return the message to the page; the application next in line for the authority comes first."""
         ordered = sorted(self._open.values(), key=lambda one: (one.query.request.priority, one.until_ns))
         return {"type": "asked", "questions": [one.to_json(now_ns) for one in ordered]}
 
 
 @dataclass(frozen=True, slots=True)
 class QueuePosition:
-    """Where a page stands in the queue for the authority."""
+    """A page's position in the queue for the authority."""
 
-    position: int | None  #: 1 is next; None: not known
-    until_ns: int | None  #: when it is expected to be its turn; None: not known
+    position: int | None  #: 1 is next; None: unknown
+    until_ns: int | None  #: when its turn is expected; None: unknown
     asked: bool  #: the holder was asked first
-    declined: str | None  #: and keeps it for this reason, which may be empty
+    declined: str | None  #: the holder's reason for keeping it, which may be empty
 
     def to_json(self, now_ns: int) -> Json:
-        """Return it as JSON values; ``now_ns`` is the monotonic clock."""
+        """Return the position as JSON values; ``now_ns`` is the monotonic clock."""
         wait_s = None if self.until_ns is None else max(0.0, seconds(self.until_ns - now_ns))
         return {"position": self.position, "wait_s": wait_s, "asked": self.asked, "declined": self.declined}
 
 
 class QueueTracker:
-    """Follows a page's position in the queue, and the answer to its question."""
+    """Tracks a page's position in the queue, and the answer to its question."""
 
     def __init__(self) -> None:
         self._asked = False
         self._declined: str | None = None
-        self._known: tuple[int, float | None] | None = None  # what the newest status had
+        self._known: tuple[int, float | None] | None = None  # position and time in the newest status
         self._until_ns: int | None = None
 
     def request(self, *, ask: bool) -> None:
-        """Start over, as the page asks for the authority."""
+        """Start over, because the page requests the authority."""
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
@@ -126,9 +126,9 @@ class QueueTracker:
         """Return the position in the queue.
 
         Returns:
-            None for who does not wait. It is equal to the last one until the status changes.
+            None if the page does not wait. Equal to the previous one until the status changes.
         """
-        if status.state == "held":  # who is overruled afterwards has it back without asking
+        if status.state == "held":  # a pilot overruled later gets it back without asking
             self.request(ask=False)
         if status.state not in ("queued", "preempted"):
             return None
@@ -153,11 +153,11 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Start over, as the page asks for the authority."""
+        """Start over, because the page requests the authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:
-        """Handle an event that came over the page's own connection."""
+        """Handle an event from the page's own connection."""
         self._queue.on_event(event, pilot.app_id)
         if self._questions.on_event(event, pilot.app_id):
             self._send(self._questions.to_json(pilot.proxy_now_ns))
@@ -173,47 +173,47 @@ class TakeoverDialog:
         """Send the page's answer to the proxy.
 
         Raises:
-            RefusedError: Nobody asks any more.
+            RefusedError: The question is no longer open.
             LinkError: The proxy does not answer.
         """
         question = self._questions.find(command.id)
         if question is None:
-            raise RefusedError("nobody asks for control any more")
+            raise RefusedError("the request for control is no longer open")
         lease = question.query.lease
         await asyncio.to_thread(pilot.answer_takeover, lease, command.id, command.grant, command.reason)
         if not command.grant and self._questions.decline(command.id):
             self._send(self._questions.to_json(pilot.proxy_now_ns))
 
 
-GIVEN_S: Final = 2.0  #: control that was handed over is gone within this; later it is lost like any other
+GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later loss is an ordinary one
 
 
 class AuthorityReport:
-    """Compares the authority with what the page was sent last. On the event loop.
+    """Compares the authority with the last message to the page. On the event loop.
 
     Args:
         station: The drone.
         app: The name under which the page flies.
-        gone_s: Its control runs out after so long without a sign of life from the cockpit at the page [s].
+        gone_s: The page's control expires after this long without a sign of life from the cockpit [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:
         self._station = station
         self._app = app
         self._gone_s = gone_s
-        #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost, who
+        #: As last sent to the page: state, holder, its priority, position in the queue, how control was lost, who
         #: waits.
         self._sent: tuple[str, str | None, int | None, QueuePosition | None, str | None, list[str]] | None = None
         self._was_mine = False
-        self._given, self._given_ns = False, 0  # to who asked for it, and when
-        self._loss: str | None = None  # how the control that this page had was lost; None: it was not
+        self._given, self._given_ns = False, 0  # handed over on request, and when
+        self._loss: str | None = None  # how this page lost its control; None: it did not
 
     def released(self) -> None:
-        """Count the control as given back on purpose: it was not lost."""
+        """Treat the loss of control as intended: the page released it."""
         self._was_mine, self._loss = False, None
 
     def handed_over(self, *, given: bool = True) -> None:
-        """Count the control that goes now as given to who asked for it: it is not lost; or no longer so."""
+        """Treat the coming loss of control as a handover, or undo that with ``given=False``."""
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
@@ -221,7 +221,7 @@ class AuthorityReport:
 
         Args:
             pilot: The page's own connection, if it has one.
-            place: Its position in the queue, while it waits.
+            place: The page's position in the queue, while it waits.
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
@@ -232,16 +232,16 @@ class AuthorityReport:
             holder, priority = None, None
         mine = state == "held"
         lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
-        if lost or (holder == self._app and not mine):  # from before
+        if lost or (holder == self._app and not mine):  # left over from before
             holder = None
         if holder is None:
             priority = None
-        if mine and pilot is not None:  # known here first
+        if mine and pilot is not None:  # known here before the feedback shows it
             holder, priority = self._app, pilot.authority.priority
         if mine or (self._was_mine and pilot is not None):
             self._loss = None if mine or pilot is None else _end_of_control(pilot)
         if mine != self._was_mine and (mine or monotonic_ns() - self._given_ns > nanoseconds(GIVEN_S)):
-            self._given = False  # it was given at another time, or whoever asked did not take it
+            self._given = False  # the handover was at another time, or the applicant did not accept
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         waiting = sorted(session.app for session in self._station.sessions if session.waits)
@@ -263,7 +263,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is higher than that of who has control, as far as is known."""
+        """Return whether a priority is higher than the holder's, as far as known."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:
@@ -271,7 +271,7 @@ class AuthorityReport:
         return held is None or priority < held
 
     def busy(self, priority: int) -> str:
-        """Return why control can't be taken with a priority, in words."""
+        """Return in words why a priority can't take control."""
         try:
             feedback = self._station.feedback()
         except LinkError:
@@ -283,20 +283,20 @@ class AuthorityReport:
         )
 
     def _why(self, ended: str, holder: str | None, lost: bool) -> str:
-        """Return what became of the control that this page had, in words that are true now."""
+        """Return what happened to the page's control, in words that are true now."""
         name = self._station.found.name
         now = f"{holder} has control" if holder else "nobody has control"
         if ended == "link" and lost:
-            return f"the link to the proxy of {name} is down: nobody has control, and what {name} does is not known"
+            return f"the link to the proxy of {name} is down: nobody has control, and the state of {name} is unknown"
         if ended == "link":
-            return f"the link to the proxy of {name} was lost: {now}, and what {name} flew meanwhile is not known"
+            return f"the link to the proxy of {name} was lost: {now}, and what {name} did meanwhile is unknown"
         if ended == "silent":
-            return f"the cockpit received nothing from this page for {self._gone_s:g} s, so its control ran out: {now}"
+            return f"the cockpit received nothing from this page for {self._gone_s:g} s, so its control expired: {now}"
         return f"{now} now"
 
 
 def _end_of_control(pilot: PilotConnection) -> str:
-    """Return how a page lost the control that it had: ``taken``, ``link``, ``silent`` or ``over``."""
+    """Return how a page lost control: ``taken``, ``link``, ``silent`` or ``over``."""
     if pilot.authority.state != "none":
         return "taken"
     if not pilot.is_linked:

@@ -1,7 +1,7 @@
-"""Keeps frames while a person draws a box, and tracks what is in it from that frame on, on threads of its own.
+"""Keeps frames while a person draws a box, and tracks its content from that frame on, on separate threads.
 
 Frames arrive on a listener's thread. The follower (:class:`skyloop.control.target_follower.TargetFollower`) is called
-on one other thread alone: it catches up frame by frame first, then takes the newest frame each time, and makes a
+on one other thread only: it first catches up frame by frame, then processes the newest frame each time, and makes a
 set-point after each frame and at least every :data:`PERIOD_S`.
 """
 
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from skyloop.messages.relayed import Shape
     from skyloop.vision import Detection
 
-KEPT_S: Final = 3.0  #: a picture that is older when its box comes is drawn again
+KEPT_S: Final = 3.0  #: a box on an older picture is refused and must be drawn again
 KEPT_BYTES: Final = 64 * 1024 * 1024
-#: While a tracker catches up it takes the newest frame that is no further than this from the one before.
+#: While catching up, a tracker takes the newest frame that is at most this far from the previous one.
 STRIDE_S: Final = 0.07
 
 _KEPT_NS: Final = nanoseconds(KEPT_S)
 _STRIDE_NS: Final = nanoseconds(STRIDE_S)
 PERIOD_S: Final = 0.05  #: between two set-points without a new frame
-SOURCE: Final = "follow"  #: of what is drawn
+SOURCE: Final = "follow"  #: of the drawings
 
 
 class KeptFrames:
     """Frames as JPEGs, ordered by capture, the newest :data:`KEPT_S` or :data:`KEPT_BYTES` of them."""
 
     def __init__(self, most_bytes: int = KEPT_BYTES) -> None:
-        """Keep nothing yet; at most ``most_bytes``."""
-        self.bytes = 0  #: of all that are kept
+        """Keep at most ``most_bytes`` of frames; none yet."""
+        self.bytes = 0  #: of all frames kept
         self._most_bytes = most_bytes
         self._frames: deque[Arrival] = deque()
 
@@ -55,7 +55,7 @@ class KeptFrames:
         return len(self._frames)
 
     def add(self, arrival: Arrival) -> None:
-        """Add a frame; one captured before the newest (a restarted proxy's) ends what was kept."""
+        """Add a frame; one captured before the newest (by a restarted proxy) discards the others."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
         self._frames.append(arrival)
@@ -67,38 +67,38 @@ class KeptFrames:
             self.bytes -= self._frames.popleft().header.size
 
     def clear(self) -> None:
-        """Keep nothing of what came so far."""
+        """Discard all frames."""
         self._frames.clear()
         self.bytes = 0
 
     def find(self, captured_ns: int) -> Arrival:
-        """Return the frame of that capture.
+        """Return the frame with this capture time.
 
         Raises:
-            RefusedError: It is not kept; the message says why.
+            RefusedError: It was not kept; the message says why.
         """
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
                 return arrival
         if not self._frames:
-            raise RefusedError("there is no frame yet to begin on: draw the box again")
+            raise RefusedError("no frame has arrived yet: draw the box again")
         oldest_ns, newest_ns = (self._frames[place].header.captured_ns for place in (0, -1))
         if oldest_ns < captured_ns < newest_ns:
-            raise RefusedError("the frame that the box was drawn on did not arrive here: draw the box again")
+            raise RefusedError("the frame under the box did not arrive here: draw the box again")
         if captured_ns > newest_ns:
-            raise RefusedError("the frame that the box was drawn on is newer than any that arrived here: draw it again")
+            raise RefusedError("the frame under the box is newer than any that arrived here: draw it again")
         raise RefusedError(
-            f"the picture was {seconds(newest_ns - captured_ns):.1f} s old when its box came, and the last "
+            f"the picture was {seconds(newest_ns - captured_ns):.1f} s old when its box arrived, and only the last "
             f"{seconds(newest_ns - oldest_ns):.1f} s are kept: draw the box again"
         )
 
     def next_after(self, captured_ns: int) -> Arrival | None:
-        """Return the frame to track in next while catching up; None if there is none newer.
+        """Return the next frame to track while catching up; None if none is newer.
 
-        It is the newest one that is at most :data:`STRIDE_S` after the last, or else the first one after it.
+        It is the newest one at most :data:`STRIDE_S` after the last, or else the first one after it.
 
         Args:
-            captured_ns: Capture of the last one.
+            captured_ns: Capture time of the last one.
         """
         best = None
         for arrival in self._frames:
@@ -111,29 +111,29 @@ class KeptFrames:
         return best
 
 
-_DEPTH: Final = 8  # frames that wait while others are made JPEGs: the one that was on the page must not be dropped
-_SAMPLES: Final = 1024  # of feedback, for the frames that are kept
+_DEPTH: Final = 8  # frames queued for JPEG encoding: the one shown on the page must not be dropped
+_SAMPLES: Final = 1024  # of feedback, for the frames kept
 _RESULTS: Final = 16  # of processors
 
 
 class FrameKeeper:
-    """Keeps frames of one camera, with feedback and detections, from when it is made until :meth:`close`.
+    """Keeps frames of one camera, with feedback and detections, until :meth:`close`.
 
     Args:
-        drone: Whose frames; may be an observer's.
+        drone: Provides the frames; may be an observer.
         camera: The camera's name.
-        first: Called once with the capture of the first frame that is kept [ns], on the listener's thread.
+        first: Called once with the capture time of the first frame kept [ns], on the listener's thread.
     """
 
     def __init__(self, drone: Drone, camera: str, first: Callable[[int], None] = lambda _: None) -> None:
         self.camera = camera
-        self.keeps = True  #: older frames than the newest, too
+        self.keeps = True  #: keep older frames, not just the newest
         self._first: Callable[[int], None] | None = first
         self._kept = KeptFrames()
         self._newest: Frame | None = None
         self._samples: deque[Feedback] = deque(maxlen=_SAMPLES)
         self._results: deque[Result] = deque(maxlen=_RESULTS)
-        self._news = threading.Condition()  # guards all above
+        self._news = threading.Condition()  # guards the fields above
         self._closed = False
         self._listeners: list[Listener[Any]] = [
             drone.on_feedback(self._on_feedback, inline=True),
@@ -142,25 +142,25 @@ class FrameKeeper:
         ]
 
     def find(self, captured_ns: int) -> Arrival:
-        """Return the frame of that capture; :class:`RefusedError` if it is not kept."""
+        """Return the frame with this capture time; :class:`RefusedError` if it was not kept."""
         with self._news:
             return self._kept.find(captured_ns)
 
     def catch_up(self, captured_ns: int) -> Arrival | None:
-        """Return the frame to track in next while catching up; None if there is none newer."""
+        """Return the next frame to track while catching up; None if none is newer."""
         with self._news:
             return self._kept.next_after(captured_ns)
 
     def newest(self, captured_ns: int, timeout_s: float) -> Frame | None:
-        """Return the newest frame, waiting for one that is not the one of that capture; None if none came in time."""
+        """Wait for a frame other than the one with this capture time, and return the newest; None if too late."""
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # its memory is the proxy's
+            frame, self._newest = self._newest, None  # its memory belongs to the proxy
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:
-        """Take the feedback that came since the last call, up to a capture [ns]; None: all."""
+        """Return and remove the feedback up to a capture time [ns]; None: all."""
         taken = []
         with self._news:
             while self._samples and (until_ns is None or self._samples[0].captured_ns <= until_ns):
@@ -168,14 +168,14 @@ class FrameKeeper:
         return taken
 
     def results(self) -> list[Result]:
-        """Take the results of processors that came since the last call."""
+        """Return and remove the results of processors."""
         with self._news:
             taken = list(self._results)
             self._results.clear()
             return taken
 
     def close(self) -> None:
-        """Unregister from the drone, without waiting, and wake who waits."""
+        """Unregister from the drone without waiting, and wake waiting threads."""
         for listener in self._listeners:
             listener.cancel(wait=False)
         with self._news:
@@ -199,7 +199,7 @@ class FrameKeeper:
     def _on_frame(self, frame: Frame) -> None:
         kept = compressed(frame) if self.keeps else None
         with self._news:
-            if self._closed or not self._samples:  # nothing is known of the vehicle at its capture
+            if self._closed or not self._samples:  # the vehicle's state at its capture is unknown
                 return
             if kept is not None and self.keeps:
                 self._kept.add(kept)
@@ -211,13 +211,14 @@ class FrameKeeper:
 
 
 def warm_up() -> None:
-    """Track once, in noise: what that imports takes the interpreter from everybody who flies by this cockpit.
+    """Track once, in noise, because its imports hold the interpreter lock while others fly by this cockpit.
 
-    SciPy, which matches detections, needs it for half a second on an idle computer and for seconds on a busy one. So
-    this runs as the cockpit starts, on a thread other than the event loop's, and not when a first target is marked.
+    SciPy, which matches detections, takes half a second to import on an idle computer and seconds on a busy one.
+    Therefore this runs as the cockpit starts, on a thread other than the event loop's, and not when a first target is
+    marked.
     """
     noise = np.random.default_rng(1).integers(0, 255, (96, 96, 3), np.uint8)
-    with suppress(MissingExtraError):  # who marks a target is told
+    with suppress(MissingExtraError):  # reported when a target is marked
         tracker = LongTermTracker()
         tracker.start(noise, (32.0, 32.0, 24.0, 32.0))
         tracker.update(noise)
@@ -225,7 +226,7 @@ def warm_up() -> None:
 
 
 class Follower(Protocol):
-    """As much of :class:`skyloop.control.target_follower.TargetFollower` as is used; called from one thread."""
+    """The part of :class:`skyloop.control.target_follower.TargetFollower` used here; called from one thread."""
 
     mode: Any
     settings: Any
@@ -242,17 +243,17 @@ class Follower(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TrackReport:
-    """What became of one step.
+    """The result of one step.
 
     Attributes:
-        status: Of the follower; None before its first frame.
-        caught_up: It has tracked up to the newest frame.
-        action: The set-point for now; None if none is wanted, and while it catches up.
-        over: The follower has given up.
+        status: The follower's; None before its first frame.
+        caught_up: Whether it has tracked up to the newest frame.
+        action: The set-point for now; None if none is wanted, and while catching up.
+        over: Whether the follower has given up.
         size: Width and height of the frames [px].
-        frame_ns: When a frame was tracked last, on this process's clock.
+        frame_ns: Time of tracking the last frame, on this process's clock.
         frame_age_s: Age of that frame when it was tracked [s].
-        problem: What went wrong in the follower, which is not called again; empty: nothing.
+        problem: An error of the follower, which is not called again; empty: none.
     """
 
     status: FollowStatus | None
@@ -266,13 +267,13 @@ class TrackReport:
 
 
 class TargetTracker:
-    """Calls a follower with frames and feedback on a thread of its own, and reports each step.
+    """Calls a follower with frames and feedback on a separate thread, and reports each step.
 
     Args:
-        drone: By which drawings are published; may be an observer's.
-        keeper: Keeps the frames; closed with this.
-        begin: The frame that the box was drawn on.
-        make: Makes the follower; called on the thread.
+        drone: Publishes the drawings; may be an observer.
+        keeper: Keeps the frames; closed with this object.
+        begin: The frame under the box.
+        make: Creates the follower; called on the thread.
         report: Called after each step, on the thread.
         clock: This process's monotonic clock [ns].
     """
@@ -286,9 +287,9 @@ class TargetTracker:
         report: Callable[[TrackReport], None],
         clock: Clock = monotonic_ns,
     ) -> None:
-        self.steers = False  #: set-points are wanted
-        self.mode = ""  #: applied with the next step; empty: as it was made
-        self.settings: Any = None  #: the same; None: as it was made
+        self.steers = False  #: whether set-points are wanted
+        self.mode = ""  #: applied with the next step; empty: unchanged
+        self.settings: Any = None  #: the same; None: unchanged
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
@@ -297,7 +298,7 @@ class TargetTracker:
         self._report = report
         self._clock = clock
         self._closed = False
-        self._seen_ns = 0  # capture of the frame that was tracked last
+        self._seen_ns = 0  # capture time of the last tracked frame
         self._frame_ns = clock()
         self._frame_age_s = 0.0
         self._size = (begin.header.width, begin.header.height)
@@ -308,12 +309,12 @@ class TargetTracker:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, without waiting for it."""
+        """Stop the thread without waiting for it."""
         self._closed = True
         self._keeper.close()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the thread, which was started, has ended."""
+        """Wait until the started thread has ended."""
         self._thread.join(timeout_s)
 
     # On the thread ---------------------------------------------------------------------------------------------
@@ -329,20 +330,20 @@ class TargetTracker:
                 del frame
         except SkyloopError as error:
             self._fail(follower, str(error))
-        except Exception as error:  # noqa: BLE001  (whatever is wrong in it, the vehicle hovers and the page is told)
+        except Exception as error:  # noqa: BLE001  (whatever fails in it, the vehicle hovers and the page learns why)
             self._fail(follower, f"tracking failed: {type(error).__name__}: {error}")
         finally:
             self._keeper.close()
 
     def _catch_up(self, follower: Follower) -> None:
-        """Track in the kept frames, from the one of the box on, for :data:`KEPT_S` at most: then in the newest."""
+        """Track in the kept frames, from that of the box on, for :data:`KEPT_S` at most; then in the newest."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
         arrival: Arrival | None
         arrival, self._begin = self._begin, None
         while arrival is not None and not self._closed and self._clock() < until_ns:
             frame = arrival.frame()
             self._feed(follower, frame.captured_ns)
-            self._look(follower, frame)
+            self._track(follower, frame)
             self._report(self._made(follower, None, caught_up=False))
             arrival = self._keeper.catch_up(self._seen_ns)
         self._keeper.keeps = False
@@ -356,12 +357,12 @@ class TargetTracker:
                 follower.settings = settings
         self._feed(follower, None)
         for result in self._keeper.results():
-            with suppress(DecodeError, MissingExtraError):  # as if no program had sent any
+            with suppress(DecodeError, MissingExtraError):  # as if no program had sent any detections
                 if isinstance(value := result.value, dict) and "detections" in value:
                     follower.detected(detections_of(value), result.captured_ns)
         if frame is not None:
-            self._look(follower, frame)
-        # A law that flies nothing would count on motion that does not come.
+            self._track(follower, frame)
+        # A law that flies nothing would count on motion that never happens.
         action = follower.step(self._clock() + self._drone.clock_offset_ns) if self.steers else None
         self._report(self._made(follower, action))
 
@@ -369,15 +370,15 @@ class TargetTracker:
         for sample in self._keeper.feedback(until_ns):
             follower.feedback(sample)
 
-    def _look(self, follower: Follower, frame: Frame) -> None:
+    def _track(self, follower: Follower, frame: Frame) -> None:
         shapes = follower.look(frame)
-        if not self.steers:  # the law's state would be drawn, too
+        if not self.steers:  # the drawing would include the law's state
             shapes = [one for one in shapes if not isinstance(one, Text)]
         self._seen_ns = frame.captured_ns
         self._frame_ns = self._clock()
         self._frame_age_s = frame.age_s
         self._size = frame.shape[1], frame.shape[0]
-        with suppress(UsageError):  # what can't be drawn is no reason to end a flight
+        with suppress(UsageError):  # a failed drawing is no reason to end a flight
             self._drone.annotate(frame, shapes, source=SOURCE)
 
     def _made(self, follower: Follower, action: AnyAction | None, *, caught_up: bool = True) -> TrackReport:
@@ -386,6 +387,6 @@ class TargetTracker:
 
     def _fail(self, follower: Follower | None, problem: str) -> None:
         status: FollowStatus | None = None
-        with suppress(Exception):  # it has failed already
+        with suppress(Exception):  # it has already failed
             status = None if follower is None else follower.status
         self._report(TrackReport(status, True, None, True, self._size, self._frame_ns, self._frame_age_s, problem))

@@ -1,6 +1,6 @@
-"""The view model: what pages are sent of a drone, made once for all of them, as plain JSON values.
+"""The view model: a drone's data for pages, made once for all of them, as plain JSON values.
 
-All is in SI units and radians; pages convert. What is not known is null.
+All values are in SI units and radians; pages convert. Unknown values are null.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 Json = dict[str, Any]
 
 _TARGET = re.compile(r"truth\.target\d*\.\w+")
-MAX_TEXT = 1000  #: characters of an event that pages get: there may be hundreds for a new one
+MAX_TEXT = 1000  #: characters of an event sent to pages: a new page may get hundreds of events
 
-#: The page's names of feedback's numbers.
+#: The page's names for feedback's numbers.
 _NUMBERS = {
     "battery": "battery",
     "battery_v": "battery_v",
@@ -45,7 +45,7 @@ _NUMBERS = {
     "yaw": "yaw_rad",
     "altitude": "altitude_m",
 }
-#: The page's names of feedback's vectors and of their parts: body axes (x forward, y left, z up), or world axes.
+#: The page's names for feedback's vectors and their components: body axes (x forward, y left, z up) or world axes.
 _VECTORS = {
     "velocity": ("velocity_m_s", ("forward", "left", "up")),
     "angular_velocity": ("angular_velocity_rad_s", ("x", "y", "z")),
@@ -53,18 +53,18 @@ _VECTORS = {
     "position": ("position_m", ("x", "y", "z")),
 }
 _BROKEN = (str(LinkState.LOST), str(LinkState.CLOSED))
-_CHANNELS_S = 0.5  # statistics cost sorting, and nobody reads faster
+_CHANNELS_S = 0.5  # between updates: statistics cost sorting, and people read no faster
 
 encode_json = msgspec.json.Encoder().encode
 
 
 def number(value: float | None) -> float | None:
-    """Return a number for JSON, to seven digits; None for what is not known or not finite."""
+    """Return a number for JSON, to seven digits; None if it is unknown or not finite."""
     return None if value is None or not math.isfinite(value) else float(f"{value:.7g}")
 
 
 def vector(values: tuple[float, ...] | None) -> list[float | None] | None:
-    """Return a vector for JSON; None if it is not known."""
+    """Return a vector for JSON; None if it is unknown."""
     return None if values is None else [number(value) for value in values]
 
 
@@ -90,7 +90,7 @@ def _scalars(feedback: Feedback) -> dict[str, float | None]:
 
 
 def motion_values(feedback: Feedback | None) -> Json:
-    """Return what instruments show, each value known by itself."""
+    """Return the values for the instruments, each null if unknown."""
     if feedback is None:
         names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "start", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
@@ -112,14 +112,14 @@ def motion_values(feedback: Feedback | None) -> Json:
 def flat_values(
     feedback: Feedback | None, logged: Mapping[str, float], set_point: AnyAction | None
 ) -> dict[str, float | None]:
-    """Return everything that is a number under a name of its own, for plots.
+    """Return every number under a unique name, for plots.
 
-    Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. What is not known is left out.
+    Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. Unknown numbers are omitted.
 
     Args:
         feedback: The newest, None for none.
         logged: The newest number of each series.
-        set_point: The command that is applied, None for none.
+        set_point: The command applied, None for none.
     """
     found: dict[str, float | None] = {}
     if feedback is not None:
@@ -137,7 +137,7 @@ def flat_values(
 
 
 def set_point_values(action: AnyAction, age_s: float) -> Json:
-    """Return a command as it was applied, as JSON values."""
+    """Return a command, as applied, as JSON values."""
     return {
         "action": ACTION_NAMES[type(action)],
         "values": {name: number(value) for name, value in _fields(action)},
@@ -146,10 +146,10 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 
 
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
-    """Return the pose that motion capture gives, as JSON values.
+    """Return the pose from motion capture as JSON values.
 
     Args:
-        pose: Position [m] and quaternion x, y, z, w; None if it is not known.
+        pose: Position [m] and quaternion x, y, z, w; None if unknown.
     """
     if pose is None:
         return None
@@ -158,7 +158,7 @@ def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
 
 
 def truth_values(native: Mapping[str, Value] | None) -> Json | None:
-    """Return where a simulated vehicle really is: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
+    """Return a simulated vehicle's true pose: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
     return None if native is None else _place(native, "truth")
 
 
@@ -175,7 +175,7 @@ def event_values(number_: int, event: Event, now_ns: int) -> Json:
     """Return an event as JSON values.
 
     Args:
-        number_: The number that the cockpit gave it.
+        number_: The number assigned by the cockpit.
         event: The event.
         now_ns: The proxy's clock.
     """
@@ -191,7 +191,7 @@ def event_values(number_: int, event: Event, now_ns: int) -> Json:
 
 
 def channel_values(stats: ChannelStats) -> Json:
-    """Return one channel's figures as JSON values; delays in seconds."""
+    """Return one channel's statistics as JSON values; delays in seconds."""
     delay = stats.delay_s
     return {
         "count": stats.count,
@@ -243,7 +243,7 @@ class TelemetryView:
         self._channels_task: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """Return what changes only when the vehicle is another one."""
+        """Return the values that only change with the vehicle."""
         station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",
@@ -259,12 +259,12 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """Return the newest of everything that moves, as a JSON object without its last brace."""
+        """Return the newest of all changing values, as a JSON object without its last brace."""
         self._refresh_channels()
         return encode_json(self._values(self._clock()))[:-1]
 
     def overview(self) -> Json:
-        """Return the drone in one row."""
+        """Return the drone's row in the overview."""
         feedback = self._feedback()
         vehicle = self.vehicle()
         motion = motion_values(feedback)
@@ -280,30 +280,30 @@ class TelemetryView:
         }
 
     def events(self, events: Sequence[tuple[int, Event]]) -> list[Json]:
-        """Return events with their numbers, for a page."""
+        """Return numbered events for a page."""
         now_ns = self._clock() + self._station.drone.clock_offset_ns
         return [event_values(number_, event, now_ns) for number_, event in events]
 
     def alarms(self, feedback: Feedback | None) -> list[Alarm]:
-        """Return what a person must know at once, the most severe first."""
+        """Return the present alarms, the most severe first."""
         drone = self._station.drone
-        # An age that comes from being sent less is nothing to worry about.
+        # Feedback that is old because it is sent less often is no reason for an alarm.
         age_s = None if feedback is None else self._age_s(feedback.captured_ns) - self._station.feedback_period_s
-        ages: dict[str, float] = {}  # by camera, the youngest of what is shown of it
+        ages: dict[str, float] = {}  # by camera, of the youngest stream shown
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
                 ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
         link = drone.link
         degraded_s = self._degraded.update(link, self._clock())
         found = alarms(link, feedback, age_s, ages, degraded_s, self._station.thresholds.newest())
-        # The proxy of a recording has a failsafe too, and nothing that it could land.
+        # A replay's proxy also has a failsafe, but no vehicle to land.
         return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 
     def holder(self, feedback: Feedback | None) -> str | None:
-        """Return who has the authority.
+        """Return the name of the holder of the authority.
 
-        That is nobody if the lease ended by silence, though feedback keeps the name, and if there is no proxy that
-        could give one.
+        None if the lease ended by silence, though feedback keeps the name, and if there is no proxy that could grant
+        one.
         """
         broken = self._links()["application"] in _BROKEN
         return None if feedback is None or broken or not feedback.lease else feedback.owner
@@ -322,7 +322,7 @@ class TelemetryView:
         station, log_feed, feedback = self._station, self._station.log_feed, self._feedback()
         links = self._links()
         if links["application"] in _BROKEN:
-            log_feed.applied = None  # nobody knows what is applied now, and after its return it is not what was
+            log_feed.applied = None  # unknown now, and no longer applied once the link is back
         applied = log_feed.applied
         native = None if feedback is None else feedback.native
         proxy_ns = now_ns + station.drone.clock_offset_ns
@@ -372,7 +372,7 @@ class TelemetryView:
         }
 
     def _waypoints(self) -> list[Json]:
-        """Return where pages fly it to, then what controllers have logged."""
+        """Return the goals of pages, followed by those logged by controllers."""
         goals = [
             {"position": vector(goal.position), "yaw": number(goal.yaw), "app": app}
             for app, goal in self._station.goals.items()
@@ -384,7 +384,7 @@ class TelemetryView:
         return goals + logged
 
     def _age_s(self, captured_ns: int) -> float:
-        """Return the age of what is stamped on the proxy's clock [s]."""
+        """Return the age of a timestamp on the proxy's clock [s]."""
         return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
 
     def _refresh_channels(self) -> None:
@@ -396,16 +396,16 @@ class TelemetryView:
             self._channels_task = asyncio.create_task(self._read_channels())
 
     async def _read_channels(self) -> None:
-        # On another thread: for the command delay the drone asks the proxy, and waits for its answer.
+        # On another thread: the drone asks the proxy for the command delay, and waits for the answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
-            for feed in self._station.streams.values():  # what a page shows as H.264 does not come as frames
+            for feed in self._station.streams.values():  # H.264 shown on pages does not arrive as frames
                 name, youngest_s = f"video/{feed.camera}", feed.age_s
                 known = stats.get(name)
                 if youngest_s is not None and (known is None or known.age_s is None or youngest_s < known.age_s):
                     stats = {**stats, name: feed.stats()}
             shown = {feed.camera for feed in self._station.feeds if feed.wanted}
-            # Of video that no page shows there is nothing to tell: what did not come was not asked for.
+            # No statistics for video that no page shows: it was not requested, so none arrived.
             stats = {
                 name: one
                 for name, one in stats.items()

@@ -1,4 +1,4 @@
-"""Pages without a browser: for tests, and for measuring what pages cost.
+"""Pages without a browser, for tests and for measuring the cost of pages.
 
 ::
 
@@ -6,8 +6,8 @@
         …
     print(pages.frames, pages.newest_age_s)
 
-Each opens the telemetry and the video of one drone and acknowledges every frame, as a browser's page does once it has
-drawn it. Nothing is decoded: drawing costs only the browser.
+Each opens the telemetry and video of one drone and acknowledges every frame, as a browser's page does after drawing
+it. Nothing is decoded: drawing only costs the browser.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ class HeadlessPage:
         tls: ssl.SSLContext | None = None,
         draw_s: float = 0.0,
     ) -> None:
-        """Prepare a page; nothing is opened yet.
+        """Prepare a page without opening anything.
 
         Args:
-            address: Of the cockpit, as it prints it.
+            address: Of the cockpit, as printed.
             drone: The drone's name.
             cameras: The cameras to watch (default: the first).
-            token: Where the cockpit asks for one.
+            token: A token, if the cockpit asks for one.
             tls: For an ``https`` address.
-            draw_s: How long a frame takes to be drawn [s].
+            draw_s: Simulated time to draw a frame [s].
         """
         self.drone = drone
         self.states = 0  #: telemetry messages
         self.frames = 0
         self.bytes = 0  #: of all frames
-        self.newest_age_s: float | None = None  #: of the newest frame when it came, where both ends share a clock
+        self.newest_age_s: float | None = None  #: of the newest frame on arrival, if both ends share a clock
         self.vehicle: dict[str, Any] = {}
         self.state: dict[str, Any] = {}  #: the newest
         self._origin = address.rstrip("/")
@@ -84,7 +84,7 @@ class HeadlessPage:
         """Watch until cancelled.
 
         Raises:
-            LinkError: The cockpit ends it, or does not let the page in.
+            LinkError: The cockpit closes the connection, or refuses the page.
         """
         base = f"/ws/drones/{self.drone}"
         try:
@@ -98,9 +98,9 @@ class HeadlessPage:
                     for camera in cameras:
                         group.create_task(self._watch(f"{base}/video/{camera}"))
         except (OSError, InvalidStatus, ConnectionClosed) as error:
-            raise LinkError(f"the cockpit at {self._origin} ended it: {error}") from error
+            raise LinkError(f"the cockpit at {self._origin} closed the connection: {error}") from error
         except ExceptionGroup as group_of:
-            raise LinkError(f"the cockpit at {self._origin} ended it: {group_of.exceptions[0]}") from group_of
+            raise LinkError(f"the cockpit at {self._origin} closed it: {group_of.exceptions[0]}") from group_of
 
     async def _listen(self, socket: ClientConnection) -> None:
         async for message in socket:
@@ -124,16 +124,16 @@ class HeadlessPage:
 
 
 def unpack_head(message: bytes) -> dict[str, Any]:
-    """Return the head of a binary message, which stands before the JPEG file."""
+    """Return the head of a binary message, which precedes the JPEG file."""
     (length,) = _LENGTH.unpack_from(message)
     head: dict[str, Any] = json.loads(message[_LENGTH.size : _LENGTH.size + length])
     return head
 
 
 class Pages:
-    """Several pages on a thread of their own; a context manager for programs that are not asynchronous.
+    """Several pages on one separate thread; a context manager for programs without asyncio.
 
-    Entering it returns when each page has its first state, and raises :class:`LinkError` if they don't within
+    Entering it returns once each page has its first state, and raises :class:`LinkError` if that takes longer than
     :data:`STARTS_WITHIN_S`.
     """
 
@@ -141,13 +141,13 @@ class Pages:
         """Prepare the pages.
 
         Args:
-            address: Of the cockpit, as it prints it.
+            address: Of the cockpit, as printed.
             drone: The drone's name.
-            count: How many pages.
-            **options: As of :class:`HeadlessPage`.
+            count: The number of pages.
+            **options: As for :class:`HeadlessPage`.
         """
         self.clients = [HeadlessPage(address, drone, **options) for _ in range(count)]
-        self.problem: BaseException | None = None  #: why they ended, if they did
+        self.problem: BaseException | None = None  #: why the pages ended, if they did
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
         self._changed = threading.Event()
@@ -155,21 +155,21 @@ class Pages:
 
     @property
     def frames(self) -> int:
-        """Frames of all pages."""
+        """Total frames of all pages."""
         return sum(client.frames for client in self.clients)
 
     @property
     def newest_age_s(self) -> float | None:
-        """The largest age that the newest frame of a page had [s]; None if a page had no frame."""
+        """The largest age among the pages' newest frames [s]; None if a page had no frame."""
         ages = [client.newest_age_s for client in self.clients]
         known = [age for age in ages if age is not None]
         return max(known) if known and len(known) == len(ages) else None
 
     def __enter__(self) -> Self:
-        """Open the pages, and return when each has its first state.
+        """Open the pages, and return once each has its first state.
 
         Raises:
-            LinkError: They don't within :data:`STARTS_WITHIN_S`.
+            LinkError: That takes longer than :data:`STARTS_WITHIN_S`.
         """
         self._thread.start()
         self._changed.wait(STARTS_WITHIN_S)
@@ -181,7 +181,7 @@ class Pages:
     def close(self) -> None:
         """Close all pages. Idempotent."""
         if self._loop is not None and self._stop is not None and not self._loop.is_closed():
-            with suppress(RuntimeError):  # closed in this very moment
+            with suppress(RuntimeError):  # the loop was closed at this moment
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
 

@@ -1,6 +1,6 @@
-"""What is around a drone: what stands there, where it may fly, where its cameras look; and whether it is ready.
+"""A drone's surroundings: the scenery, where it may fly, where its cameras point; and whether it is ready.
 
-All requests only read.
+All requests are read-only.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
     from skyloop.messages.parameter import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
-RECORDED: Final = "recorded."  #: before the names of recorded parameters: docs/replay.md
+RECORDED: Final = "recorded."  #: prefix of recorded parameters: docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Return what maps show around a drone. Asks its proxy, and waits for the answers.
+    """Return a drone's surroundings for maps. Asks its proxy and waits for the answers.
 
     Args:
         drone: The drone.
-        given: What stands there if the drone does not know.
+        given: The scenery for a drone that does not report its own.
 
     Raises:
         LinkError: The proxy does not answer.
@@ -63,7 +63,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 
 
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
-    """Return what speaks against flying straight to a place from where the drone is: the proxy's own decision.
+    """Return the proxy's reasons against flying straight to a place from the drone's position.
 
     Args:
         drone: The drone.
@@ -84,7 +84,7 @@ def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
 
 
 def space_from(read: Callable[[str], Value | None]) -> Space:
-    """Return where parameters allow a vehicle to fly; those that it does not have limit nothing."""
+    """Return where parameters allow a vehicle to fly; missing ones limit nothing."""
 
     def edge(name: str) -> float:
         value = read(name)
@@ -97,11 +97,11 @@ def space_from(read: Callable[[str], Value | None]) -> Space:
     try:
         return space_of(edge, text)
     except ParameterError:
-        return Space()  # a driver with another notion of these names
+        return Space()  # a driver uses these names for something else
 
 
 def geometry_values(world: WorldGeometry | None) -> Json:
-    """Return what stands in a world as JSON values; empty lists where nothing is known."""
+    """Return a world's scenery as JSON values; empty lists if nothing is known."""
     if world is None:
         return {"name": "", "room": None, "solids": [], "gates": [], "markers": [], "starts": [], "left_out": 0}
     room = None
@@ -119,7 +119,7 @@ def geometry_values(world: WorldGeometry | None) -> Json:
 
 
 def view_values(camera: CameraInfo) -> Json:
-    """Return where a camera looks: the rays through the corners of its pictures, in body axes; null if not known."""
+    """Return a camera's view: the rays through its pictures' corners, in body axes; null if unknown."""
     lens, rotation = camera.intrinsics, camera.rotation
     rays = None
     if lens is not None and rotation is not None and lens.fx > 0 and lens.fy > 0:
@@ -140,9 +140,9 @@ def _newest(drone: Drone) -> Feedback | None:
 
 
 def _reader(drone: Drone) -> Callable[[str], Value | None]:
-    """Return what reads a parameter's value; None where there is no such parameter."""
+    """Return a function that reads a parameter's value, or None if there is no such parameter."""
     found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
-    # The limits and zones of a replay's own proxy are those of nothing: what the recorded vehicle had is shown.
+    # A replay's own proxy has meaningless limits and zones: show those of the recorded vehicle.
     prefix = RECORDED if drone.uri.startswith("replay:") else ""
     return lambda name: found.get(prefix + name)
 
@@ -153,7 +153,7 @@ def _known(text: Value | None) -> WorldGeometry | None:
     try:
         return decode_world(text)
     except ValueError:
-        return None  # a driver with another notion of this name
+        return None  # a driver uses this name for something else
 
 
 def _limit(value: Value | None) -> float | None:
@@ -179,7 +179,7 @@ def _fields(thing: Any) -> Json:
 
 
 _OURS: Final = PreflightFinding("control", Level.OK, "a page of this cockpit has control")
-MAX_ASKING: Final = 4  #: drones that are asked at one time; each may take its thread for seconds
+MAX_ASKING: Final = 4  #: requests to drones at one time; each may block its thread for seconds
 
 
 class WorldApi:
@@ -187,8 +187,8 @@ class WorldApi:
 
     Args:
         fleet: The drones.
-        recordings: Where they are recorded to.
-        given: What stands around drones that don't know it themselves.
+        recordings: Where they are recorded.
+        given: The surroundings of drones that don't report them.
     """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
@@ -207,18 +207,18 @@ class WorldApi:
 
     @answered
     async def world(self, request: Request) -> Response:
-        """Answer with what maps show around a drone."""
+        """Answer with a drone's surroundings for maps."""
         return await self._ask(request, lambda drone: world_values(drone, self._given))
 
     @answered
     async def way(self, request: Request) -> Response:
-        """Answer with what speaks against flying straight to a place, ``?to=X,Y,Z``."""
+        """Answer with the reasons against flying straight to a place, ``?to=X,Y,Z``."""
         place = _place(request.query_params.get("to", ""))
         return await self._ask(request, lambda drone: way_values(drone, place))
 
     @answered
     async def preflight(self, request: Request) -> Response:
-        """Answer with the checklist before a flight."""
+        """Answer with the preflight checklist."""
         folder = self._recordings.folder
         station = self._fleet.stations.get(request.path_params["name"])
         ours = station is not None and bool(station.view.overview()["me"])
@@ -244,5 +244,5 @@ def _place(text: str) -> tuple[float, float, float]:
     except ValueError:
         x = y = z = math.nan
     if not all(map(math.isfinite, (x, y, z))):
-        raise BadRequest(400, f"to must be three finite numbers in metres, as 1.5,0,1, not {text!r:.60}")
+        raise BadRequest(400, f"to must be three finite numbers in metres, such as 1.5,0,1, not {text!r:.60}")
     return x, y, z

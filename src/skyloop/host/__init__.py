@@ -1,1 +1,1 @@
-"""Many vehicles from one process: proxies that share their threads, added and removed while others fly."""
+"""Many vehicles in one process: proxies that share their threads, added and removed while others fly."""

@@ -1,4 +1,4 @@
-"""The file of a host's vehicles, ``fleet.toml``. Pure, but for reading it; ``docs/host.md`` describes it."""
+"""A host's vehicle file, ``fleet.toml``. Pure except for reading it; described in ``docs/host.md``."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
-HOST: Final = "host"  #: the name of a host that has none
-#: Schemes whose vehicle is made by its address: two with the same one are two vehicles.
+HOST: Final = "host"  #: default name of a host
+#: Schemes whose address creates the vehicle: two vehicles may share one.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")
 
 
 class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``limits``: the proxy's parameters of these names."""
+    """``limits``: the proxy parameters of the same names."""
 
     tilt: float | None = None
     climb: float | None = None
@@ -35,16 +35,16 @@ class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unkno
 
 
 class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``[defaults]``: what holds for each vehicle that says nothing else."""
+    """``[defaults]``: settings of each vehicle that does not override them."""
 
-    network: Text | None = None  #: as ``--network`` of ``skyloop proxy``; ``off`` for this host only
+    network: Text | None = None  #: like ``--network`` of ``skyloop proxy``; ``off`` for this host only
     listen: list[str] | None = None
-    multicast: bool | None = None  #: whether to be found by multicast, where ``network`` names it
-    keys: Text | None = None  #: folder of an identity
-    group: Text | None = None  #: of users who may connect as well
+    multicast: bool | None = None  #: whether multicast discovery works, where ``network`` names it
+    keys: Text | None = None  #: an identity's folder
+    group: Text | None = None  #: users who may also connect
     limits: FlightLimits | None = None
     zones: list[str] | None = None
-    parameters: dict[str, Any] | None = None  #: of the proxy, by name
+    parameters: dict[str, Any] | None = None  #: the proxy's parameters, by name
     autostart: bool | None = None
     process: Literal["shared", "own"] | None = None
 
@@ -78,12 +78,12 @@ class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def encode_handed(value: object) -> bytes:
-    """Encode settings, or what has them in it, for the process that serves the vehicle: with secrets of addresses."""
+    """Encode settings, alone or nested, for the process that serves the vehicle, including secrets in addresses."""
     return msgspec.json.encode(value, enc_hook=_revealed)
 
 
 def decoder_of_handed(kind: Any) -> msgspec.json.Decoder[Any]:
-    """Return a decoder of what :func:`encode_handed` returned, of this type."""
+    """Return a decoder for :func:`encode_handed`'s output, of this type."""
     return msgspec.json.Decoder(kind, dec_hook=lambda _, text: parse_uri(text))
 
 
@@ -94,29 +94,29 @@ def _revealed(value: object) -> str:
 
 
 class Fleet(msgspec.Struct, frozen=True):
-    """What a host serves."""
+    """The vehicles of a host."""
 
     name: str
     vehicles: tuple[VehicleSettings, ...]
-    defaults: Defaults  #: for vehicles that are added by their address
+    defaults: Defaults  #: for vehicles added by address
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Read the file of a host's vehicles.
+    """Read a host's vehicle file.
 
-    Folders of keys in it are relative to its own folder.
+    Key folders in it are relative to the file's own folder.
 
     Raises:
-        UsageError: There is no such file, or it can't be read.
-        FileFormatError: It is not TOML, a key is unknown or missing, or a value is not valid; says where, and what is
-            allowed.
+        UsageError: The file is missing or unreadable.
+        FileFormatError: It is not TOML, a key is unknown or missing, or a value is invalid; the message says where, and
+            what is allowed.
     """
     path = expand(path)
     try:
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise UsageError(f"the file of vehicles {path} can't be read: {error.strerror}") from None
+        raise UsageError(f"the vehicle file {path} can't be read: {error.strerror}") from None
     if len(data) > MAX_BYTES:
         raise FileFormatError(f"{path}: the file has more than {MAX_BYTES} bytes")
     try:
@@ -137,7 +137,7 @@ def read_fleet(path: Path) -> Fleet:
 
 
 def parse_fleet(text: str, source: str) -> Fleet:
-    """Parse the text of a file of vehicles; see :func:`read_fleet`."""
+    """Parse a vehicle file's text; see :func:`read_fleet`."""
     found = read_tables(parse_toml(text, source), source, _File)
     top = Place(source)
     _checked(top, "name", lambda: check_name(found.name))
@@ -148,20 +148,20 @@ def parse_fleet(text: str, source: str) -> Fleet:
         place = top.item("vehicle", number, vehicle.name)
         settings = settings_of(vehicle, found.defaults, place, vehicle)
         if settings.name in seen:
-            raise place.error("name", f"{settings.name!r} is the name of two vehicles, and must be one's")
+            raise place.error("name", f"{settings.name!r} is the name of two vehicles; names must be unique")
         for other in vehicles:
             if other.address == settings.address and settings.address.scheme not in MADE_BY_ADDRESS:
-                raise place.error("address", f"{str(settings.address)!r} is the address of {other.name!r} too")
+                raise place.error("address", f"{str(settings.address)!r} is also the address of {other.name!r}")
         seen[settings.name] = place
         vehicles.append(settings)
     return Fleet(found.name, tuple(vehicles), found.defaults)
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with the defaults filled in; ``own`` is what the file has at ``place``.
+    """Return a vehicle's settings with the defaults filled in; ``own`` holds the file's values at ``place``.
 
     Raises:
-        FileFormatError: A value is not valid.
+        FileFormatError: A value is invalid.
     """
     _checked(place, "name", lambda: check_name(vehicle.name))
     uri = _checked(place, "address", lambda: parse_uri(vehicle.address))
@@ -176,7 +176,7 @@ def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Default
         network = None
     for key in ("keys", "listen"):
         if network is None and getattr(own, key) and own is vehicle:
-            raise place.error(key, 'it is for the network: give network = "multicast", or addresses, as well')
+            raise place.error(key, 'it needs the network: also set network = "multicast", or addresses')
     presets = {**_presets(defaults), **_presets(vehicle)}
     own_presets = _presets(own)
     for name in own_presets:
@@ -217,7 +217,7 @@ def _check_preset(place: Place, name: str, presets: dict[str, Value]) -> None:
 
 
 def _checked(place: Place, key: str, check: Any) -> Any:
-    """Return what ``check`` returns; what it raises becomes an error of the file."""
+    """Return ``check``'s result; turn its exceptions into errors of the file."""
     try:
         return check()
     except FileFormatError:

@@ -1,4 +1,4 @@
-"""The host: any number of vehicles in one process, each of which can fail, come and go without the others noticing."""
+"""The host: any number of vehicles in one process, which fail, join and leave without affecting the others."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNa
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.threads import HANG_LOOKS, LOOK_S, STALL_LOOKS, RequestWorkers, SharedLoop, Ticker, Watchdog
+from skyloop.host.threads import CHECK_S, HANG_CHECKS, STALL_CHECKS, RequestWorkers, SharedLoop, Ticker, Watchdog
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
@@ -30,13 +30,13 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-LAND_WITHIN_S: Final = 20.0
-_AT_ONCE: Final = 8  # vehicles that start at the same time
-_STALL_S: Final = STALL_LOOKS * LOOK_S
-_HANG_S: Final = HANG_LOOKS * LOOK_S
+LAND_WITHIN_S: Final = 20.0  #: default time for a landing
+_AT_ONCE: Final = 8  # vehicles that start concurrently
+_STALL_S: Final = STALL_CHECKS * CHECK_S
+_HANG_S: Final = HANG_CHECKS * CHECK_S
 _log = logging.getLogger(__name__)
 
-#: Shows a line to who runs the host.
+#: Shows a line to the host's operator.
 Announce = Callable[[str], None]
 
 
@@ -44,18 +44,18 @@ class Host:
     """Serves vehicles on shared threads, from its construction to :meth:`close`. Any thread.
 
     Args:
-        announce: Called with a line for people when a vehicle comes, fails or goes.
-        make: Makes the driver of an address, for vehicles of this process.
+        announce: Called with a line for people when a vehicle joins, fails or leaves.
+        make: Creates an address's driver, for vehicles of this process.
     """
 
     def __init__(self, announce: Announce = _log.info, make: Callable[[VehicleUri], Driver] = make_driver) -> None:
         self.announce = announce
         self._make_driver = make
         self._overview = OverviewRegistry()
-        self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they came
-        self.known: dict[str, VehicleSettings] = {}  #: what can be started by its name alone
-        self._lock = threading.Lock()  # guards who is there, and the loops
-        self._reactor = Reactor()  # for vehicles that come
+        self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order of joining
+        self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
+        self._lock = threading.Lock()  # guards the vehicles and the loops
+        self._reactor = Reactor()  # for vehicles that join
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -65,28 +65,28 @@ class Host:
         self._closing = False
 
     def proxies(self) -> list[Proxy]:
-        """Return the proxies of this process that serve now. Any thread."""
+        """Return the proxies now serving in this process. Any thread."""
         present = (vehicle.proxy for vehicle in list(self.vehicles.values()) if isinstance(vehicle, SharedVehicle))
         return [proxy for proxy in present if proxy is not None]
 
-    # Coming and going --------------------------------------------------------------------------------------------
+    # Joining and leaving -----------------------------------------------------------------------------------------
 
     def add(self, settings: VehicleSettings) -> HostedVehicle:
         """Serve one more vehicle.
 
         Raises:
             NameTakenError: This host, or another running proxy, has the name.
-            SkyloopError: The vehicle can't be served; it is listed as failed then.
+            SkyloopError: The vehicle can't be served; it is then listed as failed.
         """
         network = network_of(settings)
         with self._lock:
             if self._closing:
-                raise RefusedError("this host is ending", code="busy")
+                raise RefusedError("this host is shutting down", code="busy")
             present = self.vehicles.get(settings.name)
             if present is not None and present.runs:
                 raise NameTakenError(
-                    f"this host has a vehicle named {settings.name!r} already, {present.settings.address}: choose "
-                    f"another name, or remove that one: skyloop host remove {settings.name}"
+                    f"this host already has a vehicle named {settings.name!r}, {present.settings.address}: choose "
+                    f"another name, or remove it first: skyloop host remove {settings.name}"
                 )
             vehicle = self._make(settings, network)
             vehicle.condition = Condition.STARTING
@@ -101,7 +101,7 @@ class Host:
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
-            # It may have been removed the moment it ran: what has ended is not ticked, see _forget.
+            # It may have been removed the moment it ran; _forget stops the ticks of an ended proxy.
             if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None and vehicle.runs:
                 self._ticker.add(vehicle.proxy)
         return vehicle
@@ -109,9 +109,9 @@ class Host:
     def _make(self, settings: VehicleSettings, network: FabricSettings | None) -> HostedVehicle:
         if settings.own_process:
             return OwnProcessVehicle(settings, self.announce)
-        lane = self._workers.lane()
+        jobs = self._workers.queue()
         return SharedVehicle(
-            settings, self._reactor, lane, network, self._make_driver, self._overview, self._serve_link
+            settings, self._reactor, jobs, network, self._make_driver, self._overview, self._serve_link
         )
 
     def _serve_link(self, vehicle: SharedVehicle, link: ServedLink) -> None:
@@ -119,7 +119,7 @@ class Host:
             self._links.add(link, vehicle)
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
-        """Serve several vehicles, some at a time; return by name why some could not be served."""
+        """Serve several vehicles, some concurrently; return by name why any of them failed."""
         problems: dict[str, str] = {}
 
         def add(settings: VehicleSettings) -> None:
@@ -137,16 +137,16 @@ class Host:
 
         Args:
             name: The vehicle.
-            land: Land it even if it flies under somebody's lease.
-            timeout_s: How long to wait until it has landed [s].
+            land: Land it even if it flies under a pilot's lease.
+            timeout_s: Time to wait for the landing [s].
 
         Returns:
             Its last status.
 
         Raises:
-            UnknownNameError: There is none of this name.
-            RefusedError: It flies under a lease (code ``flown``), or has not landed in time (``flying``); it is not
-                removed then.
+            UnknownNameError: There is no vehicle of this name.
+            RefusedError: It flies under a lease (code ``flown``), or has not landed in time (``flying``); then it is
+                not removed.
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -154,15 +154,15 @@ class Host:
         status = vehicle.status()
         if status.airborne and status.pilot is not None and not land:
             raise RefusedError(
-                f"{name} flies, and {status.pilot} has the authority: let {status.pilot} land it, or land and remove "
-                f"it all the same: skyloop host remove {name} --land",
+                f"{name} is flying, and {status.pilot} has the authority: let {status.pilot} land it, or land and "
+                f"remove it anyway: skyloop host remove {name} --land",
                 code="flown",
             )
         proxy = vehicle.proxy if isinstance(vehicle, SharedVehicle) else None
         if not self._end(vehicle, timeout_s, "it was removed from its host", unless_flying=True):
             raise RefusedError(
-                f"{name} has not landed within {timeout_s:g} s and is not removed: it goes on to land and takes no "
-                "set-points any more; try again",
+                f"{name} has not landed within {timeout_s:g} s and is not removed: it keeps landing and accepts no "
+                "more set-points; try again",
                 code="flying",
             )
         with self._lock:
@@ -187,7 +187,7 @@ class Host:
         return ended
 
     def _forget(self, proxy: Proxy) -> None:
-        """Tick an ended proxy no more, and close the loops that were its own."""
+        """Stop ticking an ended proxy, and close the loops that only it used."""
         with self._lock:
             for loop in self._loops:
                 if isinstance(loop, Ticker):
@@ -198,11 +198,11 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Whether vehicles that come are served by this loop; else it was left to one whose driver has blocked."""
+        """Return whether new vehicles join this loop; otherwise it was left to a vehicle whose driver blocks."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
-        """Return a row for each vehicle, also for those of the file that were not started."""
+        """Return a row for each vehicle, including those in the file that were not started."""
         with self._lock:
             vehicles = dict(self.vehicles)
             known = dict(self.known)
@@ -215,7 +215,7 @@ class Host:
         return rows
 
     def publish_keys(self, change: str) -> None:
-        """Publish what is new about the keys of the network, to everybody."""
+        """Publish news about the network's keys to everybody."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
                 vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
@@ -226,13 +226,13 @@ class Host:
         within_s: float = 0.0,
         hurry: Callable[[], bool] = lambda: False,
     ) -> None:
-        """End all flights and all proxies at the same time, and all threads that are not stuck. Idempotent.
+        """End all flights and proxies at once, and all threads that are not stuck. Idempotent.
 
         Args:
             reason: Why, for people.
-            within_s: How long they may take to land [s].
-            hurry: Asked several times a second whether to wait for them no longer; Ctrl-C, where nothing else handles
-                it, does the same, and is raised at the end.
+            within_s: Time allowed for landings [s].
+            hurry: Polled several times a second; True stops waiting for landings. So does Ctrl-C if nothing else
+                handles it; it is raised at the end.
         """
         with self._lock:
             self._closing = True
@@ -247,7 +247,7 @@ class Host:
                 if proxy is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
-            # A thread of its own for each: a driver that hangs keeps no other vehicle in the air.
+            # One thread each: a driver that hangs must not keep another vehicle in the air.
             at_once(
                 {vehicle: partial(end, vehicle) for vehicle in vehicles},
                 tell=tell,
@@ -259,21 +259,21 @@ class Host:
                 loop.close()
             self._workers.close()
 
-    # When a driver hangs or fails --------------------------------------------------------------------------------
+    # Drivers that hang or fail -----------------------------------------------------------------------------------
 
     def _of(self, member: Any) -> SharedVehicle | None:
-        """Return the vehicle that this is, or whose transport server or proxy."""
+        """Return this vehicle, or the one that owns this transport server or proxy."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and member in (vehicle, vehicle.server, vehicle.proxy):
                 return vehicle
         return None
 
     def _on_stall(self, loop: SharedLoop, member: Any) -> None:
-        """Give all other vehicles of a loop another one."""
+        """Move all other vehicles of a loop to a new one."""
         with self._lock:
             new: SharedLoop
             if not self._is_shared(loop):
-                return  # it is the vehicle's own since an earlier stall
+                return  # an earlier stall left the loop to this vehicle
             if isinstance(loop, Reactor) and isinstance(member, SharedLocalServer):
                 new = self._reactor = loop.split(member)
             elif isinstance(loop, Ticker) and isinstance(member, Proxy):
@@ -285,14 +285,14 @@ class Host:
             self._loops.append(new)
         vehicle = self._of(member)
         if vehicle is not None:
-            self.announce(f"vehicle of {vehicle.settings.name}: its driver has blocked for {_STALL_S:g} s")
+            self.announce(f"vehicle of {vehicle.settings.name}: its driver has been blocking for {_STALL_S:g} s")
             vehicle.report_stall(_STALL_S)
 
     def _on_hang(self, loop: SharedLoop, member: Any) -> None:
-        """Give a vehicle up."""
+        """Give up a vehicle."""
         with self._lock:
             self._loops.remove(loop)
-        loop.close()  # if it ever comes back
+        loop.close()  # in case it ever returns
         vehicle = self._of(member)
         if vehicle is not None:
             self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
@@ -300,10 +300,10 @@ class Host:
     def _on_failing(self, proxy: Proxy, error: BaseException) -> None:
         vehicle = self._of(proxy)
         if vehicle is not None:
-            self._give_up(vehicle, f"its driver fails each time that it is asked, so that nothing guards it: {error!r}")
+            self._give_up(vehicle, f"its driver fails at every tick, so that no failsafe runs: {error!r}")
 
     def _give_up(self, vehicle: SharedVehicle, reason: str) -> None:
-        """End a vehicle whose driver does not work, on a thread of its own."""
+        """End a vehicle whose driver does not work, on a separate thread."""
 
         def end() -> None:
             proxy = vehicle.proxy
@@ -316,16 +316,16 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle that the host's file names.
+    """Return the settings of a vehicle in the host's file.
 
     Raises:
-        UnknownNameError: It names none of this name.
-        UsageError: It runs already.
+        UnknownNameError: The file has no such vehicle.
+        UsageError: It is already running.
     """
     settings = host.known.get(name)
     if settings is None:
         raise UnknownNameError("vehicle of this host's file", name, host.known)
     present = host.vehicles.get(name)
     if present is not None and present.runs:
-        raise UsageError(f"{name} runs already: skyloop host status shows it")
+        raise UsageError(f"{name} is already running, see skyloop host status")
     return settings

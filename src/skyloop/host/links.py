@@ -1,6 +1,6 @@
-"""One thread for the links of many vehicles: where each has its own, most of the time goes to changing between them.
+"""One thread for many vehicles' links: with a thread each, most time would go to switching between them.
 
-Commands do not come here: they are sent on the thread that receives them.
+Commands bypass it: they are sent on the thread that receives them.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
 
-_LONGEST_WAIT_NS: Final = 1_000_000_000
-_MOST_STALE: Final = 4  #: entries of the queue for each link, before those that no longer count are thrown out
+_LONGEST_WAIT_NS: Final = 1_000_000_000  #: of the selector
+_MOST_STALE: Final = 4  #: queue entries per link before stale ones are removed
 
 
 class LinkThread:
-    """Serves links on one thread, from its construction to :meth:`close`, each when it has something to read or to do.
+    """Serves links on one thread, from its construction to :meth:`close`, when they are readable or due.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it is in, and can be split.
+    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it runs, and can be split.
 
     Args:
-        links: Those that it serves from the beginning, each with the vehicle that it belongs to.
+        links: The initial links, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
         self.inside: Any = None  #: the vehicle whose link is being served
-        self.entries = 0  #: how often :attr:`inside` was set
+        self.entries = 0  #: number of times :attr:`inside` was set
         self._selector = selectors.DefaultSelector()
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards who is in there
+        self._lock = threading.Lock()  # guards whose code is running
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
-        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap: when due; an entry of another time is stale
-        self._order = count()  # of entries that are due at once
-        self._paused: set[ServedLink] = set()  # after an error: not waited for
+        self._queue: list[tuple[int, int, ServedLink]] = []  # a heap of due times; an entry with another time is stale
+        self._order = count()  # breaks ties between due times
+        self._paused: set[ServedLink] = set()  # after an error: not polled
         self._closing = False
         self._selector.register(self._awake, selectors.EVENT_READ)
         for link, vehicle in (links or {}).items():
@@ -66,7 +66,7 @@ class LinkThread:
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:
-        """Leave this thread to the links of one vehicle, and return a new one that serves all others. Any thread."""
+        """Leave this thread to one vehicle's links, and return a new one for all others. Any thread."""
         with self._lock:
             others = {link: vehicle for link, vehicle in self._members.items() if vehicle is not stuck}
             for link in others:
@@ -74,7 +74,7 @@ class LinkThread:
         return LinkThread(others)
 
     def close(self) -> None:
-        """End the thread, unless it is stuck, and the links that it has left. Idempotent."""
+        """End the thread unless it is stuck, and any links that it still has. Idempotent."""
         self._closing = True
         self._wake()
         if threading.current_thread() is not self._thread and self.inside is None:
@@ -91,7 +91,7 @@ class LinkThread:
             self._selector.unregister(link)
 
     def _plan(self, link: ServedLink, due_ns: int) -> None:
-        """Have a link served again by then. With the lock held."""
+        """Schedule a link to be served by then. With the lock held."""
         if self._due_ns.get(link) == due_ns:
             return
         self._due_ns[link] = due_ns
@@ -101,7 +101,7 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due; None without any. With the lock held."""
+        """Return when the next link is due; None if there is none. With the lock held."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
@@ -112,7 +112,7 @@ class LinkThread:
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
-            del self._due_ns[link]  # until it was served
+            del self._due_ns[link]  # until it has been served
             due.add(link)
         return due
 
@@ -136,7 +136,7 @@ class LinkThread:
             self.inside = None
         with self._lock:
             left = list(self._members)
-        for link in left:  # of a vehicle that was given up
+        for link in left:  # of a vehicle that was dropped
             link.end()
         self._selector.close()
         self._awake.close()
@@ -146,10 +146,10 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # it is another thread's meanwhile
+                return  # another thread took it over meanwhile
             if link in self._paused:
                 self._paused.remove(link)
-                readable = True  # it may be: it was not waited for
+                readable = True  # it may be: it was not polled
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1
@@ -157,7 +157,7 @@ class LinkThread:
         due_ns: int | None
         try:
             due_ns = link.serve(readable=readable)
-        except Exception:  # noqa: BLE001  it has told; the links of all others go on
+        except Exception:  # noqa: BLE001  the link has reported it; all others continue
             failed, due_ns = True, time.monotonic_ns() + nanoseconds(PAUSE_S)
         with self._lock:
             if due_ns is not None:
@@ -172,5 +172,5 @@ class LinkThread:
         link.end()
 
     def _wake(self) -> None:
-        with suppress(OSError):  # it is awake, or it ended
+        with suppress(OSError):  # it is awake, or has ended
             self._waker.send(b"\0")

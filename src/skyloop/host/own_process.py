@@ -1,8 +1,8 @@
-"""A vehicle whose proxy has a process of its own, which is started again when it dies.
+"""A vehicle whose proxy runs in a separate process, which is restarted when it dies.
 
-The process is ``python -m skyloop.host.own_process NAME``. It is handed its settings. It ends with its host, at once
-and without landing, as a proxy of the host's own process does. Each line of its standard output is a status in JSON,
-for the host.
+The process is ``python -m skyloop.host.own_process NAME`` and receives its settings at the start. It ends with its
+host, at once and without landing, as a proxy within the host's process does. Each line of its standard output is a
+status in JSON for the host.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from skyloop.proxy.serve import run
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
-STARTS_WITHIN_S: Final = 20.0
-FIRST_PAUSE_S: Final = 0.5
-LONGEST_PAUSE_S: Final = 30.0
-#: Looks without a report, four a second, after which a process hangs as a whole and is killed. Looks and not seconds:
-#: on a computer that stood still nothing hangs only because time has passed.
-SILENT_LOOKS: Final = 40
-STARTING_LOOKS: Final = 80  #: the same before its first report
-STEADY_S: Final = 60.0  #: a process that ran for so long is started again after the first pause
+STARTS_WITHIN_S: Final = 20.0  #: time for the first report
+FIRST_PAUSE_S: Final = 0.5  #: before the first restart; doubles with each death
+LONGEST_PAUSE_S: Final = 30.0  #: its limit
+#: Checks without a report, at four a second, after which the process counts as hung and is killed. Checks rather than
+#: seconds: a process does not hang because its computer was suspended.
+SILENT_CHECKS: Final = 40
+STARTING_CHECKS: Final = 80  #: the same before its first report
+STEADY_S: Final = 60.0  #: after running for this long, a process that dies is restarted after the shortest pause
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
 FAILED: Final = 1
-STATUS_EVERY_S: Final = 0.25
+STATUS_EVERY_S: Final = 0.25  #: between reports
 
 
 def pause_s(deaths: int) -> float:
-    """Return how long to wait before a process is started again that died so often in a row [s]."""
+    """Return the pause before restarting a process that has died this many times in a row [s]."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(deaths - 1, 20)))
 
 
 class OwnProcessVehicle(HostedVehicle):
-    """A vehicle with ``process = "own"``: whatever its driver does, it does to its own process only.
+    """A vehicle with ``process = "own"``: its driver can harm only its own process.
 
     Args:
         settings: Its settings.
-        announce: Called with a line for people when its process dies and is started again.
-        command: What starts the process; the name follows, and the settings are handed over.
+        announce: Called with a line for people when its process dies and when it is restarted.
+        command: The command that starts the process, before the name; the settings are passed on.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class OwnProcessVehicle(HostedVehicle):
         self._announce = announce
         self._changed = threading.Condition()  # guards all below
         self._reported: VehicleStatus | None = None  # by the present process
-        self._silent_looks = 0  # since it reported last
+        self._silent_checks = 0  # since it reported last
         self._deaths = 0  # in a row
         self._runner = RestartingChild(
             [*command, settings.name],
@@ -90,40 +90,40 @@ class OwnProcessVehicle(HostedVehicle):
 
     def _started(self, _child: ChildProcess) -> None:
         with self._changed:
-            self._reported, self._silent_looks = None, 0
+            self._reported, self._silent_checks = None, 0
 
     def _read(self, child: ChildProcess) -> None:
-        """Take in what a process reports."""
+        """Read a process's reports."""
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)
-            except msgspec.DecodeError:  # a driver's own words
+            except msgspec.DecodeError:  # a line printed by a driver
                 _log.info("%s: %s", self.settings.name, line.decode(errors="replace").rstrip())
                 continue
             with self._changed:
                 if self._runner.child is not child:
                     return
                 again = self._reported is None and self.condition is Condition.RESTARTING
-                self._reported, self._silent_looks = status, 0
+                self._reported, self._silent_checks = status, 0
                 serves = status.condition is Condition.RUNNING
                 if serves and self.condition is not Condition.RUNNING and not self._runner.stopping:
                     self.condition, self.started_s = Condition.RUNNING, time.monotonic()
                 self._changed.notify_all()
             if again and serves:
-                self._announce(f"vehicle of {self.settings.name}: runs again, process {child.pid}")
+                self._announce(f"vehicle of {self.settings.name}: running again, process {child.pid}")
 
     def _is_silent(self) -> bool:
-        """Whether the process reports nothing any more, although it is not ending."""
+        """Return whether the process has stopped reporting without being told to end."""
         with self._changed:
-            self._silent_looks += 1
-            most = STARTING_LOOKS if self._reported is None else SILENT_LOOKS
-            silent = self._silent_looks >= most and not self._runner.stopping
+            self._silent_checks += 1
+            most = STARTING_CHECKS if self._reported is None else SILENT_CHECKS
+            silent = self._silent_checks >= most and not self._runner.stopping
         if silent:
-            _log.error("the process of %s reports nothing any more: it is killed", self.settings.name)
+            _log.error("the process of %s has stopped reporting: killing it", self.settings.name)
         return silent
 
     def _ended(self, child: ChildProcess | None, ending: str) -> float | None:
-        """Note that a process has ended; return the pause before the next one."""
+        """Record that a process has ended; return the pause before the next one."""
         with self._changed:
             reported = self._reported
             self.failed = (reported.failed if reported is not None else "") or f"its process {ending}"
@@ -136,7 +136,7 @@ class OwnProcessVehicle(HostedVehicle):
         if stops:
             return None
         pause, number = pause_s(self._deaths), "" if child is None else f" (pid {child.pid})"
-        self._announce(f"vehicle of {self.settings.name}: {self.failed}{number}; it is started again in {pause:g} s")
+        self._announce(f"vehicle of {self.settings.name}: {self.failed}{number}; restarting in {pause:g} s")
         return pause
 
     def status(self) -> VehicleStatus:
@@ -152,12 +152,12 @@ class OwnProcessVehicle(HostedVehicle):
     def end(
         self,
         within_s: float,
-        reason: str,  # noqa: ARG002  (its process knows one of its own)
+        reason: str,  # noqa: ARG002  (its process has its own)
         hurry: Callable[[], bool] = lambda: False,
         *,
         unless_flying: bool = False,
     ) -> bool:
-        """Ask its process to land and to end. It is not started again."""
+        """Ask its process to land and end. It is not restarted."""
         asked = self._runner.stopping
         child = self._runner.request_stop()
         if child is not None and child.code is None:
@@ -166,7 +166,7 @@ class OwnProcessVehicle(HostedVehicle):
             deadline_s = time.monotonic() + within_s
             while (left_s := deadline_s - time.monotonic()) > 0 and child.code is None:
                 if hurry():
-                    child.part()  # it ends at once, unless without it its vehicle would fall: then it lands
+                    child.part()  # end at once, or land first if its vehicle would fall without it
                 child.wait(min(left_s, _POLL_S))
             if unless_flying and child.code is None:
                 return False
@@ -177,7 +177,7 @@ class OwnProcessVehicle(HostedVehicle):
 
 
 def serve(settings: VehicleSettings) -> None:
-    """Serve one vehicle until SIGTERM, which lands it, or the end of the host. On the main thread.
+    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. On the main thread.
 
     Raises:
         SkyloopError: It can't be served.
@@ -195,8 +195,8 @@ def serve(settings: VehicleSettings) -> None:
     row = VehicleStatus(settings.name, str(settings.address), Condition.RUNNING, process="own", pid=os.getpid())
     began_s, reported_s = time.monotonic(), 0.0
 
-    def look() -> Sequence[str]:
-        """Report the proxy's status several times a second, and return what is new about the keys."""
+    def report() -> Sequence[str]:
+        """Report the proxy's status several times a second, and return news about the keys."""
         nonlocal reported_s
         now_s = time.monotonic()
         if now_s - reported_s >= STATUS_EVERY_S:
@@ -204,7 +204,7 @@ def serve(settings: VehicleSettings) -> None:
             _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **of_proxy(proxy)))
         return () if keys is None else keys()
 
-    run([proxy], parent_fd=0, look=look, records=True)
+    run([proxy], parent_fd=0, look=report, records=True)
 
 
 def _write(status: VehicleStatus) -> None:
@@ -213,7 +213,7 @@ def _write(status: VehicleStatus) -> None:
 
 
 def main() -> None:
-    """Serve the vehicle of the settings that were handed over."""
+    """Serve the vehicle whose settings were passed on."""
     settings = decoder_of_handed(VehicleSettings).decode(handed_over() or "")
     try:
         serve(settings)

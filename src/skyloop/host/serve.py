@@ -1,8 +1,7 @@
-"""A host as a process, what ``skyloop host fleet.toml`` runs, and its socket: ``add``, ``remove`` and ``status``.
+"""The host process behind ``skyloop host fleet.toml``, and its socket: ``add``, ``remove`` and ``status``.
 
-One request and one answer for each connection, in JSON, cut into packets. The socket ``NAME.host`` lies beside those of
-the proxies, and who may connect to them may use it: the host's user, the superuser, and members of the group it was
-given.
+Each connection carries one JSON request and one answer, split into packets. The socket ``NAME.host`` is beside the
+proxies' sockets and open to the same users: the host's own, the superuser, and members of its group.
 """
 
 from __future__ import annotations
@@ -40,34 +39,34 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-_POLL_S: Final = 0.2
+_POLL_S: Final = 0.2  # between checks for signals and changes
 MAX_REQUEST: Final = 1 << 22  #: bytes, in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: bytes
 MAX_ANSWER: Final = 1 << 22  #: bytes
-ANSWERS_WITHIN_S: Final = 60.0  #: of a request that lands a vehicle first
-_CHUNK: Final = 1 << 15
-_AGAIN_S: Final = 0.1  # until a connection is accepted again that could not be
-_SLOW_S: Final = 2.0  # for the other end to take or to send a packet
+ANSWERS_WITHIN_S: Final = 60.0  #: includes a landing before a removal
+_CHUNK: Final = 1 << 15  # bytes of a packet
+_AGAIN_S: Final = 0.1  # pause after a failed accept
+_SLOW_S: Final = 2.0  # for the other end to receive or send a packet
 _log = logging.getLogger(__name__)
 
 
 def serve(
     fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND_WITHIN_S, metrics: str | None = None
 ) -> None:
-    """Serve all vehicles of a fleet that start by themselves; blocks. On the main thread.
+    """Serve all vehicles of a fleet that start automatically; blocks. On the main thread.
 
-    Writes a line for each vehicle to standard output as ``skyloop proxy`` does, ``failed NAME: …`` for one that can't
-    be served, and ``hosting …`` when all were tried. Ends on SIGINT or SIGTERM, landing all that fly first, for at
-    most ``land_within_s`` [s]; a second signal waits no longer.
+    Like ``skyloop proxy``, prints a line for each vehicle: ``failed NAME: …`` for one that can't be served, and
+    ``hosting …`` after all were tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
+    ``land_within_s`` [s]; a second signal ends the wait.
 
     Args:
         fleet: The vehicles.
-        group: Of users who may add and remove vehicles as well.
-        land_within_s: How long to wait for vehicles to land [s].
-        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced; None: none.
+        group: Users who may also add and remove vehicles.
+        land_within_s: Time allowed for landings [s].
+        metrics: ``[HOST:]PORT`` of a Prometheus endpoint, which is announced; None: no endpoint.
 
     Raises:
-        UsageError: ``metrics`` is no address, or can't be listened on.
+        UsageError: ``metrics`` is not an address, or can't be listened on.
         MissingExtraError: The extra ``metrics`` is needed and not installed.
         NameTakenError: A running host has the name.
         LinkError: The directory of sockets is not safe.
@@ -92,8 +91,8 @@ def serve(
         announce(f"hosting {served} of {len(fleet.vehicles)} vehicles as {fleet.name}, process {os.getpid()}{failed}")
         polls = _key_changes(fleet)
         gc.collect()
-        gc.freeze()  # what is there stays: the collector looks through what is new only, which takes no 20 ms
-        # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
+        gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
+        # Poll: the kernel may deliver a signal to any thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -104,14 +103,14 @@ def serve(
 
 
 class Answering:
-    """Carries out the requests at a host's control socket; the defaults are for vehicles that come by address alone."""
+    """Handles requests at a host's control socket; the defaults are for vehicles given only by address."""
 
     def __init__(self, host: Host, defaults: Defaults) -> None:
         self._host = host
         self._defaults = defaults
 
     def __call__(self, request: Request) -> Answer:
-        """Do what is asked. On the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
+        """Carry out a request. On the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
         host = self._host
         if isinstance(request, Remove):
             return Answer((host.remove(request.name, land=request.land),))
@@ -135,7 +134,7 @@ class Answering:
 
 
 class _Lines:
-    """Says for each vehicle that it is ready, or what it waits for, whenever that has changed."""
+    """Prints a vehicle's readiness, or the reason why it waits, whenever that changes."""
 
     def __init__(self) -> None:
         self._lines: dict[HostedVehicle, LinkLines] = {}
@@ -162,10 +161,10 @@ def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
 
 
 def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
-    """Return what reports on the keys of the fleet, once for each folder."""
+    """Return one source of key news for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # of one that could not be served for it
+        with suppress(UsageError, ImportError):  # if the folder could not be served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
@@ -174,7 +173,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
 
 def announce(line: str) -> None:
     """Write a line to standard output."""
-    with suppress(OSError):  # nobody reads it: the host serves all the same
+    with suppress(OSError):  # the reader is gone: continue serving
         print(line, flush=True)
 
 
@@ -183,13 +182,13 @@ class Status(msgspec.Struct, frozen=True, tag="status"):
 
 
 class Add(msgspec.Struct, frozen=True, tag="add"):
-    """Serve these vehicles too; those that run already are left alone."""
+    """Serve more vehicles; those already running are left unchanged."""
 
     vehicles: tuple[VehicleSettings, ...]
 
 
 class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
-    """Serve one more vehicle: one of the host's file by its name, or any other one by its address."""
+    """Serve one more vehicle: one in the host's file by name, or any other by address."""
 
     name: str
     address: str | None = None
@@ -197,7 +196,7 @@ class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
 
 
 class Remove(msgspec.Struct, frozen=True, tag="remove"):
-    """Land a vehicle, and serve it no longer."""
+    """Land a vehicle, and stop serving it."""
 
     name: str
     land: bool = False
@@ -207,18 +206,18 @@ Request = Status | Add | AddNamed | Remove
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """What the host answers."""
+    """The host's answer."""
 
-    vehicles: tuple[VehicleStatus, ...] = ()  #: all of them, or those that the request was about
+    vehicles: tuple[VehicleStatus, ...] = ()  #: all of them, or those in the request
     problems: dict[str, str] = {}  #: why some could not be added, by name
     error: str = ""  #: why nothing was done
-    kind: str = ""  #: of the error: the name of its class
+    kind: str = ""  #: name of the error's class
     code: str = ""
 
 
 _requests: Final[msgspec.json.Decoder[Request]] = decoder_of_handed(Request)
 _answers: Final = msgspec.json.Decoder(Answer)
-#: Carries out a request, on a thread of its own. Raises :class:`skyloop.errors.SkyloopError`.
+#: Carries out a request on a separate thread. Raises :class:`skyloop.errors.SkyloopError`.
 Responder = Callable[[Request], Answer]
 _ERRORS: Final[dict[str, type[SkyloopError]]] = {
     error.__name__: error for error in (UsageError, FileFormatError, NameTakenError, LinkError)
@@ -226,7 +225,7 @@ _ERRORS: Final[dict[str, type[SkyloopError]]] = {
 
 
 class ControlServer:
-    """Takes requests of this user, and of a group's, from :meth:`start` to :meth:`stop`."""
+    """Accepts requests from this user and a group, from :meth:`start` to :meth:`stop`."""
 
     def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
         self._name = name
@@ -239,7 +238,7 @@ class ControlServer:
         self._ended = threading.Event()
 
     def start(self) -> None:
-        """Begin.
+        """Start listening.
 
         Raises:
             NameTakenError: A running host has the name.
@@ -252,7 +251,7 @@ class ControlServer:
         self._thread.start()
 
     def stop(self) -> None:
-        """End. Requests in progress go on. Idempotent."""
+        """Stop listening. Pending requests continue. Idempotent."""
         listener, self._listener = self._listener, None
         if listener is None or self._thread is None:
             return
@@ -265,14 +264,14 @@ class ControlServer:
         while self._listener is not None:
             try:
                 accepted, _ = listener.accept()
-            except OSError:  # the end, a caller that is gone, or no descriptor is left: not asked for all the time
+            except OSError:  # closing, caller gone, or no descriptors left: pause before the next try
                 self._ended.wait(_AGAIN_S)
                 continue
             sock = Socket(accepted.detach())
             try:
                 threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
-            except RuntimeError as error:  # no thread is to be had, for a moment
-                _log.warning("a request is not answered: %s", error)
+            except RuntimeError as error:  # no thread available at the moment
+                _log.warning("a request was not answered: %s", error)
                 sock.hang_up()
 
     def _serve(self, sock: Socket) -> None:
@@ -283,11 +282,11 @@ class ControlServer:
             if answer is not None:
                 _send(sock, msgspec.json.encode(answer))
         except OSError as error:
-            _log.info("an answer was not taken: %s", error)
+            _log.info("an answer was not received: %s", error)
         sock.hang_up()
 
     def _answer(self, sock: Socket) -> Answer | None:
-        """Return the answer to what comes; None for one who asks nothing, as who only looks who listens here."""
+        """Return the answer to a request; None if there is none, as when a client only checks for a host."""
         if not may_connect(sock, self._directory.gid):
             return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
@@ -297,42 +296,42 @@ class ControlServer:
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)
-                break  # as long as one chunk by chance
+                break  # the request happened to fill its last packet
         if not received:
             return None
         if len(received) > MAX_REQUEST:
-            text = f"the request is longer than {MAX_REQUEST} bytes: add fewer vehicles at a time"
+            text = f"the request is longer than {MAX_REQUEST} bytes: add fewer vehicles at once"
             return Answer(error=text, kind="RefusedError", code="malformed")
         try:
             request = _requests.decode(received)
         except (msgspec.DecodeError, RecursionError) as error:
-            return Answer(error=f"the request is not understood: {error}", kind="RefusedError", code="malformed")
+            return Answer(error=f"malformed request: {error}", kind="RefusedError", code="malformed")
         try:
             return self._answering(request)
         except SkyloopError as error:
             code = error.code if isinstance(error, RefusedError) else ""
             return Answer(error=reason_of(error), kind=type(error).__name__, code=code)
-        except Exception as error:  # noqa: BLE001  the host goes on, and who asked gets an answer
+        except Exception as error:  # noqa: BLE001  the host continues, and the caller gets an answer
             _log.exception("a request failed")
             return Answer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
 
 
 def _send(sock: Socket, text: bytes) -> None:
-    """Send a request or an answer, in as many packets as it takes."""
+    """Send a request or an answer in as many packets as needed."""
     for first in range(0, len(text), _CHUNK):
         sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
 
 
 def running_hosts(group: str | None = None) -> list[str]:
-    """Return the names of the hosts that run on this machine and that this user may reach."""
+    """Return the names of this machine's running hosts that this user may reach."""
     return [host.name for host in find_directory(group, HOST).proxies()]
 
 
 def chosen_host(name: str | None = None, group: str | None = None) -> str:
-    """Return the host that is meant: the one of this name, or the only one that runs.
+    """Return the host of this name, or the only one running.
 
     Raises:
-        UsageError: None runs, or several do and none is named.
+        UsageError: None runs, or several do and no name is given.
         UnknownNameError: None of this name runs.
     """
     running = running_hosts(group)
@@ -341,17 +340,17 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
             raise UnknownNameError("host", name, running)
         return name
     if not running:
-        raise UsageError("no host runs on this machine: start one with skyloop host fleet.toml")
+        raise UsageError("no host is running on this machine: start one with skyloop host fleet.toml")
     if len(running) > 1:
-        raise UsageError(f"several hosts run on this machine: name one of them, --host {' or '.join(running)}")
+        raise UsageError(f"several hosts are running on this machine: choose one with --host {' or '.join(running)}")
     return running[0]
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Ask a host.
+    """Send a request to a host and return its answer.
 
     Raises:
-        UsageError, RefusedError: Nothing was done; says why.
+        UsageError, RefusedError: Nothing was done; the message says why.
         LinkError: It can't be reached, or ended meanwhile.
         NoAnswerError: It did not answer in time.
     """
@@ -364,7 +363,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
     received = bytearray()
     try:
-        with suppress(BrokenPipeError):  # who is refused is answered and hung up on before having asked
+        with suppress(BrokenPipeError):  # a refused caller gets its answer before it has sent the request
             _send(sock, encode_handed(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet

@@ -1,4 +1,4 @@
-"""Threads that many proxies share: one updates them, some do their requests, and one notices when their loop hangs."""
+"""Threads shared by many proxies: one ticks them, some serve their requests, and one watches for loops that hang."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ from skyloop.clock import beats
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
-#: Ticks in a row that raise, half a second of them, until a proxy counts as failed: it has no failsafe any more.
+#: Failed ticks in a row, half a second of them, after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Rounds from one to the next in which a proxy does everything: ten times a second.
+#: Rounds between those in which a proxy does everything: ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called with a proxy whose ticks raise, and the last error, on the ticker's thread; must return at once.
+#: Called with a proxy whose ticks fail, and the last error, on the ticker's thread; must return at once.
 OnFailing = Callable[[Proxy, BaseException], None]
-MAX_THREADS: Final = 64  #: so many drivers may hang in a request before others have to wait
-IDLE_THREADS: Final = 2  #: that stay, as requests come in bursts
-_IDLE_S: Final = 5.0
+MAX_THREADS: Final = 64  #: drivers that may hang in a request before others have to wait
+IDLE_THREADS: Final = 2  #: threads kept for bursts of requests
+_IDLE_S: Final = 5.0  #: after this time without a job, a spare thread ends
 
 Job = Callable[[], None]
-LOOK_S: Final = 0.05
-STALL_LOOKS: Final = 5  #: 0.25 s: the other vehicles get another thread, before their pilots' silence makes them hover
-HANG_LOOKS: Final = 40  #: 2 s: the vehicle is given up
+CHECK_S: Final = 0.05  #: between two checks
+STALL_CHECKS: Final = 5  #: 0.25 s: other vehicles get a new thread before their pilots' silence makes them hover
+HANG_CHECKS: Final = 40  #: 2 s: drop the vehicle
 
 
 class Ticker:
-    """Ticks proxies on one thread, from its construction to :meth:`close`. A tick that raises harms no other proxy.
+    """Ticks proxies on one thread, from its construction to :meth:`close`. A failed tick does not affect other proxies.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it is in, and can be split.
+    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it runs, and can be split.
 
     Args:
-        on_failing: What to do about a proxy of which :data:`MAX_FAILURES` ticks in a row have raised.
-        proxies: Which it ticks from the beginning.
+        on_failing: Called for a proxy after :data:`MAX_FAILURES` failed ticks in a row.
+        proxies: The initial proxies.
     """
 
     def __init__(self, on_failing: OnFailing, proxies: Iterable[Proxy] = ()) -> None:
-        self.inside: Proxy | None = None  #: which is being ticked
-        self.entries = 0  #: how often :attr:`inside` was set
+        self.inside: Proxy | None = None  #: the proxy being ticked
+        self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
-        self._failures = dict.fromkeys(proxies, 0)  # in a row, of each proxy
-        self._lock = threading.Lock()  # guards who is in there
+        self._failures = dict.fromkeys(proxies, 0)  # in a row, by proxy
+        self._lock = threading.Lock()  # guards whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -57,7 +57,7 @@ class Ticker:
             self._failures[proxy] = 0
 
     def remove(self, proxy: Proxy) -> bool:
-        """Tick a proxy no more; return whether it was ticked here. Any thread. A tick in progress goes on."""
+        """Stop ticking a proxy; return whether it was ticked here. Any thread. A tick in progress continues."""
         with self._lock:
             return self._failures.pop(proxy, None) is not None
 
@@ -67,7 +67,7 @@ class Ticker:
         return not self._failures
 
     def split(self, stuck: Proxy) -> Ticker:
-        """Leave this ticker to one proxy, and return a new one that ticks all others. Any thread."""
+        """Leave this ticker to one proxy, and return a new one for all others. Any thread."""
         with self._lock:
             others = [proxy for proxy in self._failures if proxy is not stuck]
             for proxy in others:
@@ -75,7 +75,7 @@ class Ticker:
         return Ticker(self._on_failing, others)
 
     def close(self) -> None:
-        """End the thread, unless it is stuck. Idempotent."""
+        """End the thread unless it is stuck. Idempotent."""
         self._closing.set()
         if threading.current_thread() is not self._thread and self.inside is None:
             self._thread.join()
@@ -84,9 +84,9 @@ class Ticker:
         for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
-            for place, proxy in enumerate(proxies, rounds):  # each round a fifth of them, so that all are alike long
+            for place, proxy in enumerate(proxies, rounds):  # a fifth per round, to spread the work
                 failures = self._failures.get(proxy)
-                if failures is not None:  # it is not another ticker's meanwhile
+                if failures is not None:  # another ticker has not taken it over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
             self.inside = None
 
@@ -100,7 +100,7 @@ class Ticker:
                 return
             else:
                 proxy.tick_flight(proxy.clock())
-        except Exception as error:  # noqa: BLE001  whatever is wrong with one vehicle, the others need their failsafes
+        except Exception as error:  # noqa: BLE001  one vehicle's error must not stop the others' failsafes
             self._failed(proxy, error)
         else:
             if self._failures.get(proxy):
@@ -120,32 +120,32 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads, as many as there are requests at the same time, for the lanes of proxies.
+    """A pool of daemon threads, one per concurrent request, for the job queues of proxies.
 
-    A job that hangs holds up its own lane only.
+    A job that hangs holds up only its own queue.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._ready: deque[RequestLane] = deque()  # have a job that nobody does yet
+        self._ready: deque[PooledJobQueue] = deque()  # with a job not yet started
         self._idle = 0
         self._threads = 0
         self._closed = False
 
-    def lane(self) -> RequestLane:
-        """Return a lane for one proxy."""
-        return RequestLane(self)
+    def queue(self) -> PooledJobQueue:
+        """Return one proxy's job queue."""
+        return PooledJobQueue(self)
 
     def close(self) -> None:
-        """Let the threads end that do nothing."""
+        """End the idle threads."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
-    def schedule(self, lane: RequestLane) -> None:
-        """Let a thread do the next job of a lane. For lanes."""
+    def schedule(self, jobs: PooledJobQueue) -> None:
+        """Have a thread do the queue's next job. Called by job queues."""
         with self._changed:
-            self._ready.append(lane)
+            self._ready.append(jobs)
             if self._idle >= len(self._ready):
                 self._changed.notify()
             elif self._threads < MAX_THREADS:
@@ -153,10 +153,10 @@ class RequestWorkers:
                 threading.Thread(target=self._run, name="skyloop-requests", daemon=True).start()
 
     def _run(self) -> None:
-        while (lane := self._next()) is not None:
-            lane.do_one()
+        while (jobs := self._next()) is not None:
+            jobs.do_one()
 
-    def _next(self) -> RequestLane | None:
+    def _next(self) -> PooledJobQueue | None:
         with self._changed:
             self._idle += 1
             try:
@@ -170,8 +170,8 @@ class RequestWorkers:
                 self._idle -= 1
 
 
-class RequestLane:
-    """The jobs of one proxy: a :class:`skyloop.proxy.requests.JobQueue` on the threads of a pool."""
+class PooledJobQueue:
+    """One proxy's jobs: a :class:`skyloop.proxy.requests.JobQueue` on the threads of a pool."""
 
     def __init__(self, workers: RequestWorkers) -> None:
         self._workers = workers
@@ -181,10 +181,10 @@ class RequestLane:
         self._stopped = False
 
     def start(self) -> None:
-        """There is nothing to start: the pool has threads."""
+        """Do nothing: the pool has its threads."""
 
     def put(self, job: Job) -> None:
-        """Do this after what waits already. Any thread."""
+        """Queue a job. Any thread."""
         with self._changed:
             if self._stopped:
                 return
@@ -195,7 +195,7 @@ class RequestLane:
         self._workers.schedule(self)
 
     def stop(self, timeout_s: float) -> None:
-        """Wait for the job in progress, for at most so long [s]; drop the others."""
+        """Wait for the job in progress, up to this long [s]; drop the others."""
         with self._changed:
             self._stopped = True
             self._jobs.clear()
@@ -217,34 +217,34 @@ class RequestLane:
 
 
 class SharedLoop(Protocol):
-    """A thread that runs the code of many vehicles: a ``Reactor`` or a ``Ticker``."""
+    """A thread that runs many vehicles' code: a ``Reactor`` or a ``Ticker``."""
 
     @property
     def inside(self) -> Any:
-        """Whose code it is in now; None for nobody's."""
+        """Whose code is running now; None if none."""
 
     @property
     def entries(self) -> int:
-        """How often that was set."""
+        """The number of times :attr:`inside` was set."""
 
     @property
     def empty(self) -> bool:
-        """Whether it serves nobody."""
+        """Whether it serves no vehicle."""
 
     def close(self) -> None:
-        """End the thread, unless it is stuck."""
+        """End the thread unless it is stuck."""
 
 
 class Watchdog:
-    """Looks at shared loops 20 times a second, on a thread of its own, from :meth:`start` to :meth:`close`.
+    """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
-    It counts its own looks rather than the time: on a machine that stood still, or had no processor to spare, nobody
-    hangs only because much time has gone by.
+    It counts its own checks rather than time: on a suspended or overloaded machine, no loop hangs merely because time
+    has passed.
 
     Args:
         loops: Returns the loops.
-        on_stall: Called with a loop and whose code it is stuck in, once per call that does not return.
-        on_hang: Called with the same when it still has not.
+        on_stall: Called with a loop and its stuck member, once per call that does not return.
+        on_hang: Called with the same if the call still has not returned.
     """
 
     def __init__(
@@ -256,41 +256,41 @@ class Watchdog:
         self._loops = loops
         self._on_stall = on_stall
         self._on_hang = on_hang
-        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and looks at which they were the same
-        self._looked_s = 0.0
+        self._seen: dict[SharedLoop, tuple[int, int]] = {}  # entries, and number of checks that found them unchanged
+        self._checked_s = 0.0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-watchdog", daemon=True)
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start checking."""
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more. Idempotent."""
+        """Stop checking. Idempotent."""
         self._closing.set()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join()
 
-    def look(self, now_s: float) -> None:
-        """Look once."""
-        punctual = now_s - self._looked_s < 2 * LOOK_S
-        self._looked_s = now_s
+    def check(self, now_s: float) -> None:
+        """Check once."""
+        punctual = now_s - self._checked_s < 2 * CHECK_S
+        self._checked_s = now_s
         seen: dict[SharedLoop, tuple[int, int]] = {}
         for loop in list(self._loops()):
             entries, inside = loop.entries, loop.inside
             if inside is None:
                 continue
-            before, looks = self._seen.get(loop, (-1, 0))
-            looks = looks + punctual if before == entries else 0
-            seen[loop] = entries, looks
-            if punctual and before == entries and looks in (STALL_LOOKS, HANG_LOOKS):
-                act = self._on_stall if looks == STALL_LOOKS else self._on_hang
+            before, checks = self._seen.get(loop, (-1, 0))
+            checks = checks + punctual if before == entries else 0
+            seen[loop] = entries, checks
+            if punctual and before == entries and checks in (STALL_CHECKS, HANG_CHECKS):
+                act = self._on_stall if checks == STALL_CHECKS else self._on_hang
                 try:
                     act(loop, inside)
-                except Exception:  # noqa: BLE001  it must go on to look
-                    _log.exception("what was to be done about a vehicle that hangs failed")
+                except Exception:  # noqa: BLE001  it must keep checking
+                    _log.exception("handling a vehicle that hangs failed")
         self._seen = seen
 
     def _run(self) -> None:
-        while not self._closing.wait(LOOK_S):
-            self.look(time.monotonic())
+        while not self._closing.wait(CHECK_S):
+            self.check(time.monotonic())

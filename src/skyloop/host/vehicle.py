@@ -1,4 +1,4 @@
-"""One vehicle of a host: its proxy on the shared threads of this process, or in a process of its own."""
+"""One vehicle of a host: its proxy on this process's shared threads, or in a separate process."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-OPEN_S: Final = 10.0  #: how long a driver may take to open or to close before its vehicle is given up
+OPEN_S: Final = 10.0  #: time for a driver to open or close before its vehicle is dropped
 _log = logging.getLogger(__name__)
 
 
 class Condition(StrEnum):
-    """What has become of a vehicle's proxy."""
+    """State of a vehicle's proxy."""
 
     STOPPED = "stopped"  #: not started yet, or removed
     STARTING = "starting"
     RUNNING = "running"
-    RESTARTING = "restarting"  #: its own process died, and is started again after a pause
+    RESTARTING = "restarting"  #: its own process died and restarts after a pause
     FAILED = "failed"
 
 
@@ -52,13 +52,13 @@ class VehicleStatus(msgspec.Struct, frozen=True):
     address: str
     condition: Condition
     state: str = ""  #: flight state
-    link: str = ""  #: of the vehicle
+    link: str = ""  #: state of the vehicle link
     link_reason: str = ""
     link_remedy: str = ""
     pilot: str | None = None
     battery: float | None = None
     uptime_s: float = 0.0
-    failed: str = ""  #: why it failed, or its process ended last
+    failed: str = ""  #: why it failed, or why its process last ended
     process: str = "shared"  #: or ``own``
     pid: int | None = None
     restarts: int = 0
@@ -71,12 +71,12 @@ class HostedVehicle(ABC):
     def __init__(self, settings: VehicleSettings) -> None:
         self.settings = settings
         self.condition = Condition.STOPPED
-        self.failed = ""  #: why, once it has
+        self.failed = ""  #: the reason, once failed
         self.started_s = time.monotonic()
 
     @abstractmethod
     def start(self) -> None:
-        """Serve the vehicle. Raises what speaks against it, as :class:`skyloop.errors.SkyloopError`."""
+        """Serve the vehicle. Raises :class:`skyloop.errors.SkyloopError` if that is not possible."""
 
     @abstractmethod
     def status(self) -> VehicleStatus:
@@ -94,16 +94,16 @@ class HostedVehicle(ABC):
         """End its flight and its proxy, as :meth:`skyloop.proxy.Proxy.end` does. Idempotent.
 
         Returns:
-            Whether its proxy has ended; with ``unless_flying`` that is only where it has landed in time.
+            Whether its proxy has ended; with ``unless_flying``, that needs a landing in time.
         """
 
     @property
     def runs(self) -> bool:
-        """Whether it has a proxy, or is about to have one."""
+        """Return whether it has a proxy, or is about to have one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
-        """Return what is known without its proxy."""
+        """Return the row without its proxy's state."""
         settings = self.settings
         up_s = time.monotonic() - self.started_s if self.condition is Condition.RUNNING else 0.0
         process = "own" if settings.own_process else "shared"
@@ -117,12 +117,12 @@ class SharedVehicle(HostedVehicle):
 
     Args:
         settings: Its settings.
-        reactor: Receives for it on this host.
-        jobs: Answers its requests that may wait.
+        reactor: Receives its local packets.
+        jobs: Serves its slow requests.
         network: How its proxy joins the network; None for this host only.
-        make: Makes the driver of an address.
-        overview: The rows of all vehicles of this process; None: each shows its own alone.
-        serve_link: Takes a link of its driver to a thread that serves those of several; None: it has its own thread.
+        make: Creates an address's driver.
+        overview: The rows of all vehicles of this process; None: its own row only.
+        serve_link: Moves a driver's link to a shared thread; None: the link has its own.
     """
 
     def __init__(
@@ -190,16 +190,14 @@ class SharedVehicle(HostedVehicle):
         return msgspec.structs.replace(row, **of_proxy(proxy))
 
     def report_stall(self, seconds: float) -> None:
-        """Publish that its driver blocks, and that its threads are its own from here on."""
+        """Publish that its driver blocks, and that it no longer shares its threads."""
         proxy = self.proxy
         if proxy is not None:
-            text = (
-                f"the driver has blocked for {seconds:g} s: its vehicle gets threads of its own, apart from the others"
-            )
+            text = f"the driver has been blocking for {seconds:g} s: its vehicle no longer shares its threads"
             proxy.publisher.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="host")
 
     def fail(self, reason: str) -> bool:
-        """Give the vehicle up because its driver hangs or fails, with an event; return False if it was not running."""
+        """End a vehicle whose driver hangs or fails, with an event; return False if it was not running."""
         with self._life:
             proxy = self.proxy
             if proxy is None or self.condition is not Condition.RUNNING:
@@ -217,13 +215,13 @@ class SharedVehicle(HostedVehicle):
         unless_flying: bool = False,
     ) -> bool:
         if self.condition is not Condition.STOPPED:
-            self._settled.wait(OPEN_S + 1.0)  # else it would go on to serve, with nobody who knows of it
+            self._settled.wait(OPEN_S + 1.0)  # else it would start to serve after its removal
         proxy = self.proxy
         if proxy is not None and self.condition is Condition.RUNNING:
             patience_s = OPEN_S + (within_s if proxy.handler.airborne else 0.0)
             call = partial(proxy.end, within_s, reason=reason, hurry=hurry, unless_flying=unless_flying)
             if not within(call, patience_s):
-                _log.error("the driver of %s does not close: it is left alone", self.settings.name)
+                _log.error("the driver of %s does not close: abandoning it", self.settings.name)
             if unless_flying and not proxy.ended:
                 return False
         with self._life:
@@ -234,7 +232,7 @@ class SharedVehicle(HostedVehicle):
 
 
 def of_proxy(proxy: Proxy) -> dict[str, object]:
-    """Return what a row shows of a running proxy."""
+    """Return a running proxy's part of a row."""
     vehicle = proxy.publisher
     feedback = vehicle.feedback_now
     return {
@@ -252,7 +250,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
     """Return how a vehicle's proxy joins the network; None for this host only.
 
     Raises:
-        UsageError: An address or the folder of keys is not valid.
+        UsageError: An address or the key folder is not valid.
         MissingExtraError: The extra ``network`` is not installed.
     """
     if settings.network is None:
@@ -264,17 +262,17 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 
 def within(call: Callable[[], object], seconds: float) -> bool:
-    """Call something that may hang, on a thread of its own, and raise what it raises.
+    """Call something that may hang on a separate thread, and raise its exceptions.
 
     Returns:
-        Whether it returned in time; if not, it is left to its daemon thread.
+        Whether it returned in time; if not, its daemon thread keeps running.
     """
     raised: list[BaseException] = []
 
     def run() -> None:
         try:
             call()
-        except BaseException as error:  # noqa: BLE001  it is raised again where it was waited for
+        except BaseException as error:  # noqa: BLE001  raised again in the waiting thread
             raised.append(error)
 
     thread = threading.Thread(target=run, name="skyloop-host-call", daemon=True)

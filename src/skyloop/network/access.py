@@ -1,13 +1,13 @@
-"""Zenoh's access control, made from a lab's roster; pure functions.
+"""Zenoh's access control, generated from a lab's roster; pure functions.
 
-A node applies it on each of its links to the node at the other end, by the common name in that one's certificate. What
-that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward (egress), and nothing
-else passes. So each end protects itself and relies on nobody else's configuration. A router may publish and subscribe
-to everything, and applies the rules to its own neighbours; what it passes on is sealed besides, so that it cannot forge
-anything (:mod:`skyloop.network.sealing`).
+A node applies it on each of its links to the neighbour, identified by the common name in the neighbour's certificate.
+What that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward (egress), and
+nothing else passes. So each end protects itself, whatever the configuration of others. A router may publish and
+subscribe to everything, and applies the rules to its own neighbours; traffic through it is sealed, so that it cannot
+forge anything (:mod:`skyloop.network.sealing`).
 
 The two directions mirror each other: what an application publishes, proxies subscribe to. Declarations and queries
-count as messages in the direction in which they travel: the declaration of a subscriber is published.
+count as messages in the direction in which they travel: a subscriber's declaration is published.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _SUBSCRIBE: Final = ("declare_subscriber",)
 _ALL: Final = (*_PUT, "delete", *_SUBSCRIBE, *_QUERY, *_ANSWERS, *_TOKEN, *_LIFE)
 _ANY: Final = "*"
 
-#: Key expressions, by the kinds of messages.
+#: Key expressions by kind of message.
 Rules = Mapping[tuple[str, ...], list[str]]
 
 
@@ -82,7 +82,7 @@ def may_publish(identity: Identity) -> Rules:
 def may_subscribe(identity: Identity) -> Rules:
     """Return what an identity may receive.
 
-    For an application that is what proxies send to it, for a proxy what applications send.
+    Applications receive what proxies send to them; proxies receive what applications send.
     """
     if identity.role is KeyRole.ROUTER:
         return may_publish(identity)
@@ -108,12 +108,12 @@ def may_subscribe(identity: Identity) -> Rules:
 
 
 def _to_applications(names: list[str]) -> list[str]:
-    """Return where proxies put packets and frames, and applications subscribe to them."""
+    """Return the keys on which proxies send packets and frames, and to which applications subscribe."""
     return [key for name in names for key in layout.downward(name)]
 
 
 def _to_proxies(identity: Identity, who: str) -> list[str]:
-    """Return where an application may put packets, or receive the subscription of ``who`` to them."""
+    """Return the keys on which an application may send packets, or receive ``who``'s subscription to them."""
     keys = [layout.upward(layout.ASK, name, who, _ANY) for name in _seen(identity)]
     if identity.role is KeyRole.PILOT:
         ways = (layout.ORDER, layout.COMMAND)
@@ -122,10 +122,10 @@ def _to_proxies(identity: Identity, who: str) -> list[str]:
 
 
 def _seen(identity: Identity) -> list[str]:
-    """Return the drones that an application may see; a pilot may see all, whichever it may fly."""
+    """Return the drones that an application may see; a pilot sees all, whichever it may fly."""
     return _chunks(ALL_DRONES if identity.role is KeyRole.PILOT else identity.drones)
 
 
 def _chunks(patterns: tuple[str, ...]) -> list[str]:
-    """Convert patterns to one chunk of a key expression each, where ``*`` is any name and ``$*`` any characters."""
+    """Convert each pattern to one chunk of a key expression, where ``*`` is any name and ``$*`` any characters."""
     return [pattern if pattern == _ANY else pattern.replace("*", "$*") for pattern in patterns]

@@ -1,6 +1,6 @@
-"""Who is let in: applications that prove their identity with their keys, while there is a place for them.
+"""Admission of applications that prove their identity with their keys, while there is room for them.
 
-With the proofs the two ends also agree on the keys that they seal packets with.
+With the proofs, the two ends also agree on the keys that seal their packets.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity, KeyRing
 
-MAX_CLIENTS: Final = 256  #: connections in all: each costs memory, and its share of the thread that calls the handler
-#: Of one key. A program has one connection to a drone; a lab's cockpit and its recorders and workers share a key.
+MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time of the thread that calls the handler
+#: Connections of one key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
-#: Places that only keys which may fly this drone get: so many others can't keep a pilot out, with however many keys.
+#: Connections reserved for keys that may fly this drone: others can't lock pilots out, however many keys they have.
 FOR_PILOTS: Final = 64
-#: Signs of life of one key that are remembered: they come before the connection that they are of.
+#: Tokens remembered per key: a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
-#: Without keys all have the same name, and no application can be distinguished from a flood.
+#: Without keys all have the same name, and a flood looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 
@@ -32,22 +32,22 @@ class Admission(NamedTuple):
     """The terms of a connection; without keys only ``welcome`` is set."""
 
     welcome: bytes = b""  #: the proxy's answer
-    offer: bytes = b""  #: the proof that was asked with
-    identity: Identity | None = None  #: who the other end has proved to be
-    expires: datetime | None = None  #: when its key does
-    sealer: Sealer = PLAIN  #: of packets to it
-    opener: Opener = PLAIN  #: of packets from it
-    topics: Opener = PLAIN  #: of what is published: the application's
-    generation: int = 0  #: of the key for that
+    offer: bytes = b""  #: the proof in the request
+    identity: Identity | None = None  #: the other end's proven identity
+    expires: datetime | None = None  #: expiry of its key
+    sealer: Sealer = PLAIN  #: for packets to it
+    opener: Opener = PLAIN  #: for packets from it
+    topics: Opener = PLAIN  #: for published packets: the application's opener
+    generation: int = 0  #: generation of the topic key
 
 
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join, and return its terms with the proxy's answer; without keys everybody is let in.
+    """Check a request to join, and return its terms with the proxy's answer; without keys everybody is admitted.
 
     Raises:
-        LinkError: The application has no key of this lab, another's, or one without a right to see this drone.
+        LinkError: The application has no key of this lab, another's key, or one that may not see this drone.
     """
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
@@ -56,7 +56,7 @@ def admit(
     proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(request.proof)
     identity = agreed.identity
     if identity.name != sender.who:
-        raise LinkError(f"these are the keys of {identity}, and not of {sender.who}")
+        raise LinkError(f"these are the keys of {identity}, not of {sender.who}")
     if not identity.may_see(name):
         raise LinkError(f"these are the keys of {identity}: they are not for {name}")
     sealer = Seal(agreed.down)
@@ -69,7 +69,7 @@ def admit(
 
 
 class JoinRequest:
-    """The application's request to be let in, which accepts only the answer of the proxy; without keys any."""
+    """The application's request to join, which accepts only the proxy's answer; without keys, any answer."""
 
     def __init__(self, ring: KeyRing | None, name: str, run: str, sender: layout.Sender) -> None:
         self._name = name
@@ -85,7 +85,7 @@ class JoinRequest:
         """Check the proxy's answer, and return the terms of the connection.
 
         Raises:
-            LinkError: Whoever answered has no key to serve this drone, or the answer is damaged.
+            LinkError: The answer comes from an end without a key to serve this drone, or is damaged.
         """
         if not self.proof:
             return Admission()
@@ -98,7 +98,7 @@ class JoinRequest:
             opened = opener.open(where, trailer, welcome.topics[TRAILER:])
             message = packets.parse(opened[0]) if opened is not None else None
         except DecodeError as error:
-            raise LinkError(f"its answer does not hold together: {error}") from None
+            raise LinkError(f"its answer is inconsistent: {error}") from None
         if not isinstance(message, packets.Key):
             raise LinkError("its answer has no key for topics")
         topics = Open().use(message.key, message.generation)
@@ -112,37 +112,37 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no place for one more connection, empty if there is.
+    """Return why there is no room for one more connection; empty if there is.
 
     Args:
-        who: The identity that asks.
+        who: The identity that requests it.
         may_fly: Whether it may fly this drone.
-        present: The connections there are: the identity of each, and whether it may fly this drone.
+        present: The present connections: the identity of each, and whether it may fly this drone.
     """
     here = list(present)
     own = sum(other == who for other, _ in here)
     if own >= PER_KEY:
-        return f"the key of {who!r} has {own} connections already, and may have {PER_KEY}: end some of them"
+        return f"the key of {who!r} already has {own} of at most {PER_KEY} connections: close some of them"
     if len(here) >= MAX_CLIENTS:
-        return f"there are {len(here)} connections already, and at most {MAX_CLIENTS} are taken: end some of them"
+        return f"there are already {len(here)} of at most {MAX_CLIENTS} connections: close some of them"
     lookers = sum(not flies for _, flies in here)
     if not may_fly and lookers >= MAX_CLIENTS - FOR_PILOTS:
         return (
-            f"there are {lookers} connections of keys that may not fly this drone already, and the other {FOR_PILOTS} "
-            "places are kept for pilots: end some of them"
+            f"there are already {lookers} connections of keys that may not fly this drone, and the other {FOR_PILOTS} "
+            "are reserved for pilots: close some of them"
         )
     return ""
 
 
 class Tokens:
-    """The liveliness tokens of connections, bounded for each identity, or without keys in all. Not thread-safe."""
+    """The liveliness tokens of connections, limited per identity, or in total without keys. Not thread-safe."""
 
     def __init__(self, *, by_key: bool) -> None:
         self._most = TOKENS_PER_KEY if by_key else TOKENS
         self._seen: dict[str, set[str]] = {}
 
     def add(self, who: str, connection: str) -> bool:
-        """Remember a token; return False if this identity has too many."""
+        """Add a token; return False if this identity has too many."""
         seen = self._seen.setdefault(who, set())
         if len(seen) >= self._most and connection not in seen:
             return False
@@ -150,7 +150,7 @@ class Tokens:
         return True
 
     def discard(self, who: str, connection: str) -> None:
-        """Forget a token."""
+        """Remove a token."""
         seen = self._seen.get(who)
         if seen is not None:
             seen.discard(connection)
@@ -158,9 +158,9 @@ class Tokens:
                 del self._seen[who]
 
     def has(self, who: str, connection: str) -> bool:
-        """Return whether a connection's token is there."""
+        """Return whether a connection has a token."""
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:
-        """Return whether the token of any of these connections, given with their identities, is there."""
+        """Return whether any of these connections, given with their identities, has a token."""
         return any(self.has(who, connection) for connection, who in connections.items())

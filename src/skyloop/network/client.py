@@ -31,28 +31,28 @@ from skyloop.transport.base import (
 if TYPE_CHECKING:
     import zenoh
 
-GLANCE_S: Final = 0.25  #: how long one session is given to find a proxy, before there is a search for others
-#: After a loss, a linked node that takes longer to list the proxies that it knows has probably not noticed that the
-#: links ended before they were made again. It takes the new ones for more of the old, and tells nothing by them.
-#: Each time twice as long, up to :data:`SYNC_S`: it may be busy after all.
+GLANCE_S: Final = 0.25  #: time for one session to find a proxy before searching elsewhere
+#: After a loss, a linked node that takes longer to list its proxies has probably not seen that the links ended before
+#: they were re-established. It takes the new links for more of the old ones and announces nothing on them. The limit
+#: doubles each time, up to :data:`SYNC_S`, as the node may only be busy.
 LIST_S: Final = 1.0
-POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
-STALLED_S: Final = 5.0  #: a proxy that acknowledges nothing for so long counts as gone
+POLL_S: Final = 0.05  #: how often to check for packets to resend
+STALLED_S: Final = 5.0  #: a proxy that acknowledges nothing for this long counts as gone
 KEYS_S: Final = 0.5  #: how often to check for a newer roster
-FAREWELL_S: Final = 0.3  #: how long to wait for the proxy to answer a bye
+FAREWELL_S: Final = 0.3  #: how long to wait for the answer to a bye
 _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
     """Return the dialer of a proxy on the network.
 
-    The dialer raises :class:`UnknownNameError` where no such proxy can be reached, and :class:`LinkError` where the
-    proxy does not let the application in.
+    The dialer raises :class:`UnknownNameError` if no such proxy can be reached, and :class:`LinkError` if the proxy
+    does not admit the application.
 
     Args:
         name: The proxy's name.
         settings: How to join the network; by default by multicast, without keys.
-        find_s: How long each call of the dialer searches for the proxy [s].
+        find_s: Time for each call of the dialer to find the proxy [s].
 
     Raises:
         UsageError: The name is not valid, or the keys are not an application's.
@@ -64,7 +64,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     if chosen.identity is not None:
         chosen.identity.require_application()
 
-    before: FabricClient | None = None  # the connection that was made last
+    before: FabricClient | None = None  # the previous connection
     about: packets.ProxyInfo | None = None  # the proxy
     list_s = SYNC_S
 
@@ -72,8 +72,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the other while the other has not: such a session finds nobody, or gets no
-            # answers, and Zenoh does not detect that. A new one has another identity than the old.
+            # One end may have forgotten the other while the other has not: such a session finds no proxy, or gets no
+            # answers, and Zenoh does not notice. A new session has a new identity.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -83,7 +83,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             renew(session)
             release(session)
             raise
-        except NoAnswerError:  # as above: the links may have been lost and made again since the session was opened
+        except NoAnswerError:  # as above: the links may have been re-established since the session was opened
             list_s = min(2.0 * list_s, SYNC_S)
             retire(session)
             release(session)
@@ -107,25 +107,25 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     return dialer
 
 
-#: For the receiving thread: a packet of a topic (None: to this end alone), its number there; a frame, if it is empty.
+#: For the receiving thread: a packet of a topic (None: for this end only) and its number; empty: a frame.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
 
 class FabricClient(TransportClient):
-    """An application's end, made by the dialer that :func:`dial` returns.
+    """An application's end, made by :func:`dial`'s dialer.
 
     Args:
-        session: The Zenoh session; released when the connection ends, but not where this raises.
+        session: The Zenoh session; released when the connection ends, but not if this raises.
         name: The proxy's name.
         handler: Called on the receiving thread.
-        find_s: How long to search for the proxy [s].
-        list_s: How long the linked nodes may take after that to list the proxies that they know [s].
-        known: What the proxy reported of itself before.
+        find_s: Time to find the proxy [s].
+        list_s: Further time for linked nodes to list the proxies that they know [s].
+        known: An earlier report of the proxy about itself.
 
     Raises:
         UnknownNameError: No such proxy can be reached.
-        LinkError: The proxy does not let this application in, or does not answer (:class:`NoAnswerError`).
+        LinkError: The proxy does not admit this application, or does not answer (:class:`NoAnswerError`).
     """
 
     def __init__(
@@ -138,35 +138,35 @@ class FabricClient(TransportClient):
         known: packets.ProxyInfo | None = None,
     ) -> None:
         self._session = session
-        self.parted = False  #: the proxy has announced that it ends this connection, or let it end
+        self.parted = False  #: the proxy has announced the end of this connection, or accepted it
         self._name = name
         self._handler = handler
         self._who = session.settings.who
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # of the proxy, once one is asked to let us in
-        self._lock = threading.Lock()  # guards what follows; held while a packet is sent, so that order is kept
+        self._run = ""  # the proxy's, once a proxy was asked to admit us
+        self._lock = threading.Lock()  # guards what follows; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with what was declared for each
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with the declarations of each
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None
         self._report_key = layout.upward(layout.ASK, name, self._who, self._id)
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
-        self._keys_s = 0.0  # when the keys are checked next
-        self._admission = Admission()  # with keys: who the proxy is, and what packets are sealed with
-        self.forged = 0  #: packets and frames that did not come from the proxy
-        self._receiver = Receiver()  # packets to this end alone
+        self._keys_s = 0.0  # when to check the keys next
+        self._admission = Admission()  # with keys: the proxy's identity and the seals of packets
+        self.forged = 0  #: packets and frames that were not the proxy's
+        self._receiver = Receiver()  # packets for this end only
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
         self._ended = False  # nothing can be sent any more
-        self._closing = False  # by this end: nothing more is delivered
+        self._closing = False  # closed here: nothing more is delivered
         self._farewell = threading.Event()  # the proxy has answered our bye, or is gone
         self._reason = ""
         self._held: list[Any] = []
         try:
-            about = self.about = self._enter(find_s, list_s, known)  #: what the proxy reports of itself, if it did
+            about = self.about = self._enter(find_s, list_s, known)  #: the proxy's report about itself, if any
         except BaseException:
             self._undeclare()
             raise
@@ -175,10 +175,10 @@ class FabricClient(TransportClient):
         self._thread.start()
 
     def _enter(self, find_s: float, list_s: float, known: packets.ProxyInfo | None) -> packets.ProxyInfo | None:
-        """Find the proxy and be let in.
+        """Find the proxy and join it.
 
         Raises:
-            LinkError: It does not let us in.
+            LinkError: It does not admit us.
             UnknownNameError: There is none.
         """
         session, name = self._session, self._name
@@ -198,7 +198,7 @@ class FabricClient(TransportClient):
             else:
                 return about
 
-    # --- use ---
+    # --- calls of the application ---
 
     def send(self, packet: bytes) -> bool:
         if not 0 < len(packet) <= MAX_PACKET:
@@ -234,8 +234,8 @@ class FabricClient(TransportClient):
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
-        if not sent:  # the next connection subscribes again; this one would wait for what never comes
-            self._end(f"the proxy does not take what is sent to it: the subscription to {topic!r} can't be sent")
+        if not sent:  # the next connection subscribes again; on this one, nothing would arrive
+            self._end(f"the proxy accepts no packets: the subscription to {topic!r} can't be sent")
 
     def close(self) -> None:
         self._end("closed by the application")
@@ -284,7 +284,7 @@ class FabricClient(TransportClient):
         )
 
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost, and that nothing waits for."""
+        """Send a packet that may be lost and that nothing waits for."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)
@@ -293,17 +293,17 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet, repeatedly until it is acknowledged; return False if there is no room for it. Locked."""
+        """Send a packet until it is acknowledged; return False if there is no room for it. Call with the lock held."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False
         self._send_due()
         if not waits:
-            self._inbox.put(_WAKE)  # the receiving thread resends what is on the way
+            self._inbox.put(_WAKE)  # the receiving thread resends unacknowledged packets
         return True
 
     def _send_due(self) -> None:
-        """Send the packets that are due. Locked."""
+        """Send the packets that are due. Call with the lock held."""
         for number, packet, way in self._outgoing.due(time.monotonic()):
             self._put(way, packet, number)
 
@@ -325,7 +325,7 @@ class FabricClient(TransportClient):
             return False
         return True
 
-    # --- what Zenoh calls, on its own threads ---
+    # --- callbacks, on Zenoh's threads ---
 
     def _on_proxy_gone(self, run: str) -> None:
         if run == self._run:
@@ -333,11 +333,11 @@ class FabricClient(TransportClient):
             self._end("the proxy is gone")
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet to this application alone."""
+        """Handle a packet for this application only."""
         try:
             opened = contents(self._admission.opener, sample)
             if opened is None:
-                return  # it came before, by another way
+                return  # it already arrived on another path
             packet, number = opened[0], packets.parse_number(opened[1])
         except DecodeError as error:
             self._reject(error)
@@ -361,7 +361,7 @@ class FabricClient(TransportClient):
             self._enqueue(packet)
 
     def _control(self, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False for one that is left to the handler (garbage)."""
+        """Handle one of the transport's own packets; return False for one left to the handler (garbage)."""
         if isinstance(message, packets.Taken):
             with self._lock:
                 self._outgoing.taken(message.number, time.monotonic())
@@ -380,15 +380,15 @@ class FabricClient(TransportClient):
         self._inbox.put((subscription, packet, number))
 
     def _reject(self, error: DecodeError) -> None:
-        """Count something that the proxy did not send, and log it the first time."""
+        """Count a sample that is not the proxy's, and log the first."""
         self.forged += 1
         if self.forged == 1:
-            _log.warning("%s: something came that the proxy did not send, and is left out: %s", self._name, error)
+            _log.warning("%s: ignored a packet that the proxy did not send: %s", self._name, error)
 
     # --- keys ---
 
     def _check_keys(self) -> None:
-        """End the connection if a newer roster shuts out the proxy or a node between. On the receiving thread."""
+        """End the connection if a newer roster excludes the proxy or a linked node. On the receiving thread."""
         ring, proxy, expires = self._ring, self._admission.identity, self._admission.expires
         now_s = time.monotonic()
         if ring is None or proxy is None or now_s < self._keys_s:
@@ -404,13 +404,13 @@ class FabricClient(TransportClient):
         elif expires is not None and datetime.now(UTC) >= expires:
             reason = "the keys of the proxy have expired"
         elif linked:
-            reason = f"linked to one whose keys were revoked or changed: {', '.join(sorted(linked))}"
+            reason = f"linked to a node whose keys were revoked or changed: {', '.join(sorted(linked))}"
         else:
             return
-        retire(self._session)  # a new one goes by the newer roster
+        retire(self._session)  # the next session uses the newer roster
         self._end(reason)
 
-    # --- the end of a connection ---
+    # --- the end of the connection ---
 
     def _end(self, reason: str) -> None:
         """End the connection once; the receiving thread does the rest. Any thread."""
@@ -464,7 +464,7 @@ class FabricClient(TransportClient):
                 waits, stalled_s = self._outgoing.under_way, self._outgoing.stalled_s(time.monotonic())
             most_s = STALLED_S + self.excused_s
             if stalled_s > most_s and not self._ended:
-                self._end(f"the proxy took nothing of what was sent to it for {most_s:g} s")
+                self._end(f"the proxy acknowledged nothing for {most_s:g} s")
             try:
                 return self._inbox.get(timeout=POLL_S if waits else self._pause_s)
             except Empty:
@@ -479,7 +479,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge something, ``once`` by a datagram, which may be lost."""
+        """Acknowledge a packet; ``once``: with a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return

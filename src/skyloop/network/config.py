@@ -1,6 +1,6 @@
-"""How this process joins the network: its settings, by arguments or the environment, and Zenoh's configuration of them.
+"""Network settings from arguments and the environment, and the Zenoh configuration made from them.
 
-Pure, but for reading the environment and the search of a free port.
+Pure except for reading the environment and searching for a free port.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from skyloop.network.layout import ANYONE, check_identity
 if TYPE_CHECKING:
     from skyloop.network.keys import Credentials, Identity, KeyRing
 
-LEASE_S: Final = 0.7  #: without a sign of life for so long a peer is gone, if it asks for nothing else
-MAX_LEASE_S: Final = 10.0
+LEASE_S: Final = 0.7  #: default time without a sign of life after which a peer counts as gone
+MAX_LEASE_S: Final = 10.0  #: longest lease
 DEFAULT_PORT: Final = 7447  #: Zenoh's
-#: An address that does not answer for so long is given up, and the next one of the same peer is tried.
+#: Time for an address to answer before the next one of the same peer is tried.
 OPEN_MS: Final = 800
-#: The same where addresses were given: all of them are tried at once, and a mobile network may be behind one. After an
-#: outage each answer waits there behind old video. Who gives up just before the last one comes has left a link at the
-#: other end, and Zenoh takes the next for one more beside it, by which nothing is told again.
+#: The same for given addresses: all are tried at once, and a mobile network may be behind one, where each answer after
+#: an outage waits behind old video. An end that gives up just before the last answer leaves a half-open link at the far
+#: end; Zenoh takes the next link for a second one of the same peer, and repeats no declarations on it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits for others to be found (Zenoh's default). An application that was given one address
-#: waits for its proxy itself, and goes on as soon as that shows; with several it has to know all that have the name.
+#: How long opening a session waits to discover others (Zenoh's default). An application with one address waits only for
+#: its proxy; with several it must find all proxies of the name.
 SETTLE_MS: Final = 500
-MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
-#: Bytes of one message that a proxy takes, as frames go the other way; more is dropped before it is put together.
+MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
+#: Maximum size of a message to a proxy [bytes], as frames go the other way; a larger one is dropped before reassembly.
 MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")
@@ -53,38 +53,38 @@ _OFF: Final = frozenset({"", "off", "0", "false", "no"})
 class TlsFiles:
     """An identity for mutual TLS, as PEM files."""
 
-    ca: Path  #: certificate of the authority that signed everybody's
+    ca: Path  #: certificate of the authority that signed all identities
     certificate: Path
     key: Path
 
 
 @dataclass(frozen=True, slots=True)
 class FabricSettings:
-    """How to join the network; by default others on the same network segments are found by multicast, without keys.
+    """How to join the network; by default by multicast on the same network segments, without keys.
 
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
-    (port 7447). Without keys each stands for TCP (what must arrive) and UDP (commands and feedback), with keys for
-    QUIC. An address may also be a whole Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used as it is.
+    (port 7447). Without keys each stands for TCP (packets that must arrive) and UDP (commands and feedback), with keys
+    for QUIC. An address may also be a full Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used unchanged.
 
     Raises:
-        UsageError: The identity is not valid, or is given without its certificate and key; or the lease is none.
+        UsageError: The identity is not valid or lacks its certificate and key, or the lease is out of range.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
-    multicast: bool = True  #: search, and be found, by UDP multicast on the network segments of this host
+    multicast: bool = True  #: discover by UDP multicast on this host's network segments
     tls: TlsFiles | None = None
-    #: A link counts as lost when nothing came by it for so long [s], by the others as they are told, and by an
-    #: application 0.3 s later. A mobile network is silent for seconds, and what was lost takes another to come back.
+    #: Silence after which a link counts as lost [s]; peers learn the value, applications add 0.3 s. A mobile network
+    #: may be silent for seconds, and takes another to deliver lost packets.
     lease_s: float = LEASE_S
-    who: str = ANYONE  #: the identity: the common name of the certificate
-    #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), None for none.
+    who: str = ANYONE  #: the identity: the certificate's common name
+    #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
     access_control: dict[str, Any] | None = None
-    #: The keys that ``tls`` and ``access_control`` were made from.
+    #: The keys behind ``tls`` and ``access_control``.
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
-        """Return these settings with the newest roster in the folder of the keys, for a new session.
+        """Return these settings with the newest roster in the key folder, for a new session.
 
         Raises:
             LinkError: That roster revokes these keys themselves.
@@ -101,7 +101,7 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """By how much longer a silence is borne than usual [s]."""
+        """Return the silence that is tolerated beyond the default [s]."""
         return self.lease_s - LEASE_S
 
     @property
@@ -112,7 +112,7 @@ class FabricSettings:
 
     @property
     def identity(self) -> Identity | None:
-        """Whose keys these are; None without keys."""
+        """The keys' identity; None without keys."""
         return None if self.ring is None else self.ring.credentials.identity
 
     def __post_init__(self) -> None:
@@ -124,9 +124,9 @@ class FabricSettings:
 
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
-    """Return these settings with a key: mutual TLS over QUIC, and access control by the roster that came with it."""
+    """Return these settings with keys: mutual TLS over QUIC, and access control by their roster."""
     from skyloop.network.access import access_control
-    from skyloop.network.keys import KeyRing  # with keys only: these need cryptography
+    from skyloop.network.keys import KeyRing  # only with keys: these need cryptography
 
     return replace(
         settings,
@@ -137,15 +137,15 @@ def secured(settings: FabricSettings, credentials: Credentials) -> FabricSetting
     )
 
 
-#: ``True``: search by multicast; addresses to call, with ``multicast`` among them to search as well, separated by
-#: commas; ``False``: this host only; ``None``: as the environment says.
+#: ``True``: discover by multicast; addresses to connect to, separated by commas, with ``multicast`` among them to
+#: discover as well; ``False``: this host only; ``None``: the environment's choice.
 NetworkChoice = bool | str | FabricSettings | None
 
 
 def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return the settings of the network, None to stay on this host.
+    """Return the network settings; None to stay on this host.
 
-    A key that ends within a week is logged as a warning.
+    A key that expires within a week is logged as a warning.
 
     Args:
         network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves
@@ -185,21 +185,21 @@ def serving(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Return the settings of what serves on the network, or joins its parts.
+    """Return the settings of a proxy, a host or a router on the network.
 
     Args:
-        network: ``multicast``, or addresses of routers with commas, with ``multicast`` among them for both.
+        network: ``multicast``, or addresses of routers separated by commas, with ``multicast`` among them for both.
         listen: Addresses to listen at.
         connect: More addresses to connect to.
-        multicast: Whether to be found by multicast, where ``network`` names it.
+        multicast: Whether multicast discovery works, where ``network`` names it.
         keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
 
     Raises:
-        UsageError: An address or the folder is not valid, or no place is named.
+        UsageError: An address or the folder is not valid, or no address is given.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
-        raise UsageError("the network names no place: give multicast, or addresses with commas")
+        raise UsageError("the network is empty: give multicast, or addresses separated by commas")
     routers = [word for word in words if word.lower() != MULTICAST]
     return settings(
         listen=listen, connect=(*routers, *connect), multicast=multicast and len(routers) < len(words), keys=keys
@@ -213,19 +213,19 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Make settings for the network; ``keys`` is the folder of an identity, by default ``SKYLOOP_KEYS``.
+    """Make network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``.
 
     Raises:
         UsageError: An address or the folder is not valid.
     """
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
-    endpoints_of((*listen, *connect), found)  # says what is wrong with an address before anything is opened
+    endpoints_of((*listen, *connect), found)  # report invalid addresses before opening anything
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
     return found if folder is None else secure(found, folder)
 
 
 def _lease_s() -> float:
-    """Return the lease that the environment asks for [s]. Raises :class:`UsageError`."""
+    """Return the lease in the environment [s]. Raises :class:`UsageError`."""
     text = os.environ.get(LEASE_VARIABLE) or f"{LEASE_S:g}"
     try:
         return float(text)
@@ -237,43 +237,43 @@ def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
     """Return these settings with the identity in a folder.
 
     Raises:
-        UsageError: The folder is not valid, or an address does not go with keys.
+        UsageError: The folder is not valid, or an address can't be used with keys.
     """
-    from skyloop.network.keys import load  # with keys only: it needs cryptography
+    from skyloop.network.keys import load  # only with keys: it needs cryptography
 
     found = secured(plain, load(folder))
-    endpoints_of((*found.listen, *found.connect), found)  # not all that are good without keys are with them
+    endpoints_of((*found.listen, *found.connect), found)  # keys allow fewer addresses
     return found
 
 
 class Part(StrEnum):
-    """The part that a session plays in the network."""
+    """A session's role in the network."""
 
-    PROXY = "proxy"  #: listens, and is called by applications
-    APP = "app"  #: calls proxies
-    ROUTER = "router"  #: joins those that can't reach one another
+    PROXY = "proxy"  #: listens, applications connect to it
+    APP = "app"  #: connects to proxies
+    ROUTER = "router"  #: joins ends that can't reach one another
 
 
-#: Signs of life in the time of a lease: so many that on a path that loses three packets in ten some arrive.
+#: Signs of life per lease: enough that some arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
-#: Messages that wait to be sent, by priority (Zenoh's most). Its default is 2, and what comes then is dropped within a
-#: millisecond: ten drones of one process report the same event in the same moment.
+#: Messages queued for sending, by priority (Zenoh's maximum). With its default of 2, further ones are dropped within a
+#: millisecond: ten drones in one process report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Whatever a neighbour asks for: who does not read holds up nobody, neither here nor through a router. An answer is
-#: sent as its question came.
+#: Overrides a neighbour's requests: a slow reader blocks no other, neither here nor through a router. Answers are sent
+#: like their queries.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
     "messages": ["put", "delete", "query"],
     "flows": ["ingress", "egress"],
     "overwrite": {"congestion_control": "drop"},
 }
-#: What keeps proxies apart from applications for Zenoh: a router passes on from one region to another, and takes those
-#: of one region to reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
+#: Separates proxies from applications in Zenoh: a router forwards between regions, and assumes that the nodes of one
+#: region reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
 _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration, as its sections by name; ``listen`` are endpoints in place of the settings'.
+    """Return Zenoh's configuration by section; ``listen``: endpoints that replace the settings'.
 
     Raises:
         UsageError: An address is not valid.
@@ -281,8 +281,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
-    # A neighbour that takes none of Zenoh's own declarations for as long is cut off; one of Zenoh's few receiving
-    # threads waits for it meanwhile. All else is dropped when a link is congested.
+    # Cut off a neighbour that accepts none of Zenoh's own declarations for this long: one of Zenoh's few receiving
+    # threads waits for it meanwhile. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
@@ -315,7 +315,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
     else:
         found["region_name"] = _REGIONS[part]
-        # Not a gateway for Zenoh's "clients", which are not let in: all our nodes are peers. A gateway would pass on
+        # Not a gateway for Zenoh's "clients", which are not admitted: all our nodes are peers. A gateway would forward
         # each of the clients' declarations, and thousands of them would block it for seconds.
         found["gateway"] = {"south": []}
     if settings.tls is not None:
@@ -326,18 +326,18 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """Convert addresses (``HOST:PORT``, ``HOST`` or whole endpoints) to Zenoh's: QUIC with keys, else TCP and UDP.
+    """Convert addresses (``HOST:PORT``, ``HOST`` or full endpoints) to Zenoh's: QUIC with keys, else TCP and UDP.
 
     Raises:
-        UsageError: An address is not valid, or with keys not encrypted.
+        UsageError: An address is not valid, or unencrypted although keys are used.
     """
     found: list[str] = []
     for address in addresses:
         if "/" in address:
             if not address.startswith(_PROTOCOLS):
-                raise UsageError(f"{address!r} is no network address: it looks like 10.0.0.5:7447 or tcp/10.0.0.5:7447")
+                raise UsageError(f"{address!r} is not a network address, such as 10.0.0.5:7447 or tcp/10.0.0.5:7447")
             if settings.tls is not None and not address.startswith(_ENCRYPTED):
-                raise UsageError(f"with keys nothing travels unencrypted: {address!r} must begin with quic/ or tls/")
+                raise UsageError(f"with keys, nothing is sent unencrypted: {address!r} must begin with quic/ or tls/")
             found.append(address)
             continue
         place = _with_port(address)
@@ -349,14 +349,14 @@ def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str
 
 
 def to_json(sections: dict[str, Any]) -> str:
-    """Return a configuration as JSON, for the files of Zenoh's own programs."""
+    """Return a configuration as JSON, for Zenoh's own programs."""
     return json.dumps(sections, indent=2)
 
 
 def listening(settings: FabricSettings) -> list[str]:
     """Return the addresses to listen at, with a free port in place of port 0.
 
-    Without addresses in the settings that is a free port on all interfaces.
+    Without addresses in the settings, that is a free port on all interfaces.
 
     Raises:
         LinkError: No port is free.
@@ -371,7 +371,7 @@ def listening(settings: FabricSettings) -> list[str]:
 
 
 def free_port(host: str) -> int:
-    """Return a port that is free for both TCP and UDP now.
+    """Return a port that is now free for both TCP and UDP.
 
     Raises:
         LinkError: There is none, or this host does not have the address.
@@ -393,10 +393,10 @@ def free_port(host: str) -> int:
 
 
 def _called(part: Part, has_addresses: bool) -> list[str]:
-    """Return which kinds of node a node connects to when it learns of them.
+    """Return the kinds of nodes to connect to on discovery.
 
-    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node that was given
-    addresses connects to no other router: one that was found is not retried as often as an address is.
+    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node with given
+    addresses connects to no other router: a discovered one is not retried as often as an address.
     """
     if part is Part.APP:
         return ["router", "peer"]
@@ -404,7 +404,7 @@ def _called(part: Part, has_addresses: bool) -> list[str]:
 
 
 def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
-    """Return the only protocols that are accepted; with keys, none that is not encrypted."""
+    """Return the accepted protocols; with keys, only encrypted ones."""
     usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
     return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
 
@@ -438,7 +438,7 @@ def _with_port(address: str) -> str:
         host, port = address, str(DEFAULT_PORT)
     bare = host.startswith("[") == host.endswith("]") and (":" not in host or host.startswith("["))
     if not host or not bare or not port.isdecimal() or int(port) > 65535:
-        raise UsageError(f"{address!r} is no network address: it looks like 10.0.0.5:7447, [fe80::1]:7447 or lab.local")
+        raise UsageError(f"{address!r} is not a network address, such as 10.0.0.5:7447, [fe80::1]:7447 or lab.local")
     return f"{host}:{port}"
 
 
@@ -447,5 +447,5 @@ def _host(address: str) -> str:
 
 
 def all_interfaces() -> str:
-    """Return the address that stands for all interfaces of this host."""
+    """Return the address of all interfaces of this host."""
     return "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"

@@ -1,7 +1,7 @@
-"""The applications' connections at the transport server, what is published to them, and the thread that sends to one.
+"""Applications' connections at the transport server, publishing to them, and the thread that sends to single ones.
 
-Whoever answers an application only queues the answer here, and nothing that the thread does waits for an application.
-One that acknowledges nothing costs what is kept for it, and that is bounded.
+Threads that answer an application only queue the answer here, and the sending thread never waits for an application.
+An application that acknowledges nothing costs a bounded amount of memory.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from skyloop.transport.priority import PacketBacklog
 if TYPE_CHECKING:
     import zenoh
 
-#: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
-#: that they are sent again; further commands are dropped, as newer ones follow. Set-points count once.
+#: Limit of one application's packets, and of its commands, that wait for the handler. Further packets are not
+#: acknowledged, and so resent; further commands are dropped, as newer ones follow. Set-points count once.
 MAX_WAITING: Final = 64
-POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
-_OWN_AT_MOST: Final = 8  # of the transport's own packets that wait; they may be lost, and are asked for again
+POLL_S: Final = 0.05  #: how often to check for packets to resend
+_OWN_AT_MOST: Final = 8  # the transport's own queued packets; they may be lost, and are requested again
 _log = logging.getLogger(__name__)
 _VIDEO: Final = video("")
 _STREAMS: Final = stream("")
@@ -38,7 +38,7 @@ _RESULTS: Final = results("")
 
 
 class ServerConnection:
-    """An application at the transport server. Its lock guards what is sent to it, and its topics."""
+    """An application at the transport server. Its lock guards its outgoing packets and its topics."""
 
     __slots__ = (
         "_own",
@@ -66,40 +66,40 @@ class ServerConnection:
         self.who = who
         self.id = connection
         self.admission = admission
-        self.joined_s = joined_s  #: when it asked to be let in
-        self.commands = PacketBacklog(MAX_WAITING)  #: that wait for the handler; the server guards it
-        self.announced = False  #: the handler knows of it
+        self.joined_s = joined_s  #: when it asked to join
+        self.commands = PacketBacklog(MAX_WAITING)  #: waiting for the handler; the server guards it
+        self.announced = False  #: the handler knows it
         self.confirmed = False  #: its token was seen, so that Zenoh will report its end
-        self.ended = False  #: what still comes is not wanted any more
-        self.reason = ""  #: why it ends, as soon as one end has given a reason
+        self.ended = False  #: further packets from it are ignored
+        self.reason = ""  #: why it ends, once one end has given a reason
         self.lock = threading.Lock()
         self.outgoing = Outgoing()  #: packets to it
         self.receiver = Receiver()  #: packets from it
-        self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's, to it
-        self._taken = 0  # the number to acknowledge its packets up to; 0: nothing to acknowledge
-        self.topics: dict[str, int] = {}  #: with the number up to which it has acknowledged each
-        self.paces: dict[str, Pace] = {}  #: of those of which only the newest counts
-        self.left = False  #: it is not subscribed to anything any more, and can't be again
+        self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to it
+        self._taken = 0  # acknowledge its packets up to this number; 0: nothing to acknowledge
+        self.topics: dict[str, int] = {}  #: each with the number up to which it has acknowledged
+        self.paces: dict[str, Pace] = {}  #: of topics whose newest packet alone counts
+        self.left = False  #: it has unsubscribed from everything for good
 
     def may_command(self, drone: str) -> bool:
-        """Return whether it may send more than questions to this drone, by the identity that it has proved."""
+        """Return whether its proven identity gives it the right to send this drone more than questions."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's packet has no room: more than :data:`DEPTH` before it are not acknowledged."""
+        """Return whether a topic's packet has no room: more than :data:`DEPTH` earlier ones are unacknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Note up to which packet it has acknowledged a topic.
+        """Record up to which packet it has acknowledged a topic.
 
         Args:
-            topic: The topic; empty for packets to this application alone.
-            number: The last packet that was acknowledged.
+            topic: The topic; empty for packets to this application only.
+            number: The last acknowledged packet.
             now_s: The monotonic clock [s].
 
         Returns:
-            Whether further packets to this application alone may be due.
+            Whether further packets to this application only may be due.
         """
         with self.lock:
             if not topic:
@@ -116,10 +116,10 @@ class ServerConnection:
         with self.lock:
             if self.outgoing.put(packet):
                 return ""
-        return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, wait until it takes them"
+        return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, are unacknowledged"
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long it has acknowledged nothing of what was sent to it [s]; 0 if nothing is under way."""
+        """Return for how long it has acknowledged nothing [s]; 0 if all packets are acknowledged."""
         with self.lock:
             return self.outgoing.stalled_s(now_s)
 
@@ -134,38 +134,38 @@ class ServerConnection:
             self._taken = max(self._taken, number)
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
-        """Return what is to be sent now.
+        """Return the packets to send now.
 
         Returns:
-            The packets with their numbers (0: the transport's own), and whether more may become due as time passes.
+            The packets with their numbers (0: the transport's own), and whether more may become due with time.
         """
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
                 found.insert(0, (0, packets.taken("", self._taken)))
                 self._taken = 0
-            found += [(0, packet) for packet in self._own]  # a bye is the last word
+            found += [(0, packet) for packet in self._own]  # a bye comes last
             self._own.clear()
             return found, self.outgoing.under_way and not self.ended
 
 
-#: Sends a packet to an application: its number, or 0 for one that may be lost.
+#: Sends a packet to an application; its number is 0 for one that may be lost.
 Put = Callable[[ServerConnection, bytes, int], object]
 
 
 class Sender:
-    """Sends what the connections keep, again where it is not acknowledged. Any thread may call :meth:`wake`.
+    """Sends the connections' packets, and resends unacknowledged ones. Any thread may call :meth:`wake`.
 
     Args:
         put: Sends one packet; called on this object's thread.
-        name: The proxy's name, for the thread's.
+        name: The proxy's name, for the thread's name.
     """
 
     def __init__(self, put: Put, name: str) -> None:
         self._put = put
         self._changed = threading.Condition(threading.Lock())
-        self._ready: dict[ServerConnection, None] = {}  # in the order in which they came
-        self._waiting: set[ServerConnection] = set()  # something is on the way to them; this thread's alone
+        self._ready: dict[ServerConnection, None] = {}  # in the order of arrival
+        self._waiting: set[ServerConnection] = set()  # with unacknowledged packets; used only by this thread
         self._ended = False
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
 
@@ -174,7 +174,7 @@ class Sender:
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Have packets of a connection sent that are due."""
+        """Have a connection's due packets sent."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()
@@ -208,46 +208,47 @@ class Sender:
         try:
             for number, packet in due:
                 self._put(connection, packet, number)
-        except Exception:  # noqa: BLE001  (whatever it is, the others are to be sent theirs)
-            _log.exception("nothing could be sent to %s", connection.peer.address)
+        except Exception:  # noqa: BLE001  (the others still get theirs)
+            _log.exception("sending to %s failed", connection.peer.address)
 
 
 class Publisher:
-    """Keeps the subscriptions of all connections, and publishes to them. Thread-safe."""
+    """The subscriptions of all connections, and publishing to them. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
         self._run = bytes.fromhex(run)
         self._sealer = sealer
         self._clock = clock
-        self.held_back = 0  #: packets that were not sent, as nothing was heard from any subscriber
+        self.held_back = 0  #: packets skipped because all subscribers were silent
         self._lock = threading.RLock()  # guards what follows
         self._session: Session | None = None  # while it may publish
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._numbers: dict[str, int] = {}  # of the last packet of each topic
+        self._numbers: dict[str, int] = {}  # of each topic's last packet
         self._topic_problem: Callable[[str], str] = lambda _: ""
         self.video = FramePublisher(self._send_frame, name)
 
     def open(self, session: Session, topic_problem: Callable[[str], str]) -> None:
-        """Begin to publish; ``topic_problem`` returns why a topic can't be subscribed to, empty if it can."""
+        """Start publishing; ``topic_problem`` returns why a topic can't be subscribed to, empty if it can."""
         with self._lock:
             self._session = session
             self._topic_problem = self.video.topic_problem = topic_problem
 
     def close(self) -> None:
-        """Publish no more.
+        """Stop publishing.
 
-        Publishers are not undeclared: one that another thread is using then refuses, and ends with its last user.
+        Publishers are not undeclared: one in use by another thread would refuse that; it ends with its last user.
         """
         with self._lock:
             self._session = None
             self._publishers.clear()
 
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to all subscribers of a topic; return how many of them lag too far behind to take it.
+        """Send a packet to all subscribers of a topic; return how many of them lag too far behind to receive it.
 
-        Where only the newest packet counts and the paths to all of them stand still, most are held back.
+        On a topic whose newest packet alone counts, most packets are skipped while the paths to all subscribers are
+        stalled.
         """
         with self._lock:
             subscribed = self._subscribed.get(topic)
@@ -271,7 +272,7 @@ class Publisher:
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
-            else:  # an application has named this topic: nothing is declared for it that would stay
+            else:  # an application chose this topic: leave no declaration behind
                 session.zenoh.put(
                     key,
                     payload,
@@ -281,21 +282,21 @@ class Publisher:
                     express=True,
                 )
         except z.ZError:
-            return len(subscribed)  # it is being stopped
+            return len(subscribed)  # stopping
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return how many readers it passes by."""
+        """Publish a frame; return the number of readers that miss it."""
         return self.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return how many subscribed to a topic; for a camera's plain topic, to its frames in any form."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, of its frames in all forms."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))
 
     def subscribe(self, connection: ServerConnection, request: packets.Subscribe) -> bool:
-        """Subscribe a connection to a topic, or unsubscribe it; return False if that can't be, see :meth:`problem`."""
+        """Subscribe a connection to a topic, or unsubscribe it; return False if that fails (see :meth:`problem`)."""
         topic = request.topic
         with self._lock, connection.lock:
             if connection.ended or connection.left or request.on == (topic in connection.topics):
@@ -317,7 +318,7 @@ class Publisher:
             return True
 
     def problem(self, connection: ServerConnection, topic: str) -> str:
-        """Return why a connection was not subscribed to a topic."""
+        """Return why a connection could not subscribe to a topic."""
         problem = self._topic_problem(topic)
         if not problem and topic.startswith(_VIDEO):
             problem = self.video.problem(connection.id, topic)
@@ -339,9 +340,9 @@ class Publisher:
             self._subscribed[topic] = remaining
         else:
             self._subscribed.pop(topic, None)
-            if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # an application named it: nothing of it stays
+            if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # ends with whoever is using it
+                self._publishers.pop(topic, None)  # ends with its last user
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         z = load()

@@ -1,10 +1,10 @@
-"""Numbered packets that arrive once each and in order, whatever is lost on the way.
+"""Numbered packets that arrive exactly once and in order, despite losses on the way.
 
-How many are under way is bounded. Time is an argument, and nothing here sends.
+The number of packets in flight is bounded. Time is an argument, and nothing here sends.
 
-Nothing that is sent may block its sender, so Zenoh drops what a congested path can't carry, here or at a router; it
-also drops what comes to a node before the subscription does. So each numbered packet is kept and sent again until the
-other end acknowledges it, and few are under way at once, so that they do not congest a slow path.
+Sending must never block, so Zenoh drops what a congested path can't carry, here or at a router; it also drops packets
+that reach a node before the subscription does. Hence each numbered packet is kept and resent until the other end
+acknowledges it, and few are in flight at once, so that they do not congest a slow path.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Final
 
 from skyloop.network import packets
 
-DEPTH: Final = 256  #: packets to an end that are not acknowledged yet, before further ones are refused
+DEPTH: Final = 256  #: unacknowledged packets to one end before further ones are refused
 MAX_BYTES: Final = 1 << 20  #: the same in bytes
-RECENT_PACKETS: Final = 64  #: packets of an end among which a repeated one is recognised
-ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: packets of a topic after which they are acknowledged
-#: Packets on the way at once: as many as Zenoh queues for a link before it drops one (config._QUEUES).
+RECENT_PACKETS: Final = 64  #: an end's latest packets, among which repeats are recognised
+ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this many packets
+#: Packets in flight at once: as many as Zenoh queues per link before it drops one (config._QUEUES).
 ON_THE_WAY: Final = 16
-ON_THE_WAY_BYTES: Final = 1 << 18
-ACKNOWLEDGE_EVERY_S: Final = 0.15  #: of a topic of which only the newest counts, beside that: see :class:`Pace`
-STANDS_S: Final = 0.5  #: what was not acknowledged for so long stands in the path …
-SLOW_S: Final = 0.25  #: … and until something is heard, a packet follows as often
-AGAIN_S: Final = 0.2  #: after so long without an answer what is on the way is sent again; then after twice as long, …
-AGAIN_AT_MOST_S: Final = 0.5  #: … and never later than after so long
+ON_THE_WAY_BYTES: Final = 1 << 18  #: the same in bytes
+ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and this often on topics where only the newest counts (:class:`Pace`)
+STANDS_S: Final = 0.5  #: a path with a packet unacknowledged for this long is stalled …
+SLOW_S: Final = 0.25  #: … and until it recovers, a packet is sent this often
+AGAIN_S: Final = 0.2  #: resend after this long without an answer, then after twice as long, …
+AGAIN_AT_MOST_S: Final = 0.5  #: … up to this
 
 
 @dataclass(slots=True)
@@ -37,23 +37,23 @@ class _Packet:
     number: int
     data: bytes
     way: str
-    sent_s: float = 0.0  #: when last; 0: not yet
+    sent_s: float = 0.0  #: last sent; 0: not yet
 
 
 class Outgoing:
-    """The packets for one end that it has not acknowledged yet. Not thread-safe."""
+    """The unacknowledged packets for one end. Not thread-safe."""
 
     def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
         self._depth = depth
         self._most = most_bytes
-        self._kept: deque[_Packet] = deque()  # those on the way first, then those that wait to be
+        self._kept: deque[_Packet] = deque()  # those in flight first, then the waiting ones
         self._bytes = 0
-        self._under_way = 0  # packets
+        self._under_way = 0  # packets in flight
         self._under_way_bytes = 0
         self._next = 1
         self._again_s = AGAIN_S
         self._headway_s = (
-            0.0  # when the other end last took something, or when the first packet of an idle time was sent
+            0.0  # when the other end last acknowledged something, or when an idle path got its first packet
         )
 
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
@@ -61,8 +61,8 @@ class Outgoing:
 
         Args:
             packet: The packet.
-            way: By which key it is sent, for the sender.
-            own: One of the transport's own small packets: there is room for it where others find none.
+            way: The key to send it by, for the sender.
+            own: One of the transport's own small packets, for which extra room is reserved.
 
         Returns:
             False if there is no room for it.
@@ -79,7 +79,7 @@ class Outgoing:
         return True
 
     def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
-        """Return number, packet and way of what is to be sent: where there is room on the way, and what seems lost."""
+        """Return number, packet and way of the packets to send: new ones if there is room, and apparently lost ones."""
         found: list[tuple[int, bytes, str]] = []
         if self._under_way and now_s - self._kept[0].sent_s >= self._again_s:
             self._again_s = min(2 * self._again_s, AGAIN_AT_MOST_S)
@@ -100,9 +100,9 @@ class Outgoing:
         return found
 
     def taken(self, number: int, now_s: float) -> None:
-        """Drop the packets up to this number, as the other end has acknowledged them.
+        """Drop the packets up to this number, which the other end has acknowledged.
 
-        A number of a packet that was not sent yet is ignored.
+        The number of a packet not yet sent is ignored.
         """
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
@@ -116,11 +116,11 @@ class Outgoing:
 
     @property
     def under_way(self) -> bool:
-        """Whether something was sent and is not acknowledged yet."""
+        """Whether any sent packet is unacknowledged."""
         return self._under_way > 0
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long the other end has acknowledged nothing of what is under way [s]; 0 if nothing is."""
+        """Return for how long the other end has acknowledged nothing [s]; 0 if nothing is in flight."""
         return now_s - self._headway_s if self._under_way else 0.0
 
 
@@ -128,11 +128,11 @@ class Incoming:
     """Puts the numbered packets of the other end's :class:`Outgoing` in order. Not thread-safe."""
 
     def __init__(self) -> None:
-        self.taken = 0  #: the number up to which all packets came, to be acknowledged
+        self.taken = 0  #: number up to which all packets arrived, to acknowledge
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
-        """Return the packets that can be delivered now that this one came, in order; none if it came before."""
+        """Return the packets that can be delivered after this one arrived, in order; none for a repeat."""
         if number != self.taken + 1:
             if self.taken < number <= self.taken + ON_THE_WAY:
                 self._early.setdefault(number, packet)
@@ -149,7 +149,7 @@ class AckPolicy:
     """Decides when a subscriber acknowledges the packets of a topic. Not thread-safe.
 
     Args:
-        every_s: At least so much time is between two, after which the next packet is acknowledged, too [s].
+        every_s: Acknowledge the first packet after this time, too [s].
     """
 
     def __init__(self, every_s: float = math.inf) -> None:
@@ -171,47 +171,47 @@ class AckPolicy:
 
 
 class Pace:
-    """Whether the path to one subscriber carries what is published on one topic. One thread sends, another takes.
+    """Whether the path to one subscriber carries a topic's packets. One thread sends, another acknowledges.
 
-    Datagrams are taken by a path that stands still, as by a mobile network that is silent for seconds, and wait in it
-    ahead of all that is sent later. So a subscriber of which nothing is heard is sent few.
+    A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams, which then delay all
+    later packets. So a silent subscriber is sent few.
     """
 
-    __slots__ = ("_acknowledged", "_newest", "_prompt", "_sent_s", "_since_s")
+    __slots__ = ("_acknowledged", "_eager", "_newest", "_sent_s", "_since_s")
 
     def __init__(self) -> None:
-        self._newest = self._acknowledged = 0  # numbers
-        self._prompt = False  # it acknowledges more often than it must, so that a silence says something
-        self._sent_s = -math.inf  # when the newest was
-        self._since_s = math.inf  # when the oldest was sent that is not acknowledged, or later
+        self._newest = self._acknowledged = 0  # packet numbers
+        self._eager = False  # it acknowledges more often than it must, so that silence is significant
+        self._sent_s = -math.inf  # when the newest was sent
+        self._since_s = math.inf  # when the oldest unacknowledged packet was sent, or later
 
     def may_send(self, now_s: float) -> bool:
         """Return whether another packet may be sent now."""
-        stands = self._prompt and now_s - self._since_s > STANDS_S
+        stands = self._eager and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Note a packet."""
+        """Record a sent packet."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 
     def taken(self, number: int, now_s: float) -> None:
-        """Note that the subscriber acknowledged the packets up to this number; one that was not sent yet is ignored."""
+        """Record an acknowledgement up to this number; ignore a number that was not sent yet."""
         if not self._acknowledged < number <= self._newest:
             return
-        self._prompt = self._prompt or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
+        self._eager = self._eager or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
         self._acknowledged = number
         self._since_s = math.inf if number == self._newest else now_s
 
 
 class RecentPackets:
-    """The last packets that came: where there is a direct path and one through a router, each comes twice."""
+    """The latest packets: with a direct path and one through a router, each arrives twice."""
 
     def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
 
     def is_new(self, number: int, packet: bytes) -> bool:
-        """Return whether a packet is not among the last ones, and remember it."""
+        """Return whether a packet is not among the latest ones, and remember it."""
         if (number, packet) in self._packets:
             return False
         self._packets.append((number, packet))
@@ -219,10 +219,10 @@ class RecentPackets:
 
 
 class Receiver:
-    """Receives what comes to one end of a connection: numbered packets once each and in order, the others once each.
+    """Receives packets at one end of a connection: numbered ones exactly once and in order, the others at most once.
 
-    The transport's own packets are given to ``control``, which returns whether it has handled them; those that it has
-    not, and all others, to ``deliver``. Thread-safe: for numbered packets one thread at a time calls both.
+    The transport's own packets go to ``control``, which returns whether it handled them; unhandled and all other
+    packets go to ``deliver``. Thread-safe: for numbered packets, one thread at a time calls both.
     """
 
     def __init__(self) -> None:
@@ -239,17 +239,17 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet that is sent again until it is acknowledged.
+        """Receive a packet that is resent until it is acknowledged.
 
         Args:
-            number: The packet's, from 1.
+            number: The packet's number, from 1.
             packet: The packet.
-            has_room: Whether another packet can be taken now; if not, this one is ignored and will be sent again.
+            has_room: Whether another packet fits; if not, this one is ignored and will be resent.
             control: Handles the transport's own packets.
             deliver: Handles all others.
 
         Returns:
-            The number up to which all packets were taken, to be acknowledged.
+            The number up to which all packets were accepted, to acknowledge.
         """
         with self._lock:
             if has_room():

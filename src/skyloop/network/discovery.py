@@ -1,8 +1,8 @@
-"""Discovery: which proxies are on the network, how one that comes back is found soon, and how an application joins one.
+"""Discovery: listing the network's proxies, finding one that comes back, and joining one.
 
-Zenoh retries the addresses that it was given, but searches by multicast only after 1, 2, 4 and then every 8 seconds.
-Whoever misses a proxy searches here meanwhile, without a connection, and opens a new session when a node answers that
-the present one does not know: that node is then found within milliseconds.
+Zenoh retries given addresses, but searches by multicast only after 1, 2, 4 and then every 8 seconds. An application
+that misses a proxy therefore searches here, without a connection, and opens a new session when a node answers that the
+present session does not know: that finds the node within milliseconds.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ if TYPE_CHECKING:
 
     import zenoh
 
-#: How long after it was opened a session has found who can be found at once: by multicast, or at the addresses given.
+#: Time after opening for a session to find the nodes within reach: by multicast, or at the given addresses.
 SETTLE_S: Final = 0.6
-ANSWER_S: Final = 0.5
-#: How long a linked node may take to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
+ANSWER_S: Final = 0.5  #: time for proxies to describe themselves
+#: Time for a linked node to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
 SYNC_S: Final = 5.0
-RUNS_PER_NAME: Final = 8  #: proxies of one name that are listed: one, and two or three where a network was cut in two
+RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three in a split network
 SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
-YOUNG_S: Final = 1.0  #: for so long a new session searches well by itself
-FORGET_S: Final = 10.0  #: a peer that a new session could not reach either is not tried again for so long
+YOUNG_S: Final = 1.0  #: age up to which a new session searches well without help
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long
 _POLL_S: Final = 0.05
-JOIN_S: Final = 1.0  #: how long a proxy that was found may take to let this application in
-TIMED_OUT: Final = "Timeout"  #: the text of Zenoh's error reply to a query that nobody answered in time
-MAX_CANDIDATES: Final = 4  #: with keys: so many proxies of one name are asked until one proves that it is it
+JOIN_S: Final = 1.0  #: time for a proxy to admit this application
+TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
+MAX_CANDIDATES: Final = 4  #: with keys: proxies of one name to ask until one proves that it is the right one
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
-    """List the proxies that this process can reach over the network. It takes about a second.
+    """List the proxies that this process can reach over the network. Takes about a second.
 
     Args:
         settings: How to join the network.
 
     Returns:
-        The proxies by name; those of one name by age, the oldest first.
+        The proxies by name; those of one name by age, oldest first.
 
     Raises:
         LinkError: The network can't be joined.
@@ -60,20 +60,20 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
-        runs(session)  # when that is answered, all is known that there is
+        runs(session)  # once that is answered, all reachable nodes are known
         return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
     finally:
         release(session)
 
 
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, the oldest first; there are several only where a network was cut in two.
+    """Return the proxies with this name, oldest first; several only if a network was split.
 
     Raises:
         LinkError: The network can't be joined.
     """
     if not settings.multicast and not settings.connect:
-        return []  # others have to connect to us, and we don't listen yet
+        return []  # others would have to connect to us, and we don't listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
     try:
         _settle(session)
@@ -84,20 +84,20 @@ def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
 
 
 def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, the oldest first, on a session that is open."""
+    """Return the proxies with this name, oldest first, on an open session."""
     return sorted(_ask(session, name), key=lambda about: about.since_ns)
 
 
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
-    """Return NAME and RUN of the transport servers whose tokens are seen now.
+    """Return NAME and RUN of the transport servers whose tokens are visible now.
 
-    It takes as long as the linked nodes need to send what they know, at most :data:`SYNC_S`.
+    Takes as long as the linked nodes need to send their tokens, up to :data:`SYNC_S`.
     """
     return listed(session, name)[0]
 
 
 def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
-    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know."""
+    """Return the result of :func:`runs`, and whether the linked nodes have sent all their tokens."""
     found = set()
     deadline = time.monotonic() + within_s
     for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=within_s):
@@ -110,7 +110,7 @@ def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tu
 
 
 def _settle(session: Session) -> None:
-    """Wait until a session that was just opened knows the nodes that can be found."""
+    """Wait until a new session knows the nodes within reach."""
     while (left_s := session.opened + SETTLE_S - time.monotonic()) > 0.0:
         time.sleep(min(left_s, _POLL_S))
 
@@ -134,7 +134,7 @@ def _ask(session: Session, name: str) -> list[ProxyInfo]:
 
 
 def _oldest_of_each(found: list[ProxyInfo]) -> list[ProxyInfo]:
-    """Return the oldest ones of each name, so that many answers for one name hide no other."""
+    """Return the oldest proxies of each name, so that many answers for one name hide no other."""
     counts: Counter[str] = Counter()
     few = []
     for about in sorted(found, key=lambda about: about.since_ns):
@@ -145,13 +145,13 @@ def _oldest_of_each(found: list[ProxyInfo]) -> list[ProxyInfo]:
 
 
 class UnreachablePeers:
-    """Peers that answered a search and could not be reached, such as another lab's with other keys."""
+    """Peers that answered a search but could not be reached, such as another lab's with other keys."""
 
     def __init__(self) -> None:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether a peer answered that is not known and for which no new session was opened yet."""
+        """Return whether an unknown peer answered for which no session was opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)
@@ -167,13 +167,13 @@ _lock: Final = threading.Lock()
 
 
 def proxy_reached() -> None:
-    """Forget which peers could not be reached, as a proxy was."""
+    """Forget unreachable peers after reaching a proxy."""
     with _lock:
         _UNREACHABLE.clear()
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know; return whether there are some, for which it is retired then."""
+    """Search for nodes that a session does not know; if there are any, retire it and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -203,13 +203,13 @@ def _search(session: Session) -> set[str]:
 
 
 class ProxyWatch:
-    """Watches which transport servers with one name are alive.
+    """Watches which transport servers of one name are alive.
 
     Args:
         session: The Zenoh session.
         name: The proxy's name.
-        on_gone: Called with the run of a transport server that goes away, on one of Zenoh's threads.
-        known: What a proxy with this name reported of itself before: it is not asked again.
+        on_gone: Called with the run of a transport server that disappears, on one of Zenoh's threads.
+        known: An earlier report of a proxy of this name about itself: it is not asked again.
     """
 
     def __init__(
@@ -227,34 +227,34 @@ class ProxyWatch:
         self._changed = threading.Condition()
 
     def declare(self) -> Any:
-        """Begin to watch; the caller undeclares what is returned."""
+        """Start watching; the caller undeclares the result."""
         return self._session.zenoh.liveliness().declare_subscriber(
             layout.alive(self._name, "*"), self._session.callback(self._on_token), history=True
         )
 
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
-        """Wait for a proxy with this name, then at most ``list_s`` [s] for linked nodes to list those that they know.
+        """Wait for a proxy with this name, then up to ``list_s`` [s] for linked nodes to list theirs.
 
         Returns:
-            The run of each candidate with what it reports of itself, the best first. That is the oldest; with keys the
-            next ones follow, as the oldest may turn out to have no key for this name.
+            Each candidate's run and its report about itself, best first. The best is the oldest; with keys the others
+            follow, as the oldest may have no key for this name.
 
         Raises:
             UnknownNameError: None can be reached.
-            NoAnswerError: One was found and is gone again, or a linked node does not list what it knows.
+            NoAnswerError: One was found but has disappeared, or a linked node does not list its tokens.
         """
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
         if not found:
-            # A node that is flooded with tokens may list many others before the proxy's: this waits for all of them.
+            # A node flooded with tokens may list many others before the proxy's: this waits for all of them.
             known, complete = listed(self._session, within_s=list_s)
             with self._changed:
                 self._runs.update(run for other, run in known if other == self._name)
                 found = bool(self._runs)
             if not found and not complete:
                 raise NoAnswerError(
-                    f"the network was reached, but within {list_s:g} s not all said whether they know the proxy "
-                    f"{self._name!r}"
+                    f"the network was reached, but within {list_s:g} s not all nodes answered whether they know "
+                    f"the proxy {self._name!r}"
                 )
             if not found:
                 others = {other for other, _ in known} - {self._name}
@@ -271,11 +271,11 @@ class ProxyWatch:
             found: list[tuple[str, packets.ProxyInfo | None]] = [(about.run, about) for about in running]
             found += [(run, None) for run in sorted(self._runs - {run for run, _ in found})]
         if not found:
-            raise NoAnswerError(f"the proxy {self._name!r} was found on the network, and is gone again")
+            raise NoAnswerError(f"the proxy {self._name!r} was found on the network but has disappeared")
         return found[: 1 if self._session.settings.ring is None else MAX_CANDIDATES]
 
     def _on_token(self, sample: zenoh.Sample) -> None:
-        """Note that a proxy with this name came or went."""
+        """Record that a proxy with this name appeared or disappeared."""
         try:
             _, run = layout.parse_alive(str(sample.key_expr))
         except DecodeError:
@@ -289,10 +289,10 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask that run of a proxy to let a connection in, and return its terms.
+    """Ask one run of a proxy to admit a connection, and return its terms.
 
     Raises:
-        LinkError: The proxy refuses, does not answer (:class:`NoAnswerError`), or somebody else answers in its place.
+        LinkError: The proxy refuses or does not answer (:class:`NoAnswerError`), or an impostor answers.
     """
     z, who, ring = load(), session.settings.who, session.settings.ring
     request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))
@@ -311,9 +311,9 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
     for reply in replies:
         if reply.err is not None:
             words = reply.err.payload.to_string()[:400]
-            if words == TIMED_OUT:  # a router's, in place of an answer that did not come: no refusal
+            if words == TIMED_OUT:  # sent by a router after a time-out, so not a refusal
                 continue
-            raise LinkError(f"the proxy {name!r} does not let us in: {words}")
+            raise LinkError(f"the proxy {name!r} does not admit us: {words}")
         try:
             ok = reply.ok
             welcome = None if ok is None else packets.decode_welcome(packets.copied(ok.payload, packets.MAX_OWN))
@@ -323,10 +323,10 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
             continue
         try:
             return request.accept(welcome)
-        except LinkError as error:  # perhaps somebody else answers, too
+        except LinkError as error:  # the real proxy may still answer
             impostor = error
     if impostor is not None:
-        raise LinkError(f"who answers as the proxy {name!r} is not it: {impostor}")
+        raise LinkError(f"an impostor answers as the proxy {name!r}: {impostor}")
     raise NoAnswerError(
         f"the proxy {name!r} was found on the network but did not answer"
         + ("" if session.settings.tls is None else f"; the keys of {who!r} may not give access to it")

@@ -1,7 +1,7 @@
-"""The server's video: each subscribed variant of a frame is encoded once, and sent no faster than readers take it.
+"""The server's video: each subscribed variant of a frame is encoded once, and sent no faster than readers receive it.
 
-A reader has at most :data:`WINDOW` frames on the way. While it has as many, further ones pass it by, and the newest of
-them is sent as soon as it has taken one: a slow link shows fewer frames, never old ones.
+A reader has up to :data:`WINDOW` frames in flight. Until it acknowledges one, it misses further frames, and then gets
+the newest: a slow link shows fewer frames, never old ones.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from skyloop.messages.subscription import FrameFilter, VideoRequest
 from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
-WINDOW: Final = 2  #: frames on the way to one reader
-#: Forms of one camera's frames: each costs its own encoding, the n parts of one together no more than that. The usual
-#: ones come on top of them, so that there is room for a pilot whatever others have asked for.
+WINDOW: Final = 2  #: frames in flight to one reader
+#: Forms of one camera's frames. Each costs its own encoding; the n parts of one together cost no more than one. The
+#: default forms are not counted, which leaves room for a pilot, whatever others request.
 MAX_FORMS: Final = 32
-MAX_FORMS_EACH: Final = 8  #: of them that one connection may read
-#: A frame that was not acknowledged for so long counts as lost: Zenoh drops what a congested link can't carry.
+MAX_FORMS_EACH: Final = 8  #: forms that one connection may read
+#: A frame unacknowledged for this long counts as lost: Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
-#: Sends one encoded frame of a variant: to everybody who reads it, or to these connections.
+#: Sends one encoded frame of a variant: to all its readers, or to these connections.
 Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
 
 
 @dataclass(slots=True)
 class PublishedFrame:
-    """A frame as it was published."""
+    """A published frame."""
 
     number: int  #: from 1, over all cameras
     header: FrameHeader
@@ -46,14 +46,14 @@ class PublishedFrame:
 
 
 class Reader:
-    """The frames that are on the way to one connection."""
+    """The frames in flight to one connection."""
 
     __slots__ = ("_on_way", "due", "waits")
 
     def __init__(self) -> None:
-        self._on_way: deque[tuple[int, int]] = deque()  # number and when
-        self.due = False  #: the newest frame is to be sent to it
-        self.waits = False  #: a frame has passed it by
+        self._on_way: deque[tuple[int, int]] = deque()  # number and time
+        self.due = False  #: send it the newest frame
+        self.waits = False  #: it has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
         """Return whether another frame may be sent; frames older than :data:`LOST_NS` count as lost."""
@@ -67,13 +67,13 @@ class Reader:
         self.due, self.waits = True, False
 
     def sent(self, number: int, now_ns: int) -> None:
-        """Note that the frame that is due was sent, or a newer one in its place."""
+        """Record that the due frame was sent, or a newer one in its place."""
         if self._on_way:
             self._on_way[-1] = (number, now_ns)
         self.due = self.waits = False
 
     def taken(self, number: int) -> None:
-        """Note that the frames up to this number were taken."""
+        """Record that the frames up to this number were received."""
         while self._on_way and self._on_way[0][0] <= number:
             self._on_way.popleft()
 
@@ -89,26 +89,26 @@ class Variant:
 
 
 class FramePublisher:
-    """All cameras of a transport server. Thread-safe; nothing is copied, encoded or sent under its lock."""
+    """All cameras of a transport server. Thread-safe; copies, encodes and sends outside its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
-        #: Why a topic can't be subscribed to; empty if it can.
+        #: Returns why a topic can't be subscribed to; empty if it can.
         self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send
         self._name = name
         self._clock = clock
         self._changed = threading.Condition()
-        self._variants: dict[str, dict[str, Variant]] = {}  # by camera and by topic
+        self._variants: dict[str, dict[str, Variant]] = {}  # by camera and topic
         self._threads: dict[str, threading.Thread] = {}
         self._number = 0
         self._ended = False
-        self._unable: set[str] = set()  # topics that can't be encoded, and of which that was logged
+        self._unable: set[str] = set()  # topics whose encoding failed and was logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Take a frame, whose pixels are copied if anybody reads the camera; its thread encodes and sends it.
+        """Publish a frame, copying its pixels if the camera has readers; its thread encodes and sends it.
 
         Returns:
-            How many readers it passes by, as they have :data:`WINDOW` frames on the way.
+            The number of readers that miss it, with :data:`WINDOW` frames in flight.
         """
         variants = self._variants.get(header.camera)
         if not variants:
@@ -117,7 +117,7 @@ class FramePublisher:
             wanted = [v for v in variants.values() if v.readers and v.filter.wants(header.seq, header.captured_ns)]
         if not wanted:
             return 0
-        copy = pixels.reshape(-1).copy()  # other threads run meanwhile, as they would not with tobytes()
+        copy = pixels.reshape(-1).copy()  # releases the interpreter lock, unlike tobytes()
         now_ns = self._clock()
         missed = due = 0
         with self._changed:
@@ -137,12 +137,12 @@ class FramePublisher:
         return missed
 
     def readers(self, camera: str) -> int:
-        """Return how many subscriptions a camera has, in all forms."""
+        """Return the number of a camera's subscriptions, in all forms."""
         with self._changed:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send a connection frames, from the next one on; return False if that can't be, see :meth:`problem`."""
+        """Send a connection frames from the next one on; return False if that fails (see :meth:`problem`)."""
         with self._changed:
             if self._problem(key, topic):
                 return False
@@ -155,7 +155,7 @@ class FramePublisher:
                 )
                 try:
                     thread.start()
-                except RuntimeError:  # there are no more threads
+                except RuntimeError:  # no more threads
                     self._drop(request.camera, topic, key)
                     return False
                 self._threads[request.camera] = thread
@@ -175,21 +175,21 @@ class FramePublisher:
         except UsageError as error:
             return str(error)
         if request.encoding == "h264":
-            return f"H.264 comes on a topic of its own: subscribe to {request.stream_topic}"
+            return f"H.264 has a separate topic: subscribe to {request.stream_topic}"
         usual = (request.plain, VideoRequest(request.camera, encoding="jpeg"))
         variants = self._variants.get(request.camera, {})
         if request in usual or (topic in variants and key in variants[topic].readers):
             return ""
         mine = [known for known, variant in variants.items() if key in variant.readers and variant.request not in usual]
         if len(mine) >= MAX_FORMS_EACH:
-            return f"a connection reads a camera in at most {MAX_FORMS_EACH} forms beside the usual: {_listed(mine)}"
+            return f"a connection reads at most {MAX_FORMS_EACH} forms of a camera beside the default: {_listed(mine)}"
         others = {known: variant.request for known, variant in variants.items() if variant.request not in usual}
         if topic not in variants and sum(map(_cost, others.values())) + _cost(request) > MAX_FORMS:
             return f"a camera's frames are encoded in at most {MAX_FORMS} forms: choose one of {_listed(others)}"
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:
-        """Send a connection the frames of a topic no longer."""
+        """Stop sending a connection the frames of a topic."""
         with self._changed, contextlib.suppress(UsageError):
             camera = VideoRequest.parse(topic).camera
             self._drop(camera, topic, key)
@@ -202,7 +202,7 @@ class FramePublisher:
                     self._drop(camera, topic, key)
 
     def taken(self, key: Hashable, topic: str, number: int) -> None:
-        """Note up to which frame a connection has taken a topic, and send it the newest if one has passed it by."""
+        """Record up to which frame a connection has received a topic; send it the newest if it has missed one."""
         with self._changed:
             for variants in self._variants.values():
                 variant = variants.get(topic)
@@ -230,11 +230,11 @@ class FramePublisher:
         if variant is not None and variant.readers.pop(key, None) is not None and not variant.readers:
             del variants[topic]
             self._unable.discard(topic)
-            if not variants:  # the last reader of the camera is gone: its thread ends
+            if not variants:  # the camera's last reader has left: its thread ends
                 del self._variants[camera]
                 self._changed.notify_all()
 
-    # --- the thread of a camera ---
+    # --- a camera's thread ---
 
     def _run(self, camera: str) -> None:
         while (work := self._next(camera)) is not None:
@@ -242,15 +242,15 @@ class FramePublisher:
             try:
                 header, data = self._encoded(variant, picture)
                 self._send(variant, picture.number, header, data, to)
-            except Exception:  # noqa: BLE001  (one frame less; the next one may be better)
+            except Exception:  # noqa: BLE001  (lose one frame; the next may succeed)
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
     def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
         """Wait for a variant with readers that are due.
 
         Returns:
-            The variant, its newest frame and those readers (None: all); None at the end, or when nobody reads this
-            camera.
+            The variant, its newest frame and those readers (None: all); None at the end, or when the camera has no
+            readers.
         """
         with self._changed:
             while not self._ended and camera in self._variants:
@@ -270,19 +270,19 @@ class FramePublisher:
         return None
 
     def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
-        """Encode a frame as it was asked for; where that is not possible, return it as it is and log so once."""
+        """Encode a frame as requested; if that fails, return it unencoded and log that once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)
         except (MissingExtraError, LinkError) as error:
             topic = variant.request.topic
             if topic not in self._unable:
                 self._unable.add(topic)
-                _log.warning("%s of %s is sent as it is: %s", topic, self._name, error)
+                _log.warning("%s of %s is sent unencoded: %s", topic, self._name, error)
             return picture.header, picture.pixels.tobytes()
 
 
 def _cost(request: VideoRequest) -> float:
-    """Return the share of the frames that has to be encoded for a form."""
+    """Return the share of the frames that must be encoded for a form."""
     return 1.0 if request.part is None else 1.0 / request.part[1]
 
 

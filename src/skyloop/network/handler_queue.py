@@ -1,6 +1,6 @@
-"""The queue of the one thread that calls a handler: commands first, and the connections in turns.
+"""The queue of the one thread that calls a handler: commands first, connections in turns.
 
-So two hundred requests of one connection keep the others waiting no longer than one does.
+Hence two hundred requests of one connection delay the others no longer than one does.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections.abc import Hashable
 from typing import Final, Generic, TypeVar
 
 Item = TypeVar("Item")
-#: After so many commands in a row one other packet is handled, so that endless commands don't keep others from asking
-#: for the authority.
+#: After this many commands in a row, handle one other packet: endless commands must not stop others from requesting
+#: authority.
 IN_A_ROW: Final = 16
 
 
-class _Lane(Generic[Item]):
+class _TurnQueue(Generic[Item]):
     """Queues of the connections, which take turns."""
 
     def __init__(self) -> None:
@@ -49,42 +49,42 @@ class _Lane(Generic[Item]):
 
 
 class HandlerQueue(Generic[Item]):
-    """A queue with many producers and one consumer; the items of one connection and urgency keep their order."""
+    """A queue with many producers and one consumer; items of one connection and urgency keep their order."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.Lock())
-        self._urgent: _Lane[Item] = _Lane()
-        self._others: _Lane[Item] = _Lane()
+        self._urgent: _TurnQueue[Item] = _TurnQueue()
+        self._others: _TurnQueue[Item] = _TurnQueue()
         self._in_a_row = 0
         self._closed = False
 
     def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue an item of a connection, of which at most so many may wait; urgent ones go first. Any thread.
+        """Queue an item of a connection, of which up to ``at_most`` may wait; urgent ones go first. Any thread.
 
         Returns:
             False if it was refused.
         """
         with self._changed:
-            lane = self._urgent if urgent else self._others
-            if at_most is not None and lane.count(of) >= at_most:
+            queue = self._urgent if urgent else self._others
+            if at_most is not None and queue.count(of) >= at_most:
                 return False
-            lane.put(of, item)
+            queue.put(of, item)
             self._changed.notify()
             return True
 
     def waiting(self, of: Hashable) -> int:
-        """Return how many items of a connection wait that are not urgent."""
+        """Return the number of a connection's queued items that are not urgent."""
         with self._changed:
             return self._others.count(of)
 
     def close(self) -> None:
-        """Make :meth:`get` wait no longer; items that are queued still come."""
+        """Make :meth:`get` wait no longer; queued items are still returned."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Item | None:
-        """Return the next item; None if none came in time, or if the queue is closed and empty."""
+        """Return the next item; None after the time-out, or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):

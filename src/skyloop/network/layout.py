@@ -1,9 +1,9 @@
-"""The keys of the fabric transport: by which key each packet travels, and which keys each role may use; pure functions.
+"""The keys of the fabric transport: the key for each packet, and the keys that each role may use; pure functions.
 
-Since a packet that asks for something has to travel by the key for that, control of keys is control of actions.
+Since a packet that requests something must travel by the matching key, control of keys is control of actions.
 
 ``docs/wire-format.md`` has the table. NAME is a proxy's name, WHO an application's identity (the common name of its
-certificate, ``anyone`` without keys), ID a connection: 16 hexadecimal digits, random. TOPIC, CAMERA and VARIANT may be
+certificate, ``anyone`` without keys), ID a connection: 16 random hexadecimal digits. TOPIC, CAMERA and VARIANT may be
 any text, so each is percent-encoded to one chunk of a key.
 """
 
@@ -40,21 +40,21 @@ if TYPE_CHECKING:
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO without keys
-PLAIN: Final = "-"  #: the variant of a camera's frames as the proxy has them
-#: Identities: one chunk of a key, with no wildcard in it.
+PLAIN: Final = "-"  #: the variant of a camera's unchanged frames
+#: Identities: one chunk of a key, without wildcards.
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
 
-# What an application sends by, weakest right first.
-ASK: Final = "ask"  #: reliable; what an observer may send
-ORDER: Final = "order"  #: reliable; what only a pilot may send
+# Keys that an application sends by, weakest right first.
+ASK: Final = "ask"  #: reliable; for observers, too
+ORDER: Final = "order"  #: reliable; only for pilots
 COMMAND: Final = "command"  #: best effort; the command channel
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: What an observer may ask. A request that is not named here needs the right to order, so a new one is safe.
+#: Requests allowed to observers. Any other one needs the right to order, which makes new requests safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # all of the head, as garbage keeps its order
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole head, as garbage keeps its order
 _POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may fly by it
 
 
@@ -67,7 +67,7 @@ class Sender(NamedTuple):
 
 
 def new_id() -> str:
-    """Return a new random ID, or RUN."""
+    """Return a new random ID or RUN."""
     return secrets.token_hex(8)
 
 
@@ -77,7 +77,7 @@ def alive(name: str, run: str) -> str:
 
 
 def info(name: str) -> str:
-    """Return the key at which a proxy answers who it is."""
+    """Return the key at which a proxy describes itself."""
     return f"{ROOT}/{name}/info"
 
 
@@ -87,7 +87,7 @@ def app(name: str, who: str, connection: str) -> str:
 
 
 def join(name: str, who: str, connection: str) -> str:
-    """Return the key at which an application asks to be let in."""
+    """Return the key at which an application asks to join."""
     return f"{ROOT}/{name}/join/{who}/{connection}"
 
 
@@ -107,17 +107,17 @@ def topic(name: str, topic_name: str) -> str:
 
 
 def newest_wins(topic_name: str) -> bool:
-    """Return whether only the newest packet of a topic counts: it may be lost, and waits for none before it."""
-    return topic_name.partition("?")[0] == FEEDBACK  # in whichever form
+    """Return whether only a topic's newest packet counts: it may be lost, and never waits for earlier ones."""
+    return topic_name.partition("?")[0] == FEEDBACK  # in any form
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Return the key at which frames of a variant, what follows the ``?`` of their topic, are published."""
+    """Return the key for frames of a variant, the part after the ``?`` of their topic."""
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
 def video_for(name: str, camera: str, variant: str, connection: str) -> str:
-    """Return the key of frames for one application alone, while another one of the same variant can't keep up."""
+    """Return the key for frames to one application only, when another of the same variant can't keep up."""
     return f"{video(name, camera, variant)}/{connection}"
 
 
@@ -127,15 +127,15 @@ def downward(name: str) -> tuple[str, str, str]:
 
 
 def parse_sender(key: str) -> Sender:
-    """Return the owner of a key.
+    """Return a key's owner.
 
     Raises:
-        DecodeError: It is not a key of an application.
+        DecodeError: It is not an application's key.
     """
     parts = key.split("/")
     if len(parts) == 6 and WHO.fullmatch(parts[4]) and ID.fullmatch(parts[5]):
         return Sender(parts[3], parts[4], parts[5])
-    raise DecodeError(f"{key[:200]!r} is no key of an application")
+    raise DecodeError(f"{key[:200]!r} is not an application's key")
 
 
 def parse_alive(key: str) -> tuple[str, str]:
@@ -147,7 +147,7 @@ def parse_alive(key: str) -> tuple[str, str]:
     parts = key.split("/")
     if len(parts) == 5 and parts[3] == "alive" and NAME.fullmatch(parts[2]) and ID.fullmatch(parts[4]):
         return parts[2], parts[4]
-    raise DecodeError(f"{key[:200]!r} is no token of a proxy")
+    raise DecodeError(f"{key[:200]!r} is not a proxy's token")
 
 
 def parse_topic(key: str) -> str:
@@ -159,7 +159,7 @@ def check_identity(who: str) -> None:
     """Check an identity.
 
     Raises:
-        UsageError: It can't be WHO.
+        UsageError: It is not valid as WHO.
     """
     if not WHO.fullmatch(who):
         raise UsageError(
@@ -167,13 +167,13 @@ def check_identity(who: str) -> None:
         )
 
 
-# By which key a packet has to travel -----------------------------------------------------------------------
+# The key that a packet needs ---------------------------------------------------------------------------------
 
 
 def way_of(packet: bytes) -> str:
     """Return the key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
 
-    Bytes that are no packet need no right, as nobody obeys them.
+    Bytes that are no packet need no right, as nothing obeys them.
     """
     kind = packet[5:6]
     if kind == _COMMAND:
@@ -190,15 +190,15 @@ def way_of(packet: bytes) -> str:
 
 
 def is_report(packet: bytes) -> bool:
-    """Return whether a packet reports what came of a stream: it may be lost, and one that is late tells the wrong."""
+    """Return whether a packet reports the state of a stream: it may be lost, and is wrong when late."""
     return packet[:6] == _REPORT
 
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys give no right to, which is not sent to the proxy.
+    """Return the reply to a request that an application's keys don't allow, in place of sending it to the proxy.
 
     Returns:
-        The packet of the reply; None for a packet that is no request.
+        The packet of the reply; None for a packet that is not a request.
     """
     try:
         sample = decode(packet)
@@ -211,7 +211,7 @@ def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None
 
 
 def allows(way: str, packet: bytes) -> bool:
-    """Return whether a packet may travel by the key by which it came."""
+    """Return whether a packet may travel by the key by which it arrived."""
     return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 

@@ -1,6 +1,6 @@
 """The fabric transport's own packets and attachments: bytes to typed tuples and back, as pure functions.
 
-They share the header of all packets and have kinds from 0x50, which no sample has. ``docs/wire-format.md`` has the
+They share the header of all packets and use kinds from 0x50 on, which no sample has. ``docs/wire-format.md`` has the
 tables.
 """
 
@@ -22,35 +22,35 @@ if TYPE_CHECKING:
 
 REVISION: Final = 2  #: of the fabric transport
 MAX_REASON: Final = 400  #: bytes of UTF-8
-MAX_OWN: Final = 4096  #: bytes of a Join, a Welcome or a ProxyInfo, and of any attachment
+MAX_OWN: Final = 4096  #: bytes of a Join, a Welcome, a ProxyInfo or any attachment
 
 
 class FabricKind(IntEnum):
-    """The kinds of packets that the two ends exchange between themselves."""
+    """Kinds of packets that the two ends exchange with each other."""
 
     SUBSCRIBE = 0x50  #: application to proxy
-    TAKEN = 0x51  #: either way: packets up to this number were taken
-    SEEN = 0x52  #: application to proxy: frames up to this number were taken
+    TAKEN = 0x51  #: either way: packets up to this number were received
+    SEEN = 0x52  #: application to proxy: frames up to this number were received
     BYE = 0x53  #: either way: why the connection ends; answered with the same
-    KEY = 0x54  #: proxy to application, sealed: what topics and frames are sealed with from now on
+    KEY = 0x54  #: proxy to application, sealed: the new key for topics and frames
 
 
 class Subscribe(NamedTuple):
-    """An application subscribes to a topic, or unsubscribes from it."""
+    """Subscribes an application to a topic, or unsubscribes it."""
 
     topic: str
     on: bool
 
 
 class Taken(NamedTuple):
-    """Packets up to a number were taken."""
+    """Acknowledges packets up to a number."""
 
-    topic: str  #: empty: of the packets sent to this end alone
+    topic: str  #: empty: packets sent to this end only
     number: int
 
 
 class Seen(NamedTuple):
-    """Frames of a topic up to a number were taken."""
+    """Acknowledges frames of a topic up to a number."""
 
     topic: str
     number: int
@@ -63,7 +63,7 @@ class Bye(NamedTuple):
 
 
 class Key(NamedTuple):
-    """What topics and frames are sealed with from now on."""
+    """The new key for topics and frames."""
 
     generation: int
     key: bytes  #: 32 bytes
@@ -81,31 +81,31 @@ _KEY = struct.Struct("<I32s")
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True):
-    """What an application sends when it asks to be admitted, as MessagePack."""
+    """An application's request to join, as MessagePack."""
 
     revision: int
-    run: str  #: of the proxy that is meant
+    run: str  #: of the intended proxy
     host: str = ""  #: for people
     pid: int = 0  #: for people
     program: str = ""  #: for people
-    proof: bytes = b""  #: with keys: whose it is, see :mod:`skyloop.network.keys.agreement`
+    proof: bytes = b""  #: with keys: the identity's proof, see :mod:`skyloop.network.keys.agreement`
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
-    """The answer to :class:`Join`: the connection stands."""
+    """The answer to :class:`Join`: the connection is established."""
 
     revision: int
     run: str
-    proof: bytes = b""  #: with keys: that the proxy is who it should be
+    proof: bytes = b""  #: with keys: the proxy's proof of identity
     topics: bytes = b""  #: with keys: the packet of :class:`Key`, sealed for this connection
 
 
 class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
-    """Who a proxy is: the answer at its ``info`` key, as MessagePack."""
+    """A proxy's description: the answer at its ``info`` key, as MessagePack."""
 
     name: str
     run: str
-    since_ns: int  #: wall-clock time of its start [ns since 1970]: the older one keeps a name
+    since_ns: int  #: wall-clock time of its start [ns since 1970]; the older proxy keeps a name
     host: str
     pid: int
     vehicle: str  #: its address, e.g. ``sim://``
@@ -119,7 +119,7 @@ decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet may be for the transport itself and not for the handler."""
+    """Return whether a packet may be for the transport itself rather than the handler."""
     return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
 
 
@@ -139,7 +139,7 @@ def seen(topic: str, number: int) -> bytes:
 
 
 def bye(reason: str) -> bytes:
-    """Encode a :class:`Bye`; the reason is cut to :data:`MAX_REASON` bytes."""
+    """Encode a :class:`Bye`; the reason is truncated to :data:`MAX_REASON` bytes."""
     return _packet(FabricKind.BYE, reason.encode(errors="replace")[:MAX_REASON])
 
 
@@ -159,7 +159,7 @@ def parse(packet: bytes) -> Message:
         DecodeError: It is not one, or it is damaged.
     """
     if len(packet) < HEADER_SIZE:
-        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+        raise DecodeError(f"{len(packet)} bytes are shorter than the header of {HEADER_SIZE}")
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
     if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
         raise DecodeError(f"not a packet of the fabric transport: header {packet[:HEADER_SIZE].hex(' ')}")
@@ -183,7 +183,7 @@ def parse(packet: bytes) -> Message:
 
 
 def parse_own(packet: bytes) -> Message | None:
-    """Decode one of the transport's own packets; return None for one that is for the handler, as garbage is, too."""
+    """Decode one of the transport's own packets; return None for the handler's packets and for garbage."""
     if not is_own(packet):
         return None
     try:
@@ -199,19 +199,19 @@ def _topic(text: bytes, least: int = 0) -> str:
     return topic
 
 
-# What Zenoh has received ---------------------------------------------------------------------------------------
+# Received by Zenoh ----------------------------------------------------------------------------------------------
 
 
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
-    """Return what Zenoh received as bytes; empty for None.
+    """Return bytes received by Zenoh; empty for None.
 
     Raises:
-        DecodeError: It is larger.
+        DecodeError: They are too large.
     """
     if data is None:
         return b""
     if len(data) > at_most:
-        raise DecodeError(f"{len(data)} bytes, and at most {at_most} are taken")
+        raise DecodeError(f"{len(data)} bytes, at most {at_most} allowed")
     return bytes(data)
 
 
@@ -228,7 +228,7 @@ def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, by
 
 # Attachments ---------------------------------------------------------------------------------------------------
 
-#: Of a packet to one end: its number, from 1; 0 for the transport's own, which are not counted.
+#: Attachment of a packet to one end: its number, from 1; 0 for the transport's own, which are not counted.
 number = _NUMBER.pack
 
 
@@ -245,12 +245,12 @@ def parse_number(attachment: bytes) -> int:
 
 
 def published(run: bytes, count: int) -> bytes:
-    """Encode the attachment of a published packet: RUN of its proxy, 8 bytes, and its number on the topic, from 1."""
+    """Encode a published packet's attachment: RUN of its proxy, 8 bytes, and its number on the topic, from 1."""
     return _PUBLISHED.pack(run, count)
 
 
 def parse_published(attachment: bytes) -> tuple[bytes, int]:
-    """Decode the attachment of a published packet: RUN and number.
+    """Decode a published packet's attachment: RUN and number.
 
     Raises:
         DecodeError: It is damaged.
@@ -263,12 +263,12 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
 
 
 def frame(run: bytes, count: int, header: bytes) -> bytes:
-    """Encode the attachment of a frame: RUN of its proxy, 8 bytes, its number, and the packet of its header."""
+    """Encode a frame's attachment: RUN of its proxy, 8 bytes, its number, and the packet of its header."""
     return _PUBLISHED.pack(run, count) + header
 
 
 def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
-    """Decode the attachment of a frame: RUN, number and header.
+    """Decode a frame's attachment: RUN, number and header.
 
     Raises:
         DecodeError: It is damaged.
@@ -276,5 +276,5 @@ def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
     run, count = parse_published(attachment[: _PUBLISHED.size])
     header = decode(attachment[_PUBLISHED.size :])
     if type(header) is not FrameHeader:
-        raise DecodeError(f"a frame came with a {type(header).__name__} and must with a FrameHeader")
+        raise DecodeError(f"a frame has a {type(header).__name__} instead of a FrameHeader")
     return run, count, header

@@ -1,6 +1,6 @@
-"""The connections of a proxy: lets applications in, and ends connections.
+"""The connections of a proxy: admits applications, and ends connections.
 
-It ends those whose application is gone, has lost its rights, or takes nothing of what is sent to it.
+It ends those whose application is gone, has lost its rights, or acknowledges nothing.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import KeyRing
 
-CONFIRM_S: Final = 3.0  #: how long an application may take to show its token after it was let in
-#: An application that acknowledges nothing of what is sent to it for so long is disconnected. Its end of the transport
-#: acknowledges at once, however slow the application's code is.
+CONFIRM_S: Final = 3.0  #: time for an admitted application to show its token
+#: Disconnect an application that acknowledges nothing for this long. Its end of the transport acknowledges at once,
+#: however slow the application's code is.
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
-#: For the thread that calls the handler: a packet, or True: joined, False: left.
+#: For the thread that calls the handler: a packet, or True for joined, False for left.
 Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
     """The connections of one transport server.
 
-    Thread-safe, but for :meth:`check`, which belongs to the thread that calls the handler.
+    Thread-safe except for :meth:`check`, which belongs to the thread that calls the handler.
 
     Args:
         name: The proxy's name.
         run: This run of the proxy.
-        ring: The proxy's keys, None without.
-        topic_keys: The seal of what is published, None without keys.
-        publisher: Has the subscriptions.
+        ring: The proxy's keys; None without keys.
+        topic_keys: The seal of published packets; None without keys.
+        publisher: The subscriptions.
         sender: Sends to single applications.
-        queue: Of the thread that calls the handler.
-        excused_s: How much longer than :data:`STALLED_S` an application may acknowledge nothing [s].
+        queue: The queue of the thread that calls the handler.
+        excused_s: Time added to :data:`STALLED_S` before a silent application is disconnected [s].
     """
 
     def __init__(
@@ -74,25 +74,25 @@ class ConnectionRegistry:
         self._stalled_s = STALLED_S + excused_s
         self._lock = threading.RLock()  # guards what follows
         self._open = False
-        self._tokens = Tokens(by_key=ring is not None)  # connections that show that they live
+        self._tokens = Tokens(by_key=ring is not None)  # tokens of live connections
         self._connections: dict[str, ServerConnection] = {}
         self._peers: dict[int, ServerConnection] = {}
         self._left = threading.Condition()  # notified when a connection has gone
         self._last_id = 0
-        self._shut: frozenset[str] = frozenset()  # who was shut out when the key of topics was made
-        self.dropped = 0  #: applications that were disconnected because they did not take what was sent to them
-        self.turned_away = 0  #: connections and signs of life that were too many of one key, or in all
+        self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
+        self.dropped = 0  #: applications disconnected because they acknowledged nothing
+        self.turned_away = 0  #: connections and tokens beyond the limits
         self._away = ""  # why, until the handler was notified
-        self.strays = 0  #: samples and queries that came from nobody that is connected
-        self._stray_commands = 0  # commands and requests among them that the handler was not notified of yet
+        self.strays = 0  #: samples and queries without a connection
+        self._stray_commands = 0  # commands and requests among them that the handler does not know of yet
 
     def open(self) -> None:
-        """Let applications in from now on."""
+        """Admit applications from now on."""
         with self._lock:
             self._open = True
 
     def farewell(self, reason: str, within_s: float) -> None:
-        """Let nobody in any more, disconnect all applications, and wait until they have gone."""
+        """Stop admitting, disconnect all applications, and wait until they have gone."""
         with self._lock:
             self._open = False
         for connection in self.connections:
@@ -104,11 +104,11 @@ class ConnectionRegistry:
 
     @property
     def connections(self) -> list[ServerConnection]:
-        """The present connections, a copy."""
+        """The present connections, as a copy."""
         return list(self._connections.values())
 
     def of_peer(self, peer: Peer) -> ServerConnection | None:
-        """Return the connection of a peer, None if it is gone."""
+        """Return a peer's connection; None if it is gone."""
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
@@ -123,22 +123,22 @@ class ConnectionRegistry:
         return connection
 
     def is_shut_out(self, connection: ServerConnection) -> bool:
-        """Return whether a newer roster shuts a connection's key out; if so, the connection is ended."""
+        """Return whether a newer roster excludes a connection's key; if so, end the connection."""
         if self._ring is None or connection.who not in self._ring.shut_out:
             return False
         self._shut_out(connection, _SHUT_OUT)
         return True
 
     def stray(self, key: str) -> None:
-        """Count a packet from nobody that is connected, by the key by which it came."""
+        """Count a packet without a connection, by the key by which it arrived."""
         self.strays += 1
-        if f"/{layout.ASK}/" not in key:  # what an application sends when it leaves may come late
+        if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive late
             self._stray_commands += 1
 
-    # --- what Zenoh calls, on its own threads ---
+    # --- callbacks, on Zenoh's threads ---
 
     def on_token(self, sample: zenoh.Sample) -> None:
-        """Note that an application's token came or went. On Zenoh's threads."""
+        """Record that an application's token appeared or disappeared. On Zenoh's threads."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
         except DecodeError:
@@ -147,7 +147,7 @@ class ConnectionRegistry:
         connection = self._connections.get(sender.id)
         if sample.kind == load().SampleKind.PUT:
             if not self._tokens.add(sender.who, sender.id):
-                self._turn_away(f"the key of {sender.who!r} shows more signs of life than it may have connections")
+                self._turn_away(f"the key of {sender.who!r} has more tokens than it may have connections")
             if connection is not None:
                 connection.confirmed = True
             return
@@ -158,7 +158,7 @@ class ConnectionRegistry:
             self.end(connection, f"the application is gone ({connection.peer.address})")
 
     def on_join(self, query: zenoh.Query) -> None:
-        """Answer an application that asks to be let in. On Zenoh's threads."""
+        """Answer an application's request to join. On Zenoh's threads."""
         with query:
             try:
                 sender = layout.parse_sender(str(query.key_expr))
@@ -167,7 +167,7 @@ class ConnectionRegistry:
                 self.strays += 1
                 return
             if request.run != self._run:
-                return  # another proxy of this name is meant
+                return  # for another proxy of this name
             try:
                 admission = self._admit(sender, request)
                 problem = self._join(sender, request, admission)
@@ -182,7 +182,7 @@ class ConnectionRegistry:
                 self._send_topic_key(connection, self._topic_keys.newest)
 
     def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
-        """Check who asks.
+        """Check a request's keys.
 
         Raises:
             LinkError: It has no key for this drone.
@@ -193,14 +193,14 @@ class ConnectionRegistry:
         return admit(self._ring, self._name, self._run, sender, request, newest)
 
     def _join(self, sender: layout.Sender, request: packets.Join, admission: Admission) -> str:
-        """Let an application in; return why not, empty if it was."""
+        """Admit an application; return why not, empty if it was admitted."""
         if request.revision != packets.REVISION:
-            return f"it speaks revision {request.revision} of the fabric transport, and this proxy {packets.REVISION}"
+            return f"it uses revision {request.revision} of the fabric transport, this proxy {packets.REVISION}"
         with self._lock:
             if not self._open:
                 return "the proxy is about to stop"
             if sender.id in self._connections:
-                before = self._connections[sender.id]  # which asks again, or its question came by two ways
+                before = self._connections[sender.id]  # a repeated request, or one that arrived on two paths
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
@@ -218,13 +218,13 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no place for one more connection of this identity.
+        """Return why there is no room for one more connection of this identity.
 
         Without keys only their total counts.
         """
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
-            return f"fabric:{self._name} has {MAX_CLIENTS} connections already, and takes no more" if full else ""
+            return f"fabric:{self._name} already has its maximum of {MAX_CLIENTS} connections" if full else ""
         known = {entry.name: entry.identity for entry in self._ring.roster.entries}
 
         def may_fly(name: str) -> bool:
@@ -236,14 +236,13 @@ class ConnectionRegistry:
         self.turned_away += 1
         self._away = reason
 
-    # --- from time to time, on the thread that calls the handler ---
+    # --- periodic checks, on the thread that calls the handler ---
 
     def check(self, handler: ServerHandler) -> None:
-        """End connections that must not go on; call it from time to time on the thread that calls the handler.
+        """End invalid connections; call it periodically on the thread that calls the handler.
 
-        Those are connections whose application was let in and never showed its token, takes nothing of what is sent to
-        it, or has no right to be here any more. The handler is notified of commands from unknown applications, and of
-        connections that were turned away.
+        Those are connections whose application never showed its token, acknowledges nothing, or has lost its rights.
+        The handler is notified of commands from unknown applications, and of refused connections.
         """
         self._check_keys()
         commands, self._stray_commands = self._stray_commands, 0
@@ -255,14 +254,14 @@ class ConnectionRegistry:
         now = time.monotonic()
         for connection in self.connections:
             if not connection.confirmed and now - connection.joined_s > CONFIRM_S:
-                self._shut_out(connection, "no token of it was seen")
+                self._shut_out(connection, "its token was not seen")
             elif connection.stalled_s(now) > self._stalled_s:
-                self.drop(connection, f"it took nothing of what was sent to it for {self._stalled_s:g} s")
+                self.drop(connection, f"it acknowledged nothing for {self._stalled_s:g} s")
 
     def _check_keys(self) -> None:
-        """End the connections whose keys were shut out or have expired.
+        """End connections whose keys were excluded or have expired.
 
-        If there were any, a new key is made for what is published from now on, which they can't read.
+        If there were any, make a new key for published packets, which they can't read.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:
@@ -291,10 +290,10 @@ class ConnectionRegistry:
         if connection.admission.generation < newest.generation:
             self.send(connection, packets.key(newest.generation, newest.key))
 
-    # --- sending to one, and the ends of connections: any thread ---
+    # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that has to arrive; return False if the connection has ended, or ends for it. Any thread."""
+        """Send a packet that must arrive; return False if the connection has ended, or this ends it. Any thread."""
         if connection.ended:
             return False
         problem = connection.queue(packet)
@@ -305,23 +304,23 @@ class ConnectionRegistry:
         return True
 
     def send_own(self, connection: ServerConnection, packet: bytes) -> None:
-        """Send one of the transport's own packets that may be lost; others are sent with :meth:`send`. Any thread."""
+        """Send one of the transport's own packets that may be lost; :meth:`send` sends others. Any thread."""
         connection.queue_own(packet)
         self._sender.wake(connection)
 
     def drop(self, connection: ServerConnection, reason: str) -> None:
-        """Disconnect an application that does not take what is sent to it, and count it."""
+        """Disconnect an application that acknowledges nothing, and count it."""
         self.dropped += connection.id in self._connections
         self.disconnect(connection, reason)
 
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
-        """Disconnect an application; packets from it that were not handled yet are dropped. Any thread.
+        """Disconnect an application; its unhandled packets are dropped. Any thread.
 
         Args:
-            connection: The application's.
+            connection: The application's connection.
             reason: Why, for the application.
             forget: Whether to remove the connection at once; else it is removed when the application answers, or when
-                its token is gone.
+                its token disappears.
         """
         self._hang_up(connection, reason)
         connection.ended = True
@@ -341,7 +340,7 @@ class ConnectionRegistry:
             self._left.notify_all()
 
     def _shut_out(self, connection: ServerConnection, reason: str) -> None:
-        """Disconnect an application, but let what it sent before be handled."""
+        """Disconnect an application, but handle its earlier packets."""
         self._hang_up(connection, reason)
         self.end(connection, reason)
 

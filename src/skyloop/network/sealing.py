@@ -1,6 +1,6 @@
-"""Packets sealed from end to end: nobody between a proxy and its applications can read, change or repeat them.
+"""End-to-end sealed packets: no node between a proxy and its applications can read, change or replay them.
 
-The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates the key that a packet travels by and its attachment.
+The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
 Without keys nothing is sealed. ``docs/wire-format.md`` has the bytes.
 """
 
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     import zenoh
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-TAG: Final = 16  #: bytes by which a sealed payload is longer
+TAG: Final = 16  #: bytes that sealing adds to a payload
 _TRAILER = struct.Struct("<IQ")  # generation and number: at the end of the attachment, and the nonce
 TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
-#: How far behind the newest a packet may come: datagrams overtake what is sent again, 100 a second for 10 s.
+#: How late a packet may arrive: datagrams overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
-GENERATIONS: Final = 3  #: keys of topics that an application keeps: in force, on the way, and one in between
-#: A new key of topics is in use so long after it was sent: what is sealed with it should not be there before it is.
+GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
+#: A new topic key is used this long after it was sent, so that it arrives before the first packet sealed with it.
 SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """What seals and opens without keys: it changes nothing."""
+    """The seal and opener without keys: changes nothing."""
 
     tag = trailer = 0
 
@@ -52,7 +52,7 @@ PLAIN: Final = Plain()
 
 
 class Seal:
-    """Seals with one key of :data:`KEY_BYTES` bytes, which has a number, and uses no number of a packet twice."""
+    """Seals with one numbered key of :data:`KEY_BYTES` bytes, and never uses a packet number twice."""
 
     def __init__(self, key: bytes, generation: int = 0) -> None:
         self.key = key
@@ -74,23 +74,23 @@ class Seal:
 
 
 class Open:
-    """Opens what the other end's :class:`Seal` has sealed, once each. Any thread."""
+    """Opens packets sealed by the other end's :class:`Seal`, once each. Any thread."""
 
-    tag = TAG  #: bytes by which a payload is longer than the data
-    trailer = TRAILER  #: bytes by which an attachment is longer than it was
+    tag = TAG  #: bytes that sealing adds to a payload
+    trailer = TRAILER  #: bytes that sealing adds to an attachment
 
     def __init__(self) -> None:
         self._ciphers: dict[int, ChaCha20Poly1305] = {}
-        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only of keys by which something true has come
+        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only of keys with an authentic packet
 
     def use(self, key: bytes, generation: int = 0) -> Open:
-        """Open what is sealed with this key, too, and forget the oldest of more than :data:`GENERATIONS` keys."""
+        """Also open packets sealed with this key; keep the newest :data:`GENERATIONS` keys."""
         self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
         self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
         return self
 
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
-        """Return the packet and its attachment of what came by a key; None if it came before, or can't be opened yet.
+        """Return the packet and its attachment; None for a repeat, or one that can't be opened yet.
 
         Raises:
             DecodeError: The other end did not send this.
@@ -102,8 +102,8 @@ class Open:
         cipher = self._ciphers.get(generation)
         if cipher is None:
             if generation > max(self._ciphers, default=0):
-                return None  # the key is still on the way
-            raise DecodeError(f"it is sealed with a key that is not in use any more, of generation {generation}")
+                return None  # the key has not arrived yet
+            raise DecodeError(f"it is sealed with an outdated key, of generation {generation}")
         try:
             data = cipher.decrypt(trailer, payload, _bound(where, attachment))
         except (_forged(), ValueError):
@@ -115,10 +115,10 @@ class Open:
 
 
 def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """Open a sample as :meth:`Open.open` does, without copying what is too large.
+    """Open a sample like :meth:`Open.open`, without copying one that is too large.
 
     Returns:
-        The packet and the attachment; None if it came before, or can't be opened yet.
+        The packet and the attachment; None for a repeat, or one that can't be opened yet.
 
     Raises:
         DecodeError: The other end did not send this, or it is empty or too large.
@@ -131,14 +131,14 @@ def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] 
 
 
 class ReplayWindow:
-    """The numbers that have come, as in IPsec (RFC 4303).
+    """The numbers received, as in IPsec (RFC 4303).
 
-    Each number is new once, and one that is :data:`WIDTH` or more behind the newest never is. Thread-safe.
+    Each number is new once, and one :data:`WIDTH` or more behind the newest never is. Thread-safe.
     """
 
     def __init__(self) -> None:
         self._newest = 0
-        self._seen = 0  # a bit for each number from the newest one down
+        self._seen = 0  # one bit per number, from the newest one down
         self._lock = threading.Lock()
 
     def is_new(self, number: int) -> bool:
@@ -156,7 +156,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out."""
+    """Seals packets for all applications of a proxy, with a key that changes when one of them is excluded."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -165,10 +165,10 @@ class TopicSeal:
         self._since = 0.0
 
     def renew(self) -> None:
-        """Make a new key, :attr:`newest`, to be sent to all who stay; it is in use after :data:`SWITCH_S`.
+        """Make a new key, :attr:`newest`, for all who stay; it is in use after :data:`SWITCH_S`.
 
-        A switch that is pending is not put off by another one: who was shut out first would read on meanwhile. Those
-        who stay may then miss what is published until the newer key is there.
+        A pending switch is not delayed by another one, which would let the first excluded application read on. Those
+        who stay may then miss packets until the newer key arrives.
         """
         if self._in_use is self.newest:
             self._since = self._clock() + SWITCH_S
@@ -182,7 +182,7 @@ class TopicSeal:
 
 
 def _cipher(key: bytes) -> ChaCha20Poly1305:
-    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # with keys only
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # only with keys
 
     return ChaCha20Poly1305(key)
 
@@ -194,7 +194,7 @@ def _forged() -> type[Exception]:
 
 
 def _bound(where: str, attachment: bytes) -> bytes:
-    """Return what is authenticated beside the data.
+    """Return the bytes authenticated beside the data.
 
     No key holds a zero byte, so nothing can be moved between the two parts.
     """

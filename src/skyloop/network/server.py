@@ -1,8 +1,8 @@
 """The proxy's end of the fabric transport.
 
-Zenoh's threads only sort what arrives. One thread of this end calls the handler, commands first, so that a slow handler
-delays no sign of life. Another one sends to single applications, so that an application that takes nothing delays no
-handler. Nothing is ever sent in a way that waits for somebody.
+Zenoh's threads only sort incoming packets. One thread of this end calls the handler, commands first, so that a slow
+handler delays no sign of life. Another one sends to single applications, so that one that acknowledges nothing delays
+no handler. No send ever blocks on an application.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from skyloop.transport.priority import SUPERSEDED, is_command
 if TYPE_CHECKING:
     import zenoh
 
-FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its applications to receive the reason
-_POLL_S: Final = 0.5
-_REFUSED: Final = b""  # in place of a packet that was
-_COMMAND: Final = b"c"  # in place of a command: the one that waits first in the connection's backlog
+FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
+_POLL_S: Final = 0.5  # between checks of the connections
+_REFUSED: Final = b""  # stands for a refused packet
+_COMMAND: Final = b"c"  # stands for a command: the first one in the connection's backlog
 _log = logging.getLogger(__name__)
 
 
 class FabricServer(TransportServer):
     """A proxy's end, found on the network by its name. It can be started once.
 
-    :meth:`start` raises :class:`NameTakenError` where a proxy that can be reached has the name, and :class:`LinkError`
-    where the network can't be joined.
+    :meth:`start` raises :class:`NameTakenError` if a reachable proxy has the name, and :class:`LinkError` if the
+    network can't be joined.
 
     Args:
         name: The proxy's name.
@@ -65,7 +65,7 @@ class FabricServer(TransportServer):
         ring = self._settings.ring
         topic_keys = None if ring is None else TopicSeal()
         self._commands_lock = threading.Lock()  # guards the connections' backlogs of commands
-        self._superseded = 0  # of them, by newer ones that waited behind them
+        self._superseded = 0  # number of queued commands superseded by newer ones
         self._queue: HandlerQueue[Item] = HandlerQueue()
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
@@ -85,7 +85,7 @@ class FabricServer(TransportServer):
         self._session: Session | None = None
         self._declared: list[Any] = []
         self._thread: threading.Thread | None = None
-        self.refused = 0  #: packets that came by a key that gives no right to them
+        self.refused = 0  #: packets whose key does not allow them
 
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
@@ -159,7 +159,7 @@ class FabricServer(TransportServer):
         return self._publisher.publish_frame(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return how many subscribed to a topic; for a camera's plain topic, to its frames in any form."""
+        """Return the number of a topic's subscribers; for a camera's plain topic, of its frames in all forms."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -184,7 +184,7 @@ class FabricServer(TransportServer):
 
     @property
     def strays(self) -> int:
-        """Samples and queries that came from nobody that is connected."""
+        """Samples and queries without a connection."""
         return self._registry.strays
 
     @property
@@ -214,7 +214,7 @@ class FabricServer(TransportServer):
             return False
         return True
 
-    # --- what Zenoh calls, on its own threads ---
+    # --- callbacks, on Zenoh's threads ---
 
     def _answer_info(self, query: zenoh.Query) -> None:
         with query:
@@ -232,7 +232,7 @@ class FabricServer(TransportServer):
                 return
             opened = contents(connection.admission.opener, sample)
             if opened is None:
-                return  # it came before, by another way
+                return  # it already arrived on another path
             packet, attachment = opened
             number = packets.parse_number(attachment)
         except DecodeError:
@@ -268,11 +268,11 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # else it has the turn of the one before it
+        if not superseded:  # else it takes the turn of the previous one
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False for one that is left to the handler (garbage)."""
+        """Handle one of the transport's own packets; return False for one left to the handler (garbage)."""
         if isinstance(message, packets.Taken):
             if connection.took(message.topic, message.number, time.monotonic()):
                 self._sender.wake(connection)
@@ -281,7 +281,7 @@ class FabricServer(TransportServer):
         elif isinstance(message, packets.Subscribe):
             return self._publisher.subscribe(connection, message)
         elif isinstance(message, packets.Key):
-            return False  # it is the proxy who makes them
+            return False  # only proxies send these
         else:
             self._registry.send_own(connection, packets.bye(message.reason))
             self._registry.end(connection, message.reason)
@@ -296,8 +296,8 @@ class FabricServer(TransportServer):
                 checked = time.monotonic()
                 try:
                     self._registry.check(handler)
-                except Exception:  # noqa: BLE001  nothing else receives from the applications: this thread must go on
-                    _log.exception("the connections of %s could not be checked; it is tried again", self.address)
+                except Exception:  # noqa: BLE001  this thread must continue: no other receives from the applications
+                    _log.exception("checking the connections of %s failed; retrying", self.address)
             item = self._queue.get(_POLL_S)
             if item is None:
                 if self._queue.over:
@@ -319,20 +319,20 @@ class FabricServer(TransportServer):
                             what = connection.commands.get()
                     self._handle(handler, connection, what)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
-                _log.exception("the handler of %s failed; %s is disconnected", self.address, connection.peer.address)
+                _log.exception("the handler of %s failed; disconnecting %s", self.address, connection.peer.address)
                 self._registry.disconnect(connection, f"the proxy's handler failed: {error!r}")
 
     def _handle(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
         if packet == _REFUSED:
-            handler.refused(connection.peer, "it sent what its keys give it no right to")
+            handler.refused(connection.peer, "it sent a packet that its keys do not allow")
             return
         message = packets.parse_own(packet)
-        if isinstance(message, packets.Subscribe):  # which was not possible
+        if isinstance(message, packets.Subscribe):  # it had failed
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
 
 
 def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
-    """Return a proxy's end on this host and on the network; the other arguments are a :class:`FabricServer`'s."""
+    """Return a proxy's end for this host and the network; the other arguments are a :class:`FabricServer`'s."""
     return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

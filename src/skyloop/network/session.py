@@ -1,4 +1,4 @@
-"""The Zenoh sessions of this process: one for all connections with the same settings, however many drones they fly."""
+"""This process's Zenoh sessions: one for all connections with the same settings, to any number of drones."""
 
 from __future__ import annotations
 
@@ -22,21 +22,19 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = (
-    2.0  #: a session without users stays open for so long, so that a reconnecting client finds it as it was
-)
-REOPEN_S: Final = 2.0  #: how long an address may take to be free again
-CLOSE_S: Final = 5.0  #: how long the end of the process waits for a session that is being closed
-_BORROWED: Final = 1000  # times to try again what another thread is just using …
-_BORROWED_S: Final = 0.001  # … after so long
-#: In Zenoh's errors: where in its sources one arose, and what it adds to an endpoint's address.
+LINGER_S: Final = 2.0  #: an unused session stays open this long, for clients that reconnect
+REOPEN_S: Final = 2.0  #: time for an address to become free again
+CLOSE_S: Final = 5.0  #: how long the process's exit waits for a session to close
+_BORROWED: Final = 1000  # retries when another thread is using the object …
+_BORROWED_S: Final = 0.001  # … after this pause
+#: Parts of Zenoh's errors: the place in its sources, and its additions to an endpoint's address.
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
-_ATTEMPTS: Final = 5  # to get a free port before somebody else has it
+_ATTEMPTS: Final = 5  # to get a free port before another process takes it
 
 
 class Session:
-    """One shared Zenoh session; :func:`release` gives it back.
+    """One shared Zenoh session; return it with :func:`release`.
 
     Raises:
         LinkError: The network can't be joined.
@@ -70,9 +68,9 @@ class Session:
             return set()
 
     def shut_out(self) -> frozenset[str]:
-        """Return the linked nodes that the newest roster shuts out.
+        """Return the linked nodes that the newest roster excludes.
 
-        Zenoh itself goes by the roster with which the session began.
+        Zenoh itself applies the roster with which the session started.
         """
         ring = self.settings.ring
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
@@ -85,8 +83,8 @@ class Session:
         """Close the Zenoh session. For the pool."""
         try:
             self.zenoh.close()  # type: ignore[no-untyped-call]
-        except Exception as error:  # noqa: BLE001  (whatever it is, there is nothing more that can be done)
-            _log.warning("a network session did not end well: %s", error)
+        except Exception as error:  # noqa: BLE001  (nothing more can be done)
+            _log.warning("closing a network session failed: %s", error)
 
     def _open(self) -> Any:
         zenoh_module = load()
@@ -97,29 +95,29 @@ class Session:
             try:
                 return zenoh_module.open(configure(sections))
             except zenoh_module.ZError as error:
-                # Another process may have taken the port that was found free: only then is another attempt of any use.
+                # Another process may have taken the free port: only then can another attempt help.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
                     raise LinkError(f"cannot join the network: {reason_of(error)}") from None
         raise AssertionError("unreachable")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return what an error of Zenoh says, without the places in its sources and the endpoints' inner form."""
+    """Return the text of a Zenoh error, without places in its sources and the internal form of endpoints."""
     text = _PLACE.sub("", str(error))
-    return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is not known")
+    return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is unknown")
 
 
 class _Pool:
     """All sessions of this process.
 
-    A thread closes those that nobody uses, and ends itself when there are none.
+    A thread closes unused ones, and ends when there are none.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
-        self._closing = 0  # sessions that are not in the list any more, and are being closed
-        self._over = False  # the process ends
+        self._closing = 0  # sessions being closed, and no longer in the list
+        self._over = False  # the process is exiting
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
@@ -132,7 +130,7 @@ class _Pool:
         """
         with self._changed:
             if self._over:
-                raise LinkError("the network can't be joined any more: this process is ending")
+                raise LinkError("the network can't be joined: this process is exiting")
             for session in self._sessions:
                 same = (session.settings, session.part) == (settings, part)
                 if same and not session.retired and not session.zenoh.is_closed():
@@ -144,7 +142,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back, which stays open for :data:`LINGER_S` without users if it may linger."""
+        """Give a session back; it stays open for :data:`LINGER_S` without users if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -166,9 +164,9 @@ class _Pool:
     def close_all(self) -> None:
         """Close all sessions at the end of the process.
 
-        Zenoh's threads may not call into an interpreter that is gone, and no thread of ours may be within Zenoh then:
-        when such a one comes back to Python, it is ended by an exception that native code does not let pass, and the
-        process is aborted with it ("FATAL: exception not rethrown").
+        Zenoh's threads must not call into an interpreter that is gone. Nor may a thread of ours be inside Zenoh then:
+        on its return to Python it ends by an exception that native code does not let pass, which aborts the process
+        ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -179,12 +177,12 @@ class _Pool:
             self._changed.wait_for(lambda: not self._closing, CLOSE_S)
 
     def _take_out(self, session: Session) -> None:
-        """Begin to close a session; with the lock held. :meth:`_close` has to follow."""
+        """Start closing a session; with the lock held. Then call :meth:`_close`."""
         self._sessions.remove(session)
         self._closing += 1
 
     def _close(self, session: Session) -> None:
-        """Close a session that was taken out, outside the lock, as it may wait for the network."""
+        """Close a session outside the lock, as it may wait for the network."""
         try:
             session.close()
         finally:
@@ -241,12 +239,12 @@ def host_name() -> str:
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session, which nobody else uses, by one at the same addresses with the newest roster.
+    """Replace a session without other users by one at the same addresses with the newest roster.
 
-    All its links end and are made again.
+    All its links end and are re-established.
 
     Raises:
-        LinkError: The keys were revoked, or an address is not free again within :data:`REOPEN_S`.
+        LinkError: The keys were revoked, or an address does not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)
@@ -254,29 +252,29 @@ def renewed(session: Session) -> Session:
     while True:
         try:
             return acquire(settings, session.part)
-        except LinkError:  # the ports are given back in a moment
+        except LinkError:  # the ports become free in a moment
             if time.monotonic() > deadline:
                 raise
             time.sleep(_BORROWED_S)
 
 
 def undeclare(held: Iterable[Any]) -> None:
-    """Undeclare what was declared on a session, the last first. Not on Zenoh's threads."""
+    """Undeclare a session's declarations, last first. Not on Zenoh's threads."""
     ended: type[Exception] = load().ZError
     for each in reversed([*held]):
         for _ in range(_BORROWED):
             try:
                 each.undeclare()
-            except ended:  # the session has ended, and everything with it
+            except ended:  # the session has ended, and its declarations with it
                 break
-            except RuntimeError:  # "Already borrowed": another thread is just sending by it
+            except RuntimeError:  # "Already borrowed": another thread is sending with it
                 time.sleep(_BORROWED_S)
             else:
                 break
 
 
 def configure(sections: dict[str, Any]) -> zenoh.Config:
-    """Convert sections of a configuration to Zenoh's own form."""
+    """Convert a configuration's sections to Zenoh's own form."""
     found = load().Config()
     for path, value in _leaves("", sections):
         found.insert_json5(path, json.dumps(value))
@@ -284,7 +282,7 @@ def configure(sections: dict[str, Any]) -> zenoh.Config:
 
 
 def _leaves(path: str, value: Any) -> list[tuple[str, Any]]:
-    """Split sections so that what they leave out keeps its default; some can only be set as a whole."""
+    """Split sections so that missing values keep their defaults; some can only be set as a whole."""
     if isinstance(value, dict) and not path.endswith(("access_control", "autoconnect", "gateway", "retry")):
         return [leaf for key, inner in value.items() for leaf in _leaves(f"{path}/{key}" if path else key, inner)]
     return [(path, value)]

@@ -1,4 +1,4 @@
-"""One topic that an application subscribed to: its packets or frames that wait for the handler."""
+"""A topic that an application subscribed to: its packets or frames that wait for the handler."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _VIDEO: Final = video("")
 
 
 class Subscription:
-    """Sorts what comes of a topic on Zenoh's threads, and delivers it on the receiving thread.
+    """Sorts a topic's packets on Zenoh's threads, and delivers them on the receiving thread.
 
     Args:
-        topic: Of packets, or of a camera's frames in one form.
-        run: Of the proxy: what others publish under its name is left out.
-        opener: Opens what the proxy publishes.
-        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number, which are to be given
-            back to :meth:`deliver` in order.
-        reject: Called with the reason for what the proxy did not publish.
+        topic: A topic of packets, or of a camera's frames in one form.
+        run: The proxy's run: packets that others publish under its name are ignored.
+        opener: Opens the proxy's packets.
+        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number, which must be passed to
+            :meth:`deliver` in order.
+        reject: Called with the reason when a packet is not the proxy's.
     """
 
     def __init__(
@@ -49,17 +49,17 @@ class Subscription:
         self._opener = opener
         self._enqueue = enqueue
         self._reject = reject
-        #: Whether only the newest packet counts: it is sent by datagrams, and so is what acknowledges it.
+        #: Whether only the newest packet counts: it and its acknowledgement are sent as datagrams.
         self.newest_wins = layout.newest_wins(topic)
         self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
         self._recent = RecentPackets()
         self._waiting = 0  # packets
         self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
-        self._newest = 0  # number of the newest frame that came
+        self._newest = 0  # number of the newest frame received
         self._ended = False
 
     def declare(self, session: Session, name: str, connection: str) -> list[Any]:
-        """Subscribe on a Zenoh session, and return what was declared, for the caller to undeclare."""
+        """Subscribe on a Zenoh session, and return the declarations, for the caller to undeclare."""
         z, call, topic = session.zenoh, session.callback, self._topic
         if not topic.startswith(_VIDEO):
             return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
@@ -68,14 +68,14 @@ class Subscription:
         return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
 
     def end(self) -> None:
-        """Deliver no more frames, also of those that wait."""
+        """Stop delivering frames, including queued ones."""
         self._ended = True
 
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
         """Deliver the next item to the handler.
 
         Returns:
-            The packet by which to acknowledge it to the proxy; empty for none.
+            The packet that acknowledges it to the proxy; empty for none.
         """
         if packet:
             self._waiting -= 1
@@ -87,7 +87,7 @@ class Subscription:
         handler.frame(header, np.frombuffer(data, np.uint8), self._topic)
         return packets.seen(self._topic, number)
 
-    # --- what Zenoh calls, on its own threads ---
+    # --- callbacks, on Zenoh's threads ---
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
         try:
@@ -104,7 +104,7 @@ class Subscription:
             self._enqueue(self, packet, number)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        """Queue a frame; the newest takes the place of those that wait."""
+        """Queue a frame; it replaces a queued one."""
         opener = self._opener
         try:
             attachment = packets.copied(sample.attachment, packets.MAX_OWN)

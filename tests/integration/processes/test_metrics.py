@@ -58,4 +58,4 @@ def test_an_invalid_address_is_refused_before_anything_starts() -> None:
     assert "'nowhere' is not an address for metrics" in said
     assert "ready" not in said
     said = skyloop_command("sim", "--firmware", "tello", "--metrics", "0", code=2)
-    assert "--metrics is of proxies" in said
+    assert "--metrics is for proxies" in said

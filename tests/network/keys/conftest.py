@@ -1,4 +1,4 @@
-"""A lab with some identities, at a time that stands still."""
+"""A lab with some identities, at a fixed time."""
 
 from __future__ import annotations
 
@@ -20,6 +20,6 @@ def lab(tmp_path: Path) -> Lab:
 
 @pytest.fixture
 def jane(lab: Lab) -> Path:
-    """The folder of a pilot's identity."""
+    """Return the folder of a pilot's identity."""
     lab.issue(make_identity("jane", "pilot", "alpha*"), now=NOW)
     return lab.folder("jane")

@@ -1,4 +1,4 @@
-"""Who two ends are to each other, whoever lies between, and the secrets that they agree on."""
+"""Mutual proof of identity across routers, and the agreed secrets."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def rings(lab: Lab) -> dict[str, KeyRing]:
     return {name: KeyRing(load(lab.folder(name), now=NOW)) for name in ("alpha", "jane", "eve")}
 
 
-def test_both_ends_know_each_other_and_the_same_secrets(rings: dict[str, KeyRing]) -> None:
+def test_both_ends_know_each_other_and_share_the_secrets(rings: dict[str, KeyRing]) -> None:
     app, proxy = Agreement(rings["jane"], *TERMS), Agreement(rings["alpha"], *TERMS)
     answer, there = proxy.answer(app.offer(), NOW)
     here = app.accept(answer, NOW)
@@ -37,7 +37,7 @@ def test_both_ends_know_each_other_and_the_same_secrets(rings: dict[str, KeyRing
     assert there.expires == NOW + timedelta(days=30)
 
 
-def test_no_two_connections_have_the_same_secrets(rings: dict[str, KeyRing]) -> None:
+def test_no_two_connections_share_secrets(rings: dict[str, KeyRing]) -> None:
     offer = Agreement(rings["jane"], *TERMS).offer()
     (_, one), (_, other) = (Agreement(rings["alpha"], *TERMS).answer(offer, NOW) for _ in range(2))
     assert len({one.up, one.down, other.up, other.down}) == 4
@@ -56,8 +56,8 @@ def test_an_offer_is_for_one_connection(rings: dict[str, KeyRing], number: int) 
 
 
 @pytest.mark.parametrize("field", ["share", "signature", "certificate"])
-def test_what_somebody_between_exchanges_is_noticed(rings: dict[str, KeyRing], field: str) -> None:
-    """Its own share, another signature, or the certificate of another, in what either end says."""
+def test_changes_by_a_man_in_the_middle_are_detected(rings: dict[str, KeyRing], field: str) -> None:
+    """His own share, another signature, or another's certificate, in either end's message."""
     app = Agreement(rings["jane"], *TERMS)
     offer = app.offer()
     other = msgspec.msgpack.decode(Agreement(rings["eve"], *TERMS).offer(), type=Proof)
@@ -77,7 +77,7 @@ def test_an_answer_is_to_one_offer(rings: dict[str, KeyRing]) -> None:
         later.accept(answer, NOW)
 
 
-def test_who_is_revoked_or_expired_or_of_another_lab_is_refused(
+def test_revoked_expired_and_foreign_identities_are_refused(
     rings: dict[str, KeyRing], lab: Lab, tmp_path: Path
 ) -> None:
     offer = Agreement(rings["eve"], *TERMS).offer()
@@ -104,7 +104,7 @@ def test_garbage_is_no_proof(rings: dict[str, KeyRing], garbage: bytes) -> None:
         Agreement(rings["alpha"], *TERMS).answer(garbage, NOW)
 
 
-def test_a_share_that_gives_no_secret_is_refused(rings: dict[str, KeyRing]) -> None:
+def test_a_share_without_a_secret_is_refused(rings: dict[str, KeyRing]) -> None:
     """The points of small order: everybody would know the secret."""
     app = Agreement(rings["jane"], *TERMS)
     app._share = bytes(32)
@@ -112,7 +112,7 @@ def test_a_share_that_gives_no_secret_is_refused(rings: dict[str, KeyRing]) -> N
         Agreement(rings["alpha"], *TERMS).answer(app.offer(), NOW)
 
 
-def test_what_there_is_to_say_is_kept_until_somebody_looks(rings: dict[str, KeyRing], lab: Lab) -> None:
+def test_messages_wait_until_they_are_polled(rings: dict[str, KeyRing], lab: Lab) -> None:
     ring = rings["alpha"]
     assert ring.admits(make_identity("eve", "pilot", "*"))
     assert not ring.admits(make_identity("eve", "pilot", "alpha")), "other rights are another identity"

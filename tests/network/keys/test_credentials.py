@@ -1,4 +1,4 @@
-"""Reading an identity's folder: all that can be wrong with it is told, and what is about to end."""
+"""Reading an identity's folder: every fault and every near expiry is reported."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.network.keys.conftest import NOW
 DAY = timedelta(days=1)
 
 
-def test_what_a_good_folder_holds(lab: Lab, jane: Path) -> None:
+def test_the_contents_of_a_good_folder(lab: Lab, jane: Path) -> None:
     credentials = load(jane, now=NOW)
     assert credentials.identity == make_identity("jane", "pilot", "alpha*")
     assert credentials.expires == NOW + 30 * DAY
@@ -66,16 +66,16 @@ def _sign_away(folder: Path) -> None:
         (lambda mine, _: shutil.rmtree(mine), UsageError, "there is no folder"),
         (lambda mine, _: (mine / "identity.key").unlink(), UsageError, "the private key .* can't be read"),
         (lambda mine, _: (mine / "identity.key").chmod(0o644), UsageError, "open to others .mode 0644.*chmod 600"),
-        (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "no unencrypted private key"),
-        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "another kind"),
+        (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "not an unencrypted private key"),
+        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "not a key as made by"),
         (
             lambda mine, other: shutil.copy(other / "identity.key", mine),
             UsageError,
             "does not belong to the certificate",
         ),
         (lambda mine, _: (mine / "identity.pem").unlink(), UsageError, "the certificate .* can't be read"),
-        (lambda mine, _: (mine / "identity.pem").write_bytes(b"\xff"), FileFormatError, "no certificate in PEM form"),
-        (lambda mine, _: (mine / "ca.pem").write_bytes(b"-----BEGIN"), FileFormatError, "ca.pem is no certificate"),
+        (lambda mine, _: (mine / "identity.pem").write_bytes(b"\xff"), FileFormatError, "not a certificate in PEM"),
+        (lambda mine, _: (mine / "ca.pem").write_bytes(b"-----BEGIN"), FileFormatError, "ca.pem is not a certificate"),
         (
             lambda mine, _: shutil.copy(mine / "identity.pem", mine / "ca.pem"),
             FileFormatError,
@@ -83,14 +83,14 @@ def _sign_away(folder: Path) -> None:
         ),
         (lambda mine, other: shutil.copy(other / "ca.pem", mine), UsageError, "keys of different labs were mixed"),
         (lambda mine, _: (mine / "roster.json").unlink(), UsageError, "the roster .* can't be read"),
-        (lambda mine, _: (mine / "roster.json").write_bytes(b"{"), FileFormatError, "is no roster"),
-        (lambda mine, _: (mine / "roster.json").write_bytes(b'{"roster":1}'), FileFormatError, "is no roster"),
-        (lambda mine, _: _sign_away(mine), FileFormatError, "is no roster"),
+        (lambda mine, _: (mine / "roster.json").write_bytes(b"{"), FileFormatError, "is not a roster"),
+        (lambda mine, _: (mine / "roster.json").write_bytes(b'{"roster":1}'), FileFormatError, "is not a roster"),
+        (lambda mine, _: _sign_away(mine), FileFormatError, "is not a roster"),
         (lambda mine, _: _change_roster(mine), UsageError, "was changed, or is not signed by"),
         (lambda mine, other: shutil.copy(other / "roster.json", mine), UsageError, "is not signed by"),
     ],
 )
-def test_a_damaged_or_mixed_up_folder_is_told(
+def test_a_damaged_or_mixed_up_folder_is_reported(
     jane: Path, tmp_path: Path, damage: Damage, kind: type[UsageError], words: str
 ) -> None:
     other = Lab.make(tmp_path / "other", now=NOW)
@@ -108,7 +108,7 @@ def test_a_damaged_or_mixed_up_folder_is_told(
         (NOW + 1825 * DAY, "the lab's authority, .* expired on 2035-04-30"),
     ],
 )
-def test_a_key_out_of_its_time_is_refused(jane: Path, at: datetime, words: str) -> None:
+def test_a_key_that_is_not_valid_now_is_refused(jane: Path, at: datetime, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         load(jane, now=at)
 
@@ -118,7 +118,7 @@ def test_the_lab_itself_is_no_identity(lab: Lab) -> None:
         load(lab.directory, now=NOW)
 
 
-def test_a_revoked_or_replaced_key_is_refused_once_the_roster_says_so(lab: Lab, jane: Path, tmp_path: Path) -> None:
+def test_a_revoked_or_replaced_key_is_refused_once_the_roster_has_it(lab: Lab, jane: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(jane, tmp_path / "copy")
     lab.issue(make_identity("jane", "observer"), now=NOW)
     shutil.copy(lab.directory / "roster.json", copy)
@@ -130,7 +130,7 @@ def test_a_revoked_or_replaced_key_is_refused_once_the_roster_says_so(lab: Lab, 
         load(copy, now=NOW)
 
 
-def test_a_roster_from_before_the_key_is_told(lab: Lab, tmp_path: Path) -> None:
+def test_a_roster_older_than_the_key_is_reported(lab: Lab, tmp_path: Path) -> None:
     old = shutil.copy(lab.directory / "roster.json", tmp_path / "old.json")
     lab.issue(make_identity("jane", "pilot"), now=NOW)
     shutil.copy(old, lab.folder("jane") / "roster.json")
@@ -138,7 +138,7 @@ def test_a_roster_from_before_the_key_is_told(lab: Lab, tmp_path: Path) -> None:
         load(lab.folder("jane"), now=NOW)
 
 
-def test_an_older_roster_is_no_news_and_a_false_one_is_an_error(lab: Lab, jane: Path, tmp_path: Path) -> None:
+def test_an_older_roster_is_ignored_and_a_false_one_is_an_error(lab: Lab, jane: Path, tmp_path: Path) -> None:
     old = shutil.copy(jane / "roster.json", tmp_path / "old.json")
     lab.issue(make_identity("olga", "observer"), now=NOW)
     credentials = load(jane, now=NOW)
@@ -149,7 +149,7 @@ def test_an_older_roster_is_no_news_and_a_false_one_is_an_error(lab: Lab, jane: 
         credentials.renewed()
 
 
-def test_a_roster_of_another_format_is_told(lab: Lab, jane: Path) -> None:
+def test_a_roster_of_another_format_is_reported(lab: Lab, jane: Path) -> None:
     from skyloop.network.keys.credentials import Roster, encode_roster
 
     content = encode_roster(Roster(9, lab.authority.name, format=2), lab.authority)
@@ -170,13 +170,13 @@ def test_a_roster_of_another_format_is_told(lab: Lab, jane: Path) -> None:
         (-DAY, "expired on 2030-04-30"),
     ],
 )
-def test_an_end_is_told_a_week_before(left: timedelta, words: str) -> None:
+def test_an_expiry_is_announced_a_week_before(left: timedelta, words: str) -> None:
     text = expiry_warning("it", NOW + left, NOW)
     assert bool(text) is bool(words)
     assert words in text
 
 
-def test_the_ends_of_a_key_and_of_its_authority_are_told(tmp_path: Path) -> None:
+def test_expiries_of_a_key_and_its_authority_are_announced(tmp_path: Path) -> None:
     lab = Lab.make(tmp_path / "lab", days=33, now=NOW)
     lab.issue(make_identity("jane", "pilot"), now=NOW)
     jane = load(lab.folder("jane"), now=NOW)

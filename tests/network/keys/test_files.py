@@ -1,4 +1,4 @@
-"""The files of keys: what can't be made or written says which and why, and leaves nothing."""
+"""Key files: failures name file and reason, and leave nothing behind."""
 
 from __future__ import annotations
 

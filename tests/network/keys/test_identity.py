@@ -1,4 +1,4 @@
-"""Names, roles and patterns of drones: what is accepted, and what they match."""
+"""Names, roles and patterns of drones: valid ones, and their matches."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = st.from_regex(NAME, fullmatch=True)
         ("jane/x", "pilot", "*", "cannot be the name of a key"),
         ("j*", "pilot", "*", "cannot be the name of a key"),
         ("a" * 49, "pilot", "*", "1 to 48"),
-        ("anyone", "pilot", "*", "who has none"),
+        ("anyone", "pilot", "*", "who have no key"),
         ("jane", "captain", "*", "pilot, observer, proxy, router"),
         ("jane", "pilot", "", "names no drones"),
         ("jane", "pilot", "alpha,", "names no drones"),
@@ -34,10 +34,10 @@ NAMES = st.from_regex(NAME, fullmatch=True)
         ("jane", "pilot", ".alpha", "names no drones"),
         ("jane", "pilot", "Alpha", "names no drones"),
         ("jane", "pilot", ",".join(f"d{n}" for n in range(MAX_PATTERNS + 1)), "too many"),
-        ("hub", "router", "alpha", "leave out which"),
+        ("hub", "router", "alpha", "leave out the drones"),
     ],
 )
-def test_what_makes_no_identity_is_told_with_what_would(name: str, role: str, drones: str, words: str) -> None:
+def test_an_invalid_identity_is_reported_with_valid_ones(name: str, role: str, drones: str, words: str) -> None:
     with pytest.raises(UsageError, match=re.escape(words)):
         make_identity(name, role, drones)
 
@@ -55,7 +55,7 @@ def test_what_makes_no_identity_is_told_with_what_would(name: str, role: str, dr
         ("*-sim", ("*-sim",)),
     ],
 )
-def test_patterns_are_kept_in_one_form(text: str, patterns: tuple[str, ...]) -> None:
+def test_patterns_are_normalised(text: str, patterns: tuple[str, ...]) -> None:
     assert parse_drones(text) == patterns
     assert parse_drones(",".join(patterns)) == patterns
 
@@ -80,7 +80,7 @@ def test_which_drones_a_pattern_covers(drones: str, name: str, covered: bool) ->
 
 
 @pytest.mark.parametrize("role", KeyRole)
-def test_keys_are_good_for_one_role_only(role: KeyRole) -> None:
+def test_keys_are_valid_for_one_role_only(role: KeyRole) -> None:
     identity = make_identity("somebody", role)
     checks: dict[str, Callable[[], None]] = {
         "a proxy needs": lambda: identity.require_proxy("alpha"),
@@ -96,7 +96,7 @@ def test_keys_are_good_for_one_role_only(role: KeyRole) -> None:
                 require()
 
 
-def test_a_proxy_serves_the_names_of_its_keys_only() -> None:
+def test_a_proxy_serves_only_its_keys_names() -> None:
     identity = make_identity("hangar", "proxy", "alpha*")
     identity.require_proxy("alpha7")
     with pytest.raises(UsageError, match="not for the name 'bravo'"):
@@ -104,7 +104,7 @@ def test_a_proxy_serves_the_names_of_its_keys_only() -> None:
 
 
 @given(NAMES)
-def test_every_name_of_a_proxy_can_be_that_of_its_key_and_is_covered_by_itself(name: str) -> None:
+def test_every_proxy_name_can_be_its_keys_and_covers_itself(name: str) -> None:
     if name == "anyone":
         return
     identity = make_identity(name, KeyRole.PROXY, name)

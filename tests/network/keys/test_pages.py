@@ -1,4 +1,4 @@
-"""Certificates of cockpits' pages: for this machine's names, by an authority that can certify nothing else."""
+"""Certificates of cockpit pages: for this machine's names, by an authority that can certify nothing else."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ OWN = ["localhost", "127.0.0.1", "box", "192.168.1.5"]
 
 
 def handshake(made: PageFiles, name: str) -> None:
-    """Connect as a browser does that trusts the authority."""
+    """Connect like a browser that trusts the authority."""
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server.load_cert_chain(made.certificate, made.key)
     here, there = socket.socketpair()
 
     def serve() -> None:
-        with there, suppress(OSError):  # the other end says why
+        with there, suppress(OSError):  # the other end reports the reason
             server.wrap_socket(there, server_side=True).close()
 
     thread = threading.Thread(target=serve)
@@ -39,11 +39,11 @@ def handshake(made: PageFiles, name: str) -> None:
         thread.join()
 
 
-def test_a_browser_that_trusts_the_authority_trusts_the_page_by_each_of_its_names(tmp_path: Path) -> None:
+def test_a_browser_that_trusts_the_authority_trusts_the_page_by_all_its_names(tmp_path: Path) -> None:
     made = page_certificate(tmp_path / "keys" / "pages", [*OWN, "8.8.8.8"], ["drones.lab"], NOW)
     for name in (*OWN, "drones.lab"):
         handshake(made, name)
-    assert made.left_out == ("8.8.8.8",), "no address of the Internet"
+    assert made.left_out == ("8.8.8.8",), "no Internet address"
     with pytest.raises(ssl.SSLCertVerificationError):
         handshake(made, "other.lab")
     assert made.key.stat().st_mode & 0o077 == 0
@@ -74,9 +74,9 @@ def test_it_is_kept_while_it_fits(tmp_path: Path) -> None:
     content = first.certificate.read_bytes()
     page_certificate(folder, OWN, (), NOW + timedelta(days=PAGE_DAYS - 30))
     assert first.certificate.read_bytes() != content, "it soon expires"
-    assert first.authority.read_bytes() == authority, "browsers need not be told"
+    assert first.authority.read_bytes() == authority, "browsers need no new authority"
     page_certificate(folder, OWN, (), NOW + timedelta(days=1800))
-    assert first.authority.read_bytes() != authority, "nor is it valid for ever"
+    assert first.authority.read_bytes() != authority, "the authority expires, too"
     made = page_certificate(folder, OWN, (), NOW + timedelta(days=1800))
     handshake_names = certificates.page_names(
         certificates.read_certificate(made.certificate.read_bytes(), made.certificate)
@@ -84,7 +84,7 @@ def test_it_is_kept_while_it_fits(tmp_path: Path) -> None:
     assert set(handshake_names) == set(OWN)
 
 
-def test_what_it_may_not_certify_is_refused(tmp_path: Path) -> None:
+def test_names_that_it_may_not_certify_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "keys" / "pages"
     with pytest.raises(UsageError, match=r"none of 8\.8\.8\.8 is private"):
         page_certificate(folder, ["8.8.8.8"], (), NOW)

@@ -1,4 +1,4 @@
-"""The keys of a process that runs: what it is told, when, and who is shut out."""
+"""A running process's keys: its messages, their times, and excluded identities."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ DAY, HOUR = timedelta(days=1), timedelta(hours=1)
 
 @pytest.fixture
 def ring(lab: Lab) -> KeyRing:
-    """A proxy's."""
+    """Return a proxy's keys."""
     for name, role, drones in (("alpha", "proxy", "alpha"), ("jane", "pilot", "alpha*"), ("eve", "pilot", "*")):
         lab.issue(make_identity(name, role, drones), now=NOW)
     return KeyRing(load(lab.folder("alpha"), now=NOW))
 
 
-def test_nothing_is_to_be_said_of_good_keys(ring: KeyRing) -> None:
+def test_good_keys_cause_no_message(ring: KeyRing) -> None:
     assert ring.poll(NOW) == []
 
 
-def test_an_end_is_told_at_once_and_then_every_hour(ring: KeyRing) -> None:
+def test_an_expiry_is_announced_at_once_and_then_hourly(ring: KeyRing) -> None:
     late = NOW + 25 * DAY
     assert [len(ring.poll(late + wait)) for wait in (0 * HOUR, HOUR / 2, HOUR, HOUR * 1.5, HOUR * 2)] == [1, 0, 1, 0, 1]
     assert ring.poll(NOW + 26 * DAY)[0].startswith("the key of alpha expires in 4 days")
 
 
-def test_a_new_name_on_the_roster_is_told_once(ring: KeyRing, lab: Lab) -> None:
+def test_a_new_name_on_the_roster_is_announced_once(ring: KeyRing, lab: Lab) -> None:
     lab.issue(make_identity("olga", "observer"), now=NOW)
     (news,) = ring.poll(NOW)
     assert "roster has changed (number 5)" in news
@@ -48,7 +48,7 @@ def test_a_renewed_key_is_no_news(ring: KeyRing, lab: Lab) -> None:
     assert ring.credentials.roster.number == 5
 
 
-def test_who_is_revoked_or_changed_is_shut_out_at_once(ring: KeyRing, lab: Lab) -> None:
+def test_a_revoked_or_changed_identity_is_excluded_at_once(ring: KeyRing, lab: Lab) -> None:
     lab.revoke("eve")
     (news,) = ring.poll(NOW)
     assert "revoked or changed: eve" in news
@@ -69,7 +69,7 @@ def test_a_damaged_or_older_roster_changes_nothing(ring: KeyRing, lab: Lab, tmp_
     ring.poll(NOW)
     mine.write_bytes(newer[:50])
     (news,) = ring.poll(NOW)
-    assert "is no roster" in news
+    assert "is not a roster" in news
     assert "stays in force" in news
     assert ring.poll(NOW) == []
     mine.write_bytes(good)

@@ -109,7 +109,7 @@ def test_a_serial_port_that_is_missing_and_one_that_is_silent(start: Start, tmp_
     [
         ("mavlink://serial:/dev/none-here", "there is no /dev/none-here", "plug the vehicle in"),
         ("mavlink://tcp:127.0.0.1:9", "Connection refused", "start it at 127.0.0.1"),
-        ("mavlink://udpin:127.0.0.1:14999", "no message on udpin", "have the vehicle send"),
+        ("mavlink://udpin:127.0.0.1:14999", "no message on udpin", "point the vehicle"),
         ("ardrone://127.0.0.9", "no navdata from 127.0.0.9", "start the emulated drone"),
         ("tello://127.0.0.9?local=127.0.0.78", "no state from 127.0.0.9", "start the emulated drone"),
     ],

@@ -76,7 +76,7 @@ def test_a_guesser_that_is_gone_is_logged_as_such(caplog: pytest.LogCaptureFixtu
     assert gate.wrong_token_s({"client": None}) == FIRST_S
     assert gate.wrong_token_s({"client": ("10.0.0.1", 1)}) == FIRST_S
     assert [record.message for record in caplog.records] == [
-        "1 wrong tokens from a client that is gone",
+        "1 wrong tokens from a disconnected client",
         "1 wrong tokens from 10.0.0.1",
     ]
 

@@ -91,7 +91,7 @@ def test_observers_that_stop_reading_delay_no_command_and_no_emergency_stop(
 
         # On a busy machine Zenoh may end their links first, which disconnects them, too.
         eventually(lambda: len(let_go()) == STALLED, "all that stopped reading were let go, and it was told", 30.0)
-        stalled = sum("it took nothing" in text for text in let_go())
+        stalled = sum("it acknowledged nothing" in text for text in let_go())
 
         def counted() -> bool:
             statistics = eye._proxy_statistics()

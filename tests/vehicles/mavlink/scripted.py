@@ -1,4 +1,4 @@
-"""A session on a clock that the tests move, and a vehicle that says what they want."""
+"""A session on a manual clock, and a vehicle whose messages the tests choose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def options(text: str = "mavlink://udpin:127.0.0.1:14540?parameters=no") -> Mavl
 
 
 class Vehicle:
-    """What an autopilot would say. ``autopilot``: :data:`PX4` or :data:`ARDUPILOT`."""
+    """A scripted autopilot. ``autopilot``: :data:`PX4` or :data:`ARDUPILOT`."""
 
     def __init__(self, autopilot: int, system: int = 1, *, version: int = 2) -> None:
         self.autopilot = autopilot
@@ -36,7 +36,7 @@ class Vehicle:
         self.kind = 2
         self.landed = Landed.ON_GROUND
         self.ready = True
-        self.remote = False  # it hears a remote control
+        self.remote = False  # it receives a remote control
         self.flags = 0x1F  #: of its estimator
         self.boot_ms = 10_000
         self.place = (0.0, 0.0, 0.0)
@@ -50,9 +50,9 @@ class Vehicle:
         return m.MAVLink_heartbeat_message(self.kind, self.autopilot, 1 | self.armed << 7, custom, self.status, 3)
 
     def telemetry(self) -> list[Message]:
-        """Everything that flows."""
+        """Return all streamed messages."""
         receiver = 0x10000 * self.remote
-        present = receiver | 0x10000000 * (self.autopilot != PX4)  # a PX4 never says that it has this check
+        present = receiver | 0x10000000 * (self.autopilot != PX4)  # a PX4 never reports that it has this check
         healthy = receiver | 0x10000000 * self.ready
         altitude = -self.place[2]
         local = m.MAVLink_local_position_ned_message(self.boot_ms, *self.place, *self.velocity)
@@ -71,7 +71,7 @@ class Vehicle:
 
 
 class Bench:
-    """A session, its vehicle, and what went between them."""
+    """A session, its vehicle, and the traffic between them."""
 
     def __init__(self, vehicle: Vehicle, given: MavlinkOptions | None = None) -> None:
         self.vehicle = vehicle
@@ -80,7 +80,7 @@ class Bench:
         self.sink = RecordingSink()
         self.said: list[Message] = []
         self.frames: list[bytes] = []
-        self.peers: set[Peer] = set()  # that something was sent to
+        self.peers: set[Peer] = set()  # receivers of packets
         self._ears = Codec(1, 1)
         self.deliver()
 
@@ -102,7 +102,7 @@ class Bench:
         self.deliver()
 
     def go_on(self, seconds: float, *, silent: bool = False) -> None:
-        """Time passes; the vehicle tells everything at 50 Hz, its heartbeat at 5 Hz."""
+        """Advance the time; the vehicle sends all messages at 50 Hz, its heartbeat at 5 Hz."""
         for step in range(round(nanoseconds(seconds) / TICK_NS)):
             self.clock.advance(TICK_NS / 1e9)
             self.vehicle.boot_ms += 20
@@ -113,14 +113,14 @@ class Bench:
             self.tick()
 
     def found(self) -> Bench:
-        """Up and running, with all of its messages flowing."""
+        """Connect, with all messages flowing."""
         self.hear(self.vehicle.heartbeat())
         self.go_on(0.5)
         self.said.clear()
         return self
 
     def flying(self, mode: str, height_m: float = 3.0) -> Bench:
-        """Somebody took off with it before."""
+        """Put it in the air, flown by another operator."""
         vehicle = self.vehicle
         vehicle.mode, vehicle.armed, vehicle.status, vehicle.landed = mode, True, 4, Landed.IN_AIR
         vehicle.place = (0.0, 0.0, -height_m)
@@ -132,13 +132,13 @@ class Bench:
         return applied
 
     def heard_of(self, kind: str) -> list[Message]:
-        """What the vehicle was told, of this kind, since the last look."""
+        """Return messages of this kind to the vehicle since the last call."""
         found = [message for message in self.said if message.get_type() == kind]
         self.said = [message for message in self.said if message.get_type() != kind]
         return found
 
     def commands(self) -> list[tuple[Any, ...]]:
-        """Number and arguments, without the requests for messages."""
+        """Return number and arguments of commands, without message requests."""
         asked = (m.MAV_CMD_SET_MESSAGE_INTERVAL, m.MAV_CMD_REQUEST_MESSAGE)
         return [
             (each.command, *(each.param1, each.param2, each.param3, each.param7))
@@ -155,11 +155,11 @@ class Bench:
         return self.sink.newest
 
     def state(self) -> FlightState:
-        """As told last."""
+        """As last reported."""
         return self.newest.state
 
     def link(self) -> LinkState | None:
-        """As told last."""
+        """As last reported."""
         return self.sink.link_state
 
     @property

@@ -1,4 +1,4 @@
-"""The ways to a vehicle: a port that listens, one that speaks first, TCP, and a serial line."""
+"""Connections to a vehicle: a listening port, one that sends first, TCP, and a serial line."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ LOCAL = "127.0.0.1"
 
 
 def came(connection: MavlinkConnection) -> bytes:
-    """All that comes within a while, until something has."""
-    assert select.select([connection], [], [], 5.0)[0], "nothing comes"
+    """Return all bytes that arrive shortly, waiting for the first."""
+    assert select.select([connection], [], [], 5.0)[0], "nothing arrives"
     return b"".join(data for data, _ in connection.receive())
 
 
@@ -43,7 +43,7 @@ def by_tcp() -> Iterator[tuple[MavlinkConnection, socket.socket]]:
 
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
-    """A serial line: its far end, and the device at this one."""
+    """A serial line: its far end, and the local device."""
     far, near = os.openpty()
     tty.setraw(near)
     yield far, os.ttyname(near)
@@ -53,7 +53,7 @@ def line() -> Iterator[tuple[int, str]]:
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 here")
 @pytest.mark.parametrize(("family", "local"), [(socket.AF_INET6, "::1"), (socket.AF_INET, LOCAL)])
-def test_a_port_of_ipv6_hears_and_answers_vehicles_of_both_kinds(family: int, local: str) -> None:
+def test_an_ipv6_port_receives_and_answers_both_kinds_of_vehicles(family: int, local: str) -> None:
     address = options_of(parse_uri("mavlink://udpin:[::]:14550")).address
     assert str(address) == "udpin:[::]:14550"
     try:
@@ -74,7 +74,7 @@ def test_a_port_of_ipv6_hears_and_answers_vehicles_of_both_kinds(family: int, lo
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="there is no IPv6 here")
-def test_one_that_speaks_first_reaches_a_host_of_ipv6() -> None:
+def test_a_sender_reaches_an_ipv6_host() -> None:
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as vehicle:
         try:
             vehicle.bind(("::1", 0))
@@ -89,7 +89,7 @@ def test_one_that_speaks_first_reaches_a_host_of_ipv6() -> None:
             assert came(ours) == b"answer"
 
 
-def test_a_port_that_listens_answers_whom_it_heard() -> None:
+def test_a_listening_port_answers_the_sender() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind((LOCAL, 0))
         ours = open_connection(Address(ConnectionKind.UDP_IN, LOCAL, 0))
@@ -104,14 +104,14 @@ def test_a_port_that_listens_answers_whom_it_heard() -> None:
             assert (data, peer) == (b"one", vehicle.getsockname())
             ours.send(Packet(b"two", peer))
             vehicle.settimeout(5.0)
-            assert vehicle.recv(100) == b"two", "what was sent to nobody never came"
+            assert vehicle.recv(100) == b"two", "a packet without a receiver is dropped"
             with pytest.raises(OSError, match="in use"):
                 open_connection(Address(ConnectionKind.UDP_IN, LOCAL, port))
         finally:
             ours.close()
 
 
-def test_a_port_that_speaks_first_needs_no_peer() -> None:
+def test_a_port_that_sends_first_needs_no_peer() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind((LOCAL, 0))
         vehicle.settimeout(5.0)
@@ -126,7 +126,7 @@ def test_a_port_that_speaks_first_needs_no_peer() -> None:
             ours.close()
 
 
-def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
+def test_tcp_carries_bytes_and_reports_its_end() -> None:
     with by_tcp() as (ours, vehicle):
         assert ours.receive() == [], "nothing yet"
         ours.send(Packet(b"hello", None))
@@ -139,12 +139,12 @@ def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
             ours.receive()
 
 
-def test_tcp_ends_half_a_frame_so_that_it_is_discarded_and_the_next_one_is_whole() -> None:
-    """What follows half a frame would be noise to the vehicle; a whole one that finds no room is merely lost."""
+def test_tcp_sends_half_a_frame_to_its_end_and_then_whole_ones() -> None:
+    """The rest of half a frame would be noise to the vehicle; a whole frame without room is merely lost."""
     frame = bytes(32 << 20)
     with by_tcp() as (ours, vehicle):
         ours.send(Packet(frame, None))
-        # Freed room may take a moment to be known on both sides: here nobody reads, so none is freed.
+        # Freed room may take a moment to show on both sides: here nothing is read, so none is freed.
         wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
         ours.send(Packet(b"lost without a word", None))
         got = bytearray()
@@ -176,7 +176,7 @@ def test_a_serial_line_carries_bytes_both_ways(line: tuple[int, str]) -> None:
         ours.close()
 
 
-def test_a_serial_line_that_is_not_there_and_one_without_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_serial_line_and_missing_pyserial_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("serial")
     with pytest.raises(OSError, match="nowhere"):
         open_connection(Address(ConnectionKind.SERIAL, "/dev/nowhere", 57600))

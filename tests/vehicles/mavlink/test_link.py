@@ -1,4 +1,4 @@
-"""The driver over every way to a vehicle, against emulated autopilots."""
+"""The driver on every kind of connection, against emulated autopilots."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def up(sink: RecordingSink) -> None:
     assert sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S), sink.links
 
 
-def test_the_last_connection_has_more_time_to_deliver_what_was_sent() -> None:
+def test_the_last_connection_has_longer_to_deliver_its_packets() -> None:
     link = MavlinkLink(MavlinkSession(options("mavlink://tcp:127.0.0.1:5760"), 0), lambda _: None)
     link._connection = line = create_autospec(TcpClient, instance=True)
     link._stopping.set()
@@ -73,12 +73,12 @@ def test_the_last_connection_has_more_time_to_deliver_what_was_sent() -> None:
     line.close.assert_called_once()
 
 
-def test_udp_that_speaks_first() -> None:
+def test_udp_that_sends_first() -> None:
     with firmware() as it, opened(f"mavlink://udpout:127.0.0.1:{it.settings.ports.udp}") as (_, sink):
         up(sink)
 
 
-def test_a_thread_that_serves_several_serves_it_too() -> None:
+def test_a_shared_thread_serves_it_too() -> None:
     thread = LinkThread()
     with firmware() as it:
         driver = MavlinkDriver(parse_uri(f"mavlink://udpout:127.0.0.1:{it.settings.ports.udp}"))
@@ -88,7 +88,7 @@ def test_a_thread_that_serves_several_serves_it_too() -> None:
         driver.open(sink)
         try:
             up(sink)
-            wait_until(lambda: threads, "its state")
+            wait_until(lambda: threads, "its state arrives")
             assert threads == {"skyloop-links"}
         finally:
             driver.close()
@@ -96,8 +96,8 @@ def test_a_thread_that_serves_several_serves_it_too() -> None:
     assert not sink.problems
 
 
-def test_a_name_that_does_not_resolve_keeps_no_other_link_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread serves several vehicles; it comes back for the answer once there is one."""
+def test_an_unresolvable_name_delays_no_other_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shared thread comes back for the answer once there is one."""
     released, found = threading.Event(), socket.getaddrinfo("127.0.0.1", None, type=socket.SOCK_STREAM)
 
     def resolver(*_: object) -> object:
@@ -125,7 +125,7 @@ def test_a_name_that_does_not_resolve_keeps_no_other_link_waiting(monkeypatch: p
     driver.close()
 
 
-def test_what_fails_on_a_thread_that_serves_several_is_an_event_and_told_to_the_thread() -> None:
+def test_a_failure_on_a_shared_thread_is_an_event_and_raised_there() -> None:
     given: list[ServedLink] = []
     driver = MavlinkDriver(parse_uri("mavlink://udpout:127.0.0.1:9"))
     driver.serve_link = given.append
@@ -143,18 +143,18 @@ def test_what_fails_on_a_thread_that_serves_several_is_an_event_and_told_to_the_
         assert "the link to the vehicle failed: ZeroDivisionError" in sink.events[-1].text
     finally:
         ending = threading.Thread(target=driver.close)
-        ending.start()  # waits until the thread that serves it says that it has ended
-        wait_until(lambda: link.serve(readable=False) is None, "it is to end")
+        ending.start()  # waits until the serving thread reports its end
+        wait_until(lambda: link.serve(readable=False) is None, "it should end")
         link.end()
         ending.join(PATIENCE_S)
     assert not ending.is_alive()
 
 
-def test_tcp_is_up_when_a_heartbeat_comes_and_not_when_it_is_connected() -> None:
+def test_tcp_is_up_with_a_heartbeat_not_with_the_connection() -> None:
     with firmware(kind=Kind.ARDUCOPTER) as it:
         assert it.settings.ports.tcp is not None
         with socket.create_connection(("127.0.0.1", it.settings.ports.tcp)) as first:
-            first.recv(16)  # it has the autopilot for itself
+            first.recv(16)  # it has the autopilot to itself
             with opened(it.tcp_address) as (_, sink):
                 assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S), sink.links
                 first.close()
@@ -162,7 +162,7 @@ def test_tcp_is_up_when_a_heartbeat_comes_and_not_when_it_is_connected() -> None
                 assert sink.wait(lambda: sink.newest is not None and sink.newest.roll_rad is not None, PATIENCE_S)
 
 
-def test_tcp_is_connected_again_after_the_vehicle_was_away() -> None:
+def test_tcp_reconnects_after_the_vehicle_was_away() -> None:
     it = firmware(kind=Kind.ARDUCOPTER)
     with it, opened(it.tcp_address) as (_, sink):
         up(sink)
@@ -173,7 +173,7 @@ def test_tcp_is_connected_again_after_the_vehicle_was_away() -> None:
 
 
 def test_a_serial_port() -> None:
-    """A pseudo-terminal, whose other end is carried to an autopilot's TCP port."""
+    """A pseudo-terminal, whose other end is bridged to an autopilot's TCP port."""
     pytest.importorskip("serial")
     master, slave = os.openpty()
     with firmware(kind=Kind.ARDUCOPTER) as it:
@@ -190,8 +190,8 @@ def test_a_serial_port() -> None:
     os.close(master)
 
 
-def test_a_serial_port_that_is_no_longer_read_is_lost_and_stops_nobody() -> None:
-    """The vehicle goes on sending, and reads nothing: commands return, the link is lost, closing is done at once."""
+def test_an_unread_serial_port_is_lost_and_blocks_nothing() -> None:
+    """The vehicle sends but reads nothing: commands return, the link is lost, and closing is immediate."""
     pytest.importorskip("serial")
     far, near = os.openpty()
     tty.setraw(near)
@@ -246,7 +246,7 @@ def _carry(read: Callable[[], bytes], write: Callable[[bytes], object]) -> threa
 
 
 @pytest.mark.parametrize("way", ["udpin:127.0.0.1:1", "tcp:127.0.0.1:1", "serial:/dev/nothing-of-the-kind:57600"])
-def test_what_can_not_be_reached_is_told_with_the_reason(way: str) -> None:
+def test_unreachable_vehicles_are_reported_with_the_reason(way: str) -> None:
     with opened(f"mavlink://{way}") as (driver, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
         if not way.startswith("udpin") or os.geteuid() != 0:  # root may listen anywhere
@@ -255,7 +255,7 @@ def test_what_can_not_be_reached_is_told_with_the_reason(way: str) -> None:
             driver.apply(Takeoff())
 
 
-def test_two_vehicles_on_one_port_are_told_apart() -> None:
+def test_two_vehicles_on_one_port_are_distinguished() -> None:
     host = world(2)
     remote = Ports.free(Kind.PX4).remote
     ports = [Ports(Ports.free(Kind.PX4).udp, remote) for _ in range(2)]
@@ -270,7 +270,7 @@ def test_two_vehicles_on_one_port_are_told_apart() -> None:
         assert any("another vehicle" in event.text for event in sink.events)
 
 
-def test_two_vehicles_with_one_id_are_told_apart_by_their_addresses() -> None:
+def test_two_vehicles_with_one_id_are_distinguished_by_address() -> None:
     host = world(2)
     remote = Ports.free(Kind.PX4).remote
     ports = [Ports(Ports.free(Kind.PX4).udp, remote) for _ in range(2)]
@@ -284,8 +284,8 @@ def test_two_vehicles_with_one_id_are_told_apart_by_their_addresses() -> None:
         assert host.simulation.truth(0).state is FlightState.LANDED
 
 
-def test_another_vehicle_in_the_place_of_the_first_is_flown_as_what_it_is() -> None:
-    """A PX4, then an ArduCopter with the same system id on the same port, whose numbers of modes mean other things."""
+def test_a_vehicle_that_replaces_the_first_is_flown_as_what_it_is() -> None:
+    """A PX4, then an ArduCopter with the same system id on the same port, whose mode numbers differ."""
     ports = Ports.free(Kind.PX4)
     with opened(f"mavlink://udpin:127.0.0.1:{ports.remote}") as (driver, sink):
         with firmware(kind=Kind.PX4, ports=ports):
@@ -300,7 +300,7 @@ def test_another_vehicle_in_the_place_of_the_first_is_flown_as_what_it_is() -> N
 
 
 def fly(driver: Driver, sink: RecordingSink) -> None:
-    """Up and down again."""
+    """Take off and land."""
 
     def state() -> FlightState | None:
         return sink.newest.state if sink.newest is not None else None
@@ -313,17 +313,17 @@ def fly(driver: Driver, sink: RecordingSink) -> None:
 
 
 def test_a_second_program_that_takes_the_vehicle_keeps_it() -> None:
-    """On a link of its own: it lands what the driver flies, and the driver lets it."""
+    """On a separate connection it lands the vehicle, and the driver lets it."""
     with firmware(world(speed=1.0), kind=Kind.ARDUCOPTER) as it, opened(it.tcp_address) as (driver, sink):
         up(sink)
-        wait_until(lambda: ready(sink), "it may be armed")
+        wait_until(lambda: ready(sink), "it can be armed")
         driver.apply(Takeoff())
         assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.HOVERING, PATIENCE_S)
         driver.apply(Velocity(forward=0.3))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             lands = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_DO_SET_MODE, 0, 1, 9, 0, 0, 0, 0, 0)
             other.sendto(Codec(250, 190).encode(lands), ("127.0.0.1", it.settings.ports.udp))
-        assert sink.wait(lambda: any("went to LAND" in event.text for event in sink.events), PATIENCE_S)
+        assert sink.wait(lambda: any("changed to LAND" in event.text for event in sink.events), PATIENCE_S)
         with pytest.raises(DriverError, match="not chosen here"):
             driver.apply(Velocity(forward=0.3))
         assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, PATIENCE_S)
@@ -334,7 +334,7 @@ def ready(sink: RecordingSink) -> bool:
 
 
 @pytest.mark.parametrize("kind", list(Kind))
-def test_the_old_version_flies(kind: Kind) -> None:
+def test_mavlink_1_flies(kind: Kind) -> None:
     with firmware(kind=kind, version=1) as it, opened(it.address) as (driver, sink):
         up(sink)
         fly(driver, sink)
@@ -359,7 +359,7 @@ def test_it_flies_with_a_tenth_of_all_datagrams_lost(kind: Kind) -> None:
 
 @pytest.mark.parametrize("kind", list(Kind))
 @pytest.mark.parametrize("pose", ["odometry", "vision_position_estimate"])
-def test_poses_from_outside_make_it_fly_without_gps(kind: Kind, pose: str) -> None:
+def test_external_poses_make_it_fly_without_gps(kind: Kind, pose: str) -> None:
     with (
         firmware(kind=kind, gps=False) as it,
         opened(f"{it.address}?pose={pose}&origin=47.4,8.5,488") as (driver, sink),
@@ -371,7 +371,7 @@ def test_poses_from_outside_make_it_fly_without_gps(kind: Kind, pose: str) -> No
             while not stop.wait(0.02):
                 captured_ns = sink.newest.captured_ns if sink.newest is not None else 0
                 pose = ExternalPose((0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), captured_ns, 0.001, 0.01)
-                with suppress(DriverError):  # before the first feedback, or after a stall, it is too old
+                with suppress(DriverError):  # too old before the first feedback or after a stall
                     driver.external_pose(pose)
 
         thread = threading.Thread(target=capture)
@@ -397,14 +397,14 @@ def test_poses_are_checked() -> None:
         driver.external_pose(ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 0))
 
 
-def test_a_vehicle_that_takes_no_poses_says_so() -> None:
+def test_a_vehicle_that_accepts_no_poses_reports_that() -> None:
     from skyloop.drivers.registry import make_driver
 
     with pytest.raises(UnsupportedError, match="sim://"):
         make_driver("sim://?cameras=none").external_pose(ExternalPose((0.0,) * 3, (0.0, 0.0, 0.0, 1.0), 0))
 
 
-def test_a_camera_beside_the_autopilot_shows_its_newest_picture() -> None:
+def test_a_camera_beside_the_autopilot_shows_its_newest_image() -> None:
     pytest.importorskip("av")
     port = Ports.free(Kind.PX4).remote
     host = SimHost(with_multirotors(SimOptions(world="room", seed=4, wind=0.0)))
@@ -421,10 +421,8 @@ def test_a_camera_beside_the_autopilot_shows_its_newest_picture() -> None:
             driver.close()
 
 
-def test_a_camera_that_is_not_there_is_told_and_does_not_disturb() -> None:
+def test_a_missing_camera_is_reported_and_does_no_harm() -> None:
     pytest.importorskip("av")
     with firmware() as it, opened(f"{it.address}?camera=/dev/video-of-nobody") as (_, sink):
         up(sink)
-        wait_until(
-            lambda: any("there is no such device" in event.text for event in sink.events), "the camera is missed"
-        )
+        wait_until(lambda: any("there is no such device" in event.text for event in sink.events), "it is reported")

@@ -30,7 +30,7 @@ def understood(text: str) -> MavlinkOptions:
         ("mavlink://serial:/dev/ttyACM0", ConnectionKind.SERIAL, "/dev/ttyACM0", 57600),
     ],
 )
-def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
+def test_connections(text: str, way: ConnectionKind, place: str, number: int) -> None:
     address = understood(text).address
     assert (address.kind, address.place, address.number) == (way, place, number)
 
@@ -40,11 +40,11 @@ def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
     [
         ("mavlink://", "none of udpin, udpout, tcp, serial"),
         ("mavlink://127.0.0.1:14540", "none of udpin"),
-        ("mavlink://udpin:127.0.0.1", "names no place"),
-        ("mavlink://tcp:127.0.0.1:99999", "names no place"),
-        ("mavlink://serial:", "names no place"),
-        ("mavlink://udpin:[::x]:14550", "names no place"),
-        ("mavlink://udpin:::14550", "names no place"),
+        ("mavlink://udpin:127.0.0.1", "names no host or device"),
+        ("mavlink://tcp:127.0.0.1:99999", "names no host or device"),
+        ("mavlink://serial:", "names no host or device"),
+        ("mavlink://udpin:[::x]:14550", "names no host or device"),
+        ("mavlink://udpin:::14550", "names no host or device"),
         ("mavlink://udpin:[::]:14550?component=0", "component"),
         ("mavlink://udpin:0.0.0.0:14550?sysid=0", "sysid"),
         ("mavlink://udpin:0.0.0.0:14550?sysid=255", "must differ"),
@@ -62,14 +62,14 @@ def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
         ("mavlink://udpin:0.0.0.0:14550?camera=/dev/video0&camera_facing=up", "camera_facing"),
     ],
 )
-def test_what_makes_no_sense_is_refused_with_what_would(text: str, what: str) -> None:
+def test_invalid_options_are_refused_with_valid_ones(text: str, what: str) -> None:
     with pytest.raises(UsageError) as caught:
         MavlinkDriver(parse_uri(text))
     assert what in str(caught.value)
 
 
 @pytest.mark.parametrize("held", [bytes(range(32)), bytes(range(32)).hex().encode() + b"\n"])
-def test_a_signing_key_comes_from_a_file(tmp_path: Path, held: bytes) -> None:
+def test_a_signing_key_is_read_from_a_file(tmp_path: Path, held: bytes) -> None:
     file = tmp_path / "key"
     file.write_bytes(held)
     assert understood(f"mavlink://udpin:0.0.0.0:14550?signing_key={file}").key == bytes(range(32))

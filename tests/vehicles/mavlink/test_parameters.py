@@ -35,7 +35,7 @@ def value(name: str, number: float, kind: int, index: int, count: int = 3, *, by
     return m.MAVLink_param_value_message(name.encode(), field, kind, count, index)
 
 
-def test_what_is_lost_of_the_list_is_asked_for() -> None:
+def test_lost_parameters_of_the_list_are_requested() -> None:
     exchange = ParameterExchange()
     exchange.request_all(0)
     (request,) = exchange.poll(1)
@@ -51,7 +51,7 @@ def test_what_is_lost_of_the_list_is_asked_for() -> None:
     assert exchange.values == {"ONE": 1, "TWO": 2, "THREE": 3}
 
 
-def test_a_list_that_never_comes_is_given_up() -> None:
+def test_a_list_that_never_arrives_is_given_up() -> None:
     exchange = ParameterExchange()
     exchange.request_all(0)
     said = [message for at in range(0, 30 * S, S // 10) for message in exchange.poll(at)]
@@ -59,7 +59,7 @@ def test_a_list_that_never_comes_is_given_up() -> None:
     assert exchange.given_up
 
 
-def test_writing_is_repeated_until_the_value_comes_back() -> None:
+def test_a_write_is_repeated_until_the_value_comes_back() -> None:
     exchange, ended = ParameterExchange(), list[str | None]()
     exchange.on_value(value("ONE", 1, 6, 0), 0)
     exchange.write("ONE", 5, S, ended.append)
@@ -71,20 +71,20 @@ def test_writing_is_repeated_until_the_value_comes_back() -> None:
     assert ended == [None]
 
 
-def test_a_value_that_is_not_taken_is_told() -> None:
+def test_a_rejected_value_is_reported() -> None:
     exchange, ended = ParameterExchange(), list[str | None]()
     exchange.on_value(value("ONE", 1, 6, 0), 0)
     exchange.write("ONE", 5, S, ended.append)
     exchange.poll(0)
     exchange.poll(S)
     assert ended[0] is not None
-    assert "reported is 1" in ended[0]
+    assert "last reported 1" in ended[0]
     exchange.write("ONE", 6, 5 * S, ended.append)
     exchange.fail_writes("it is gone")
     assert ended[1] == "it is gone"
 
 
-def test_bytes_for_integers_of_px4() -> None:
+def test_px4_integers_are_bytes() -> None:
     exchange = ParameterExchange()
     exchange.bytewise = True
     exchange.on_value(value("COM_DL_LOSS_T", 10, 6, 0, bytewise=True), 0)
@@ -108,7 +108,7 @@ def test_names_types_units_and_ranges() -> None:
     assert not any(name.startswith("limits.") for name in entries), "the autopilot's limits are not ours"
 
 
-def test_the_drivers_own_limits_are_cautious_whatever_the_autopilot_would_do() -> None:
+def test_the_drivers_own_limits_are_cautious_despite_the_autopilots() -> None:
     limits = {parameter.name: parameter for parameter in limit_parameters(USUAL)}
     assert {name: limits[name].value for name in ("limits.speed", "limits.climb", "limits.altitude")} == {
         "limits.speed": 2.0,
@@ -122,13 +122,13 @@ def test_the_drivers_own_limits_are_cautious_whatever_the_autopilot_would_do() -
 
 
 @pytest.mark.parametrize("value", [math.nan, True, "fast", 31.0, 0.0])
-def test_a_limit_that_makes_no_sense_is_refused(value: float) -> None:
+def test_an_invalid_limit_is_refused(value: float) -> None:
     with pytest.raises(ParameterError, match=r"limits\.speed"):
         with_limit(USUAL, "limits.speed", value)
 
 
 @pytest.mark.parametrize("number", [16_777_217, -16_777_217, 2_147_483_647, 33_554_433])
-def test_a_whole_number_that_the_vehicle_would_hear_as_another_is_refused_with_the_reason(number: int) -> None:
+def test_a_number_that_would_arrive_changed_is_refused_with_the_reason(number: int) -> None:
     with pytest.raises(ParameterError, match=f"would receive -?[0-9]+ instead of {number}"):
         check_exact("mavlink.brd_options", number, bytewise=False)
     assert check_exact("mavlink.brd_options", number, bytewise=True) == number
@@ -143,14 +143,14 @@ def test_wrong_names_and_values_are_refused() -> None:
     entries = vehicle_parameters(reported(RTL_ALT=(1500, 6), BAD=(math.inf, 9)))
     with pytest.raises(UnknownNameError, match="rtl_alt"):
         writable_parameter(entries, "mavlink.rtl_alti")
-    with pytest.raises(ParameterError, match="only be read"):
+    with pytest.raises(ParameterError, match="read-only"):
         writable_parameter(entries, "mavlink.bad")
     for wrong in (1.5, True, "high", math.nan, 9_999_999):
         with pytest.raises(ParameterError):
             entries["mavlink.rtl_alt"].to_native(wrong)
 
 
-def test_safety_nets_that_are_off_are_named_with_what_to_set() -> None:
+def test_disabled_safety_nets_are_named_with_what_to_set() -> None:
     values = {"FS_GCS_ENABLE": 0, "MAV_GCS_SYSID": 255}
     found = {each.what: each for each in ArduCopterProfile().safety_diagnostics(values, 255)}
     assert not found["loss of this computer"].good
@@ -162,7 +162,7 @@ def test_safety_nets_that_are_off_are_named_with_what_to_set() -> None:
     assert "own_sysid=254" in other.advice
 
 
-def test_arducopter_that_is_set_to_take_thrust_gets_thrust() -> None:
+def test_arducopter_configured_for_thrust_gets_thrust() -> None:
     assert isinstance(ArduCopterProfile().thrust_model({}), ClimbRateThrust)
     assert isinstance(ArduCopterProfile().thrust_model({"GUID_OPTIONS": 8, "MOT_THST_HOVER": 0.3}), CollectiveThrust)
     newer = ArduCopterProfile().thrust_model({"WP_SPD_UP": 4.0})

@@ -1,4 +1,4 @@
-"""Poses from outside as the autopilots take them."""
+"""External poses as the autopilots receive them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POSE = ExternalPose(
     0.01,
     0.02,
 )
-ANGLES = (math.radians(5), math.radians(-10), math.radians(60))  # nose up, and clockwise from north, is positive there
+ANGLES = (math.radians(5), math.radians(-10), math.radians(60))  # positive: nose up, and clockwise from north
 
 
 def test_as_odometry() -> None:
@@ -39,9 +39,9 @@ def test_as_odometry() -> None:
     assert math.isnan(message.velocity_covariance[0])
 
 
-def test_the_quaternion_is_turned_into_mavlinks_axes_and_order() -> None:
+def test_the_quaternion_has_mavlinks_axes_and_order() -> None:
     x, y, z, w = Rotation.from_euler("ZYX", ANGLES[::-1]).as_quat()
-    assert len({round(abs(each), 3) for each in (x, y, z, w)}) == 4, "no order looks like another"
+    assert len({round(abs(each), 3) for each in (x, y, z, w)}) == 4, "all orders differ"
     assert pose_message(POSE, PoseMessage.ODOMETRY).q == pytest.approx([w, x, y, z])
 
 
@@ -57,8 +57,8 @@ def test_as_a_vision_estimate_of_unknown_accuracy() -> None:
     assert math.isnan(message.covariance[0])
 
 
-def test_a_pose_from_the_future_is_refused_or_taken_for_one_of_now() -> None:
-    """A wrong clock; all poses with the right time would look old after it."""
+def test_a_pose_from_the_future_is_refused_or_dated_now() -> None:
+    """After one with a wrong clock, all poses with the right time would look old."""
     for ahead_ns, taken in ((-NS_PER_S, -NS_PER_S), (0, 0), (NS_PER_S // 50, 0)):
         pose = replace(POSE, captured_ns=5 * NS_PER_S + ahead_ns)
         assert pose.bounded(5 * NS_PER_S).captured_ns == 5 * NS_PER_S + taken

@@ -1,4 +1,4 @@
-"""Who is heard, what is made of it, and how the link stands: on a clock that the tests move."""
+"""Which messages count, how they are converted, and the link's state, on a manual clock."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
 
 
 @AUTOPILOTS
-def test_an_autopilot_is_known_by_its_heartbeat(autopilot: int) -> None:
+def test_an_autopilot_is_recognised_by_its_heartbeat(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot, system=7))
     assert bench.link() is LinkState.CONNECTING
     bench.hear(m.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
@@ -54,10 +54,10 @@ def test_an_autopilot_is_known_by_its_heartbeat(autopilot: int) -> None:
     assert bench.session.description.startswith("ArduCopter" if autopilot == ARDUPILOT else "PX4")
 
 
-def test_messages_are_asked_for_until_they_flow() -> None:
+def test_messages_are_requested_until_they_flow() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.hear(bench.vehicle.heartbeat())
-    for _ in range(400):  # 8 s, in which nothing but heartbeats comes
+    for _ in range(400):  # 8 s with only heartbeats
         bench.clock.advance(0.02)
         bench.hear(bench.vehicle.heartbeat())
         bench.tick()
@@ -66,14 +66,14 @@ def test_messages_are_asked_for_until_they_flow() -> None:
     assert asked.count(m.MAVLINK_MSG_ID_HEARTBEAT) == 1, "that one flows"
 
 
-def test_what_does_not_flow_is_absent_and_what_stops_becomes_so() -> None:
+def test_missing_values_are_absent_and_stopped_ones_become_so() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.hear(bench.vehicle.heartbeat())
     first = bench.newest
     assert (first.roll_rad, first.altitude_m, first.velocity_m_s, first.battery, first.position_m) == (None,) * 5
     bench.found()
     assert None not in (bench.newest.altitude_m, bench.newest.velocity_m_s, bench.newest.battery)
-    for _ in range(80):  # 1.6 s with nothing but the attitude
+    for _ in range(80):  # 1.6 s with only the attitude
         bench.clock.advance(0.02)
         bench.vehicle.boot_ms += 20
         bench.hear(bench.vehicle.telemetry()[-1])
@@ -101,7 +101,7 @@ def test_units_axes_and_signs() -> None:
     assert newest.battery_v == pytest.approx(12.0)
 
 
-def test_another_vehicle_with_the_same_id_is_told_and_left_alone() -> None:
+def test_another_vehicle_with_the_same_id_is_reported_and_ignored() -> None:
     bench = Bench(Vehicle(PX4)).found()
     other = Codec(1, 1)
     bench.hear(m.MAVLink_attitude_message(20_000, 1.0, 0, 0, 0, 0, 0), peer=("127.0.0.1", 14581), codec=other)
@@ -122,14 +122,14 @@ def test_a_vehicle_is_chosen_by_its_system_id_and_by_its_peer() -> None:
         assert bench.session.is_receiving
 
 
-def test_after_a_loss_no_other_system_is_flown_instead() -> None:
+def test_after_a_loss_no_other_system_is_flown() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.go_on(3.0, silent=True)
     assert bench.link() is LinkState.LOST
     bench.hear(bench.vehicle.heartbeat(), codec=Codec(9, 1))
     assert not bench.session.is_receiving
     bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 20_000))
-    assert bench.session.is_receiving, "the same system, from elsewhere"
+    assert bench.session.is_receiving, "the same system at another address"
 
 
 @pytest.mark.parametrize(("system", "component", "kind", "autopilot"), [(255, 190, 6, 8), (1, 100, 30, 8)])
@@ -140,7 +140,7 @@ def test_ground_stations_and_cameras_are_no_vehicles(system: int, component: int
     assert bench.texts == []
 
 
-def test_answers_to_other_programs_are_not_ours() -> None:
+def test_answers_to_other_programs_are_ignored() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.hear(m.MAVLink_command_ack_message(400, 0, 0, 0, 245, 190))
     assert bench.session.commands.result(400, 0) is None
@@ -148,8 +148,8 @@ def test_answers_to_other_programs_are_not_ours() -> None:
     assert bench.session.commands.result(400, 0) == 4
 
 
-@pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "autopilot is number 0"), (3, 1, "no multirotor")])
-def test_what_can_not_be_flown_is_seen_and_refused_clearly(autopilot: int, kind: int, why: str) -> None:
+@pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "MAV_AUTOPILOT is 0"), (3, 1, "not a multirotor")])
+def test_an_unsupported_vehicle_is_shown_and_clearly_refused(autopilot: int, kind: int, why: str) -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.vehicle.autopilot, bench.vehicle.kind = autopilot, kind
     heartbeat = m.MAVLink_heartbeat_message(kind, autopilot, 1, 0, 3, 3)
@@ -163,7 +163,7 @@ def test_what_can_not_be_flown_is_seen_and_refused_clearly(autopilot: int, kind:
         bench.apply(Takeoff())
 
 
-def test_an_old_vehicle_is_answered_in_its_version_and_invited_to_the_new_one() -> None:
+def test_an_old_vehicle_is_answered_in_its_version_and_offered_the_new_one() -> None:
     bench = Bench(Vehicle(ARDUPILOT, version=1)).found()
     bench.frames.clear()
     bench.go_on(1.1)
@@ -177,7 +177,7 @@ def test_an_old_vehicle_is_answered_in_its_version_and_invited_to_the_new_one() 
     assert {frame[0] for frame in bench.frames} == {0xFD}
 
 
-def test_signed_messages_without_a_key_are_refused_clearly() -> None:
+def test_signed_messages_without_a_key_are_clearly_refused() -> None:
     bench = Bench(Vehicle(PX4))
     signing = Codec(1, 1, key=bytes(32))
     for _ in range(300):
@@ -189,7 +189,7 @@ def test_signed_messages_without_a_key_are_refused_clearly() -> None:
     assert sum("signing_key" in text for text in bench.texts) == 1
 
 
-def test_silence_is_told_in_steps() -> None:
+def test_silence_is_reported_in_steps() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.go_on(1.3, silent=True)
     assert bench.link() is LinkState.DEGRADED
@@ -202,7 +202,7 @@ def test_silence_is_told_in_steps() -> None:
     assert bench.link() is LinkState.UP
 
 
-def test_a_vehicle_that_was_started_anew_is_set_up_anew() -> None:
+def test_a_rebooted_vehicle_is_set_up_again() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.vehicle.boot_ms = 0
     bench.go_on(0.1)
@@ -213,7 +213,7 @@ def test_a_vehicle_that_was_started_anew_is_set_up_anew() -> None:
     assert bench.link() is LinkState.UP
 
 
-def test_its_clock_is_mapped_on_ours_by_timesync() -> None:
+def test_its_clock_is_mapped_to_ours_by_timesync() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.go_on(1.1)
     question = bench.heard_of("TIMESYNC")[-1]
@@ -224,16 +224,16 @@ def test_its_clock_is_mapped_on_ours_by_timesync() -> None:
     bench.hear(m.MAVLink_timesync_message(theirs_ns, question.ts1))
     assert bench.session.clock.round_trip_s is not None
     boot_ms = bench.vehicle.boot_ms
-    bench.clock.advance(0.1)  # the message is 100 ms late, and tells when it was so
+    bench.clock.advance(0.1)  # the message arrives 100 ms late and says when it was sent
     bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
     assert bench.clock() - bench.newest.captured_ns == pytest.approx(100e6, abs=5e6)
 
 
-def test_its_questions_about_time_are_answered() -> None:
+def test_its_time_requests_are_answered() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.said.clear()
     bench.hear(m.MAVLink_timesync_message(0, 987_654_321))
-    assert bench.session.due_ns <= bench.clock(), "at once: it takes the delay for the way"
+    assert bench.session.due_ns <= bench.clock(), "at once: it takes the delay for travel time"
     bench.tick()
     answers = [each for each in bench.heard_of("TIMESYNC") if each.ts1 == 987_654_321]
     assert answers[0].tc1 == bench.clock()
@@ -251,18 +251,18 @@ def test_texts_and_health_become_events() -> None:
     text = told["Preflight Fail: ekf2 missing data, and more words so that it is long"]
     assert (text.severity, text.data["reason"]) == (Severity.ERROR, "prearm")
     assert told["the vehicle can't be armed now"].severity is Severity.WARNING
-    assert "the vehicle is ready to be armed" in told
+    assert "the vehicle is ready to arm" in told
     assert "the vehicle knows where it is" in told
 
 
-def test_an_autopilot_of_another_component_is_named_and_can_be_chosen() -> None:
+def test_an_autopilot_with_another_component_is_named_and_can_be_chosen() -> None:
     vehicle = Vehicle(ARDUPILOT)
     vehicle.codec = Codec(1, 42)
     bench = Bench(vehicle)
     for _ in range(3):
         bench.hear(vehicle.heartbeat())
     assert [event.text for event in bench.sink.events] == [
-        "an autopilot answers as component 42 of system 1, not as component 1: it is ignored; ?component=42 chooses it"
+        "an autopilot answers as component 42 of system 1, not as component 1: ignored; ?component=42 chooses it"
     ]
     given = Bench(vehicle, options("mavlink://udpin:127.0.0.1:14540?parameters=no&component=42")).found()
     assert given.sink.link_state is LinkState.UP
@@ -270,12 +270,12 @@ def test_an_autopilot_of_another_component_is_named_and_can_be_chosen() -> None:
     assert {each.target_component for each in given.heard_of("COMMAND_LONG")} == {42}
 
 
-def test_one_that_still_wakes_up_says_so_once() -> None:
-    """A real ArduCopter can't be armed for 42 s after its start: there were two events a second."""
+def test_a_booting_vehicle_reports_that_once() -> None:
+    """A real ArduCopter can't be armed for 42 s after its start, which caused two events a second."""
     vehicle = Vehicle(ARDUPILOT)
     vehicle.ready = False
     bench = Bench(vehicle).found()
-    assert bench.sink.links[-1] == (LinkState.UP, "still waking up: its own checks before arming do not pass yet")
+    assert bench.sink.links[-1] == (LinkState.UP, "still waking up: its pre-arm checks do not pass yet")
     links, events = len(bench.sink.links), len(bench.sink.events)
     for _ in range(10):
         bench.go_on(0.5)
@@ -287,21 +287,21 @@ def test_one_that_still_wakes_up_says_so_once() -> None:
     vehicle.ready = True
     bench.go_on(0.1)
     assert bench.sink.links[-1] == (LinkState.UP, "")
-    vehicle.ready = False  # it was awake: this is something else
+    vehicle.ready = False  # it was ready before: this has another cause
     bench.go_on(0.5)
     bench.hear(*chunks_of("PreArm: Compass not healthy", 2, 0), *chunks_of("PreArm: Compass not healthy", 2, 0))
     assert bench.sink.links[-1] == (LinkState.UP, "")
     assert [event.text for event in bench.sink.events].count("PreArm: Compass not healthy") == 2
 
 
-def test_one_that_was_started_long_ago_and_can_not_be_armed_does_not_wake_up() -> None:
+def test_a_vehicle_started_long_ago_that_can_not_be_armed_is_not_booting() -> None:
     vehicle = Vehicle(ARDUPILOT)
     vehicle.ready, vehicle.boot_ms = False, 3_600_000
     bench = Bench(vehicle).found()
     assert bench.sink.links[-1] == (LinkState.UP, "")
 
 
-def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
+def test_a_plane_is_shown_and_its_whole_recording_is_read() -> None:
     data, at, frames = recorded("mavlink/arduplane-flight.tlog").read_bytes(), 0, 0
     session, sink = MavlinkSession(options(), 0), RecordingSink()
     while at + 9 < len(data) and at + data[at + 9] + 16 <= len(data):
@@ -320,7 +320,7 @@ def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
 
 
 class _Timeless(RecordingSink):
-    """Of a recording, whose clock is not ours."""
+    """For a recording, whose clock is not ours."""
 
     def __init__(self, sink: RecordingSink) -> None:
         self.__dict__ = sink.__dict__
@@ -344,7 +344,7 @@ KINDS = (
 def test_hostile_messages_never_raise_and_feedback_stays_plausible(
     hostile: list[tuple[str, bytes]], autopilot: int
 ) -> None:
-    """Well-formed frames with any bits in their fields, of the vehicle that is flown."""
+    """Well-formed frames with arbitrary bits in their fields, from the vehicle that is flown."""
     given_ = options("mavlink://udpin:127.0.0.1:14540")
     bench = Bench(Vehicle(autopilot), given_).found()
     for kind, noise in hostile:
@@ -384,8 +384,8 @@ def test_noise_never_raises(datagrams: list[bytes]) -> None:
     assert bench.link() is LinkState.UP
 
 
-def test_a_px4_is_ready_by_what_it_really_sends() -> None:
-    """It tells the outcome of its checks for the mode that it is in, and never that there are any."""
+def test_a_px4_is_ready_by_the_reports_that_it_really_sends() -> None:
+    """It reports the outcome of its checks for its current mode, and never that the checks exist."""
     bench = Bench(Vehicle(PX4)).found()
     vehicle = bench.vehicle
 
@@ -395,15 +395,15 @@ def test_a_px4_is_ready_by_what_it_really_sends() -> None:
 
     assert ready() is True
     vehicle.ready = False
-    assert ready() is False, "in the mode that a take-off begins in, it means what it says"
-    for mode in ("OFFBOARD", "AUTO.LAND", "AUTO.RTL", "POSCTL"):  # what flights leave behind
+    assert ready() is False, "in a take-off's first mode the report counts"
+    for mode in ("OFFBOARD", "AUTO.LAND", "AUTO.RTL", "POSCTL"):  # modes that flights leave behind
         vehicle.mode = mode
-        assert ready() is True, f"{mode} says nothing of the mode that a take-off begins in"
+        assert ready() is True, f"{mode} says nothing about a take-off's first mode"
     vehicle.flags = 0x07
     assert ready() is False, "it does not know where it is"
 
 
-def test_a_px4_at_rest_is_not_lost_and_one_in_the_air_is() -> None:
+def test_a_px4_at_rest_is_not_lost_and_a_flying_one_is() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.vehicle.flags = 0x9F
     bench.go_on(2.0)
@@ -413,8 +413,8 @@ def test_a_px4_at_rest_is_not_lost_and_one_in_the_air_is() -> None:
     assert "the vehicle does not know where it is" in bench.texts
 
 
-def test_a_px4_that_lifts_off_is_not_lost_by_what_it_told_at_rest() -> None:
-    """A real one reports its estimator once a second: the newest report is from before, up to 0.33 s were seen."""
+def test_a_px4_that_lifts_off_is_not_lost_by_its_report_at_rest() -> None:
+    """A real one reports its estimator once a second: the newest may be 0.33 s from before the lift-off."""
     bench = Bench(Vehicle(PX4)).found()
     bench.vehicle.flags = 0x9F
     bench.go_on(2.0)
@@ -425,14 +425,14 @@ def test_a_px4_that_lifts_off_is_not_lost_by_what_it_told_at_rest() -> None:
     assert "the vehicle does not know where it is" not in bench.texts
 
 
-def test_an_arducopter_that_assumes_its_place_is_lost_at_rest_too() -> None:
+def test_an_arducopter_that_assumes_its_position_is_lost_at_rest_too() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.vehicle.flags = 0x9F
     bench.go_on(2.0)
     assert "the vehicle does not know where it is" in bench.texts
 
 
-def test_the_limits_in_force_are_told_at_the_start() -> None:
+def test_the_limits_in_force_are_reported_at_the_start() -> None:
     bench = Bench(Vehicle(PX4), options("mavlink://udpin:127.0.0.1:14540?parameters=no&speed=4&altitude=12")).found()
     assert any(text.startswith("limits: 4 m/s, 1 m/s up and down, 12 m high") for text in bench.texts)
 
@@ -448,12 +448,12 @@ def on_earth(bench: Bench, latitude_e7: int, longitude_e7: int, up_m: float) -> 
 
 
 @AUTOPILOTS
-def test_where_its_axes_begin_on_the_earth_is_known_with_a_fix(autopilot: int) -> None:
+def test_the_origin_of_its_axes_is_known_with_a_fix(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot))
     bench.found()
     metres_per_e7 = 0.011131884502145034 if autopilot == ARDUPILOT else math.radians(1e-7) * 6_371_000.0
     boot_ms = bench.vehicle.boot_ms
-    # It flies north at 10 m/s, and reported the one place 0.1 s before the other.
+    # It flies north at 10 m/s, and reported one position 0.1 s before the other.
     local = m.MAVLink_local_position_ned_message(boot_ms - 100, 99.0, 50.0, -20.0, 10.0, 0.0, 0.0)
     north_e7, east_e7 = round(100.0 / metres_per_e7), round(50.0 / metres_per_e7)
 
@@ -462,7 +462,7 @@ def test_where_its_axes_begin_on_the_earth_is_known_with_a_fix(autopilot: int) -
         bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
 
     told(2)
-    assert bench.newest.origin is None, "an origin that was given to it may be anywhere"
+    assert bench.newest.origin is None, "an origin without a fix may be anywhere"
     told(3)
     origin = bench.newest.origin
     assert origin is not None
@@ -472,14 +472,14 @@ def test_where_its_axes_begin_on_the_earth_is_known_with_a_fix(autopilot: int) -
 
 
 @AUTOPILOTS
-def test_positions_are_counted_from_the_worlds_origin(autopilot: int) -> None:
+def test_positions_are_relative_to_the_worlds_origin(autopilot: int) -> None:
     world = options("mavlink://udpin:127.0.0.1:14540?parameters=no&world_origin=0,0,480")
     bench = Bench(Vehicle(autopilot), world)
     bench.hear(bench.vehicle.heartbeat())
     bench.tick()
     assert m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN in [each.param1 for each in bench.heard_of("COMMAND_LONG")]
     bench.flying("GUIDED" if autopilot == ARDUPILOT else "OFFBOARD")
-    assert bench.newest.position_m is None, "where the autopilot's own axes begin is not known yet"
+    assert bench.newest.position_m is None, "the autopilot's own origin is not known yet"
     bench.hear(m.MAVLink_gps_global_origin_message(898, -180, 488_000))  # 10 m north, 2 m west, 8 m up
     bench.go_on(0.1)
     assert bench.newest.position_m == pytest.approx((-2.0, 10.0, 11.0), abs=0.02)
@@ -489,10 +489,10 @@ def test_positions_are_counted_from_the_worlds_origin(autopilot: int) -> None:
     assert (sent.x, sent.y, sent.z) == pytest.approx((0.0, 1.0, -3.0), abs=0.02), "in the autopilot's own axes"
     bench.go_on(3.0, silent=True)
     bench.go_on(0.5)
-    assert bench.newest.position_m is None, "it was lost and found: it may have begun anew"
+    assert bench.newest.position_m is None, "it may have rebooted while the link was lost"
 
 
-def test_poses_from_outside_are_told_in_the_autopilots_axes() -> None:
+def test_external_poses_are_sent_in_the_autopilots_axes() -> None:
     bench = Bench(Vehicle(PX4), options("mavlink://udpin:127.0.0.1:14540?parameters=no&world_origin=0,0,480")).found()
     pose = ExternalPose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), bench.clock())
     bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
@@ -505,8 +505,8 @@ def test_poses_from_outside_are_told_in_the_autopilots_axes() -> None:
     assert (told.x, told.y, told.z) == pytest.approx((2.0 - 10.0, 1.0, -3.0), abs=0.02)
 
 
-def test_no_pose_from_outside_goes_where_it_might_be_read_late_nor_one_that_is_old() -> None:
-    """An autopilot that dates it by its arrival takes it for a jump: poses went on for 2.5 s of silence."""
+def test_neither_poses_that_may_be_read_late_nor_old_ones_are_sent() -> None:
+    """An autopilot that dates a pose by its arrival takes it for a jump. Poses used to be sent for 2.5 s of silence."""
     bench = Bench(Vehicle(PX4)).found()
 
     def problem(age_s: float = 0.0) -> str:
@@ -515,16 +515,16 @@ def test_no_pose_from_outside_goes_where_it_might_be_read_late_nor_one_that_is_o
     assert (problem(), problem(0.4)) == ("", "")
     assert problem(0.6) == "an external pose is 0.6 s old, at most 0.5 s"
     bench.go_on(0.6, silent=True)
-    assert "nothing is heard from the vehicle just now" in problem()
+    assert "the vehicle is silent just now" in problem()
     bench.go_on(3.0, silent=True)
     assert "no data from the vehicle" in problem()
     bench.go_on(1.0)
     assert problem() == ""
-    bench.session._heard_by_it = False
-    assert problem() != "", "nothing shows yet that it reads what is sent"
+    bench.session._receives_us = False
+    assert problem() != "", "nothing shows yet that it receives us"
 
 
-def test_places_of_different_times_are_not_taken_together() -> None:
+def test_positions_of_different_times_are_not_paired() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.found()
     before = bench.newest.origin
@@ -533,10 +533,10 @@ def test_places_of_different_times_are_not_taken_together() -> None:
     bench.hear(m.MAVLink_attitude_message(bench.vehicle.boot_ms, 0, 0, 0, 0, 0, 0))
     origin = bench.newest.origin
     assert before is None
-    assert origin is None or origin.latitude_deg < 1e-3, "only what came together before"
+    assert origin is None or origin.latitude_deg < 1e-3, "only an earlier pair"
 
 
-def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
+def test_a_vehicle_is_polled_as_often_as_its_activity_needs() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
 
     def next_ns() -> int:
@@ -549,20 +549,20 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
     bench.session.parameters.complete = True
     bench.flying("GUIDED")
     bench.session.command(Velocity(0.5), bench.clock())
-    assert bench.session.due_ns == bench.clock(), "a command goes at once"
+    assert bench.session.due_ns == bench.clock(), "a command is sent at once"
     assert next_ns() == 2 * TICK_NS, "and is repeated 25 times a second"
     bench.clock.advance(0.01)
-    assert next_ns() == 2 * TICK_NS - 10_000_000, "also where it is polled in between"
+    assert next_ns() == 2 * TICK_NS - 10_000_000, "also when polled earlier"
     bench.session.command(Hover(), bench.clock())
     bench.tick()
     due_ns = bench.session.due_ns
     bench.session.command(Idle(), bench.clock())
     bench.session.command(Hover(), bench.clock())
-    assert bench.session.due_ns == due_ns, "what is under way already is not hurried"
+    assert bench.session.due_ns == due_ns, "a running action is not hurried"
     bench.session.command(Land(), bench.clock())
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.goal is Goal.LAND
-    assert bench.session.due_ns <= bench.clock(), "it begins at once"
+    assert bench.session.due_ns <= bench.clock(), "it starts at once"
     assert next_ns() == STEP_NS, "and is followed step by step"
     bench.session.command(EmergencyStop(), bench.clock())
     assert bench.session.due_ns <= bench.clock()
@@ -570,7 +570,7 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
 
 
 @AUTOPILOTS
-def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot: int) -> None:
+def test_a_resting_vehicle_is_missed_in_time_and_its_mode_seen_at_once(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     heard_ns = bench.clock()
     for wanted, after_ns in ((LinkState.DEGRADED, DEGRADED_NS), (LinkState.LOST, LOST_NS)):
@@ -581,7 +581,7 @@ def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot
     bench.found()
     bench.tick()
     bench.hear(bench.vehicle.heartbeat())
-    assert bench.session.due_ns > bench.clock(), "one that says nothing new"
+    assert bench.session.due_ns > bench.clock(), "no news"
     bench.vehicle.armed = True
     for message in (bench.vehicle.heartbeat(), m.MAVLink_current_mode_message(0, 1, 1)):
         bench.clock.advance(0.001)
@@ -590,7 +590,7 @@ def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot
         assert bench.session.due_ns <= bench.clock()
 
 
-# What takes the place of a vehicle, and what only looks like it ------------------------------------------------------
+# Replaced vehicles, and apparent ones --------------------------------------------------------------------------------
 
 
 def parameter(name: str, value: float, index: int = 0, count: int = 1) -> Message:
@@ -603,7 +603,7 @@ def version_of(serial: int) -> Message:
 
 
 def known(bench: Bench, serial: int = 0) -> Bench:
-    """A vehicle whose parameters were read, and that said who it is, if it has a serial number."""
+    """Read a vehicle's parameters and version, with a serial number if it has one."""
     bench.found()
     bench.hear(parameter("MPC_THR_HOVER", 0.7))
     if serial:
@@ -621,8 +621,8 @@ WITH_PARAMETERS = "mavlink://udpin:127.0.0.1:14540"
 
 
 @pytest.mark.parametrize("silent_s", [10.0, 0.0])
-def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_modes(silent_s: float) -> None:
-    """A PX4, then an ArduCopter on the same port, where PX4's numbers of modes are GUIDED and RTL."""
+def test_another_autopilot_with_the_same_id_is_never_flown_with_the_first_ones_modes(silent_s: float) -> None:
+    """A PX4, then an ArduCopter on the same port, where PX4's mode numbers mean GUIDED and RTL."""
     bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
     bench.go_on(silent_s, silent=True)
     bench.vehicle = Vehicle(ARDUPILOT)
@@ -631,7 +631,7 @@ def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_mod
     bench.go_on(1.0)
     assert "ArduCopter" in bench.session.description
     assert (bench.newest.native or {})["mavlink.mode"] == "LOITER"
-    assert not bench.session.parameters.values, "those of the other one are gone"
+    assert not bench.session.parameters.values, "the other vehicle's are gone"
     assert any("another vehicle" in text for text in bench.texts)
     bench.apply(Hover())
     bench.go_on(2.0)
@@ -641,22 +641,22 @@ def test_another_autopilot_with_the_same_id_is_never_flown_by_the_first_ones_mod
     assert modes_set(bench) == {COPTER_NUMBERS["LAND"]}
 
 
-def test_what_can_not_be_flown_is_not_flown_in_the_place_of_another() -> None:
+def test_an_unsupported_vehicle_in_the_place_of_another_is_not_flown() -> None:
     bench = known(Bench(Vehicle(ARDUPILOT), options(WITH_PARAMETERS)))
     bench.go_on(3.0, silent=True)
     bench.vehicle.kind = 1  # a plane
     bench.found()
-    with pytest.raises(DriverError, match="no multirotor"):
+    with pytest.raises(DriverError, match="not a multirotor"):
         bench.apply(Hover())
 
 
-def test_another_airframe_of_the_same_kind_is_read_anew() -> None:
-    """By its serial number; what was learnt of the first one is dropped."""
+def test_another_airframe_of_the_same_kind_is_read_again() -> None:
+    """Recognised by its serial number; everything known of the first one is dropped."""
     bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
     bench.go_on(3.0, silent=True)
     bench.vehicle = Vehicle(PX4)
     bench.found()
-    assert bench.link() is LinkState.DEGRADED, "which one it is is not known yet"
+    assert bench.link() is LinkState.DEGRADED, "its identity is not known yet"
     bench.hear(version_of(8))
     bench.go_on(0.1)
     assert not bench.session.parameters.values
@@ -679,7 +679,7 @@ def test_the_same_vehicle_is_up_again_without_reading_its_parameters() -> None:
 
 
 @pytest.mark.parametrize("serial", [0, 7])
-def test_a_vehicle_that_does_not_say_which_it_is_is_read_anew(serial: int) -> None:
+def test_a_vehicle_without_an_identity_is_read_again(serial: int) -> None:
     bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=serial)
     bench.go_on(3.0, silent=True)
     bench.hear(bench.vehicle.heartbeat())
@@ -691,8 +691,8 @@ def test_a_vehicle_that_does_not_say_which_it_is_is_read_anew(serial: int) -> No
     assert bench.link() is LinkState.UP
 
 
-def test_a_message_that_arrives_late_is_no_reboot() -> None:
-    """One attitude is 1.5 s late: nothing is lost, no set-point is missing, and it is not taken for the newest."""
+def test_a_late_message_is_no_reboot() -> None:
+    """One attitude is 1.5 s late: no loss, no missing set-point, and it does not count as the newest."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(1.0)
@@ -711,8 +711,8 @@ def test_a_message_that_arrives_late_is_no_reboot() -> None:
     assert all(each.vx == pytest.approx(0.5) for each in sent)
 
 
-def test_a_serial_number_that_one_version_of_the_protocol_lacks_is_no_other_vehicle() -> None:
-    """MAVLink 1 cuts the longer one off: the shorter one tells then, or nothing does."""
+def test_a_serial_number_missing_in_one_protocol_version_is_no_other_vehicle() -> None:
+    """MAVLink 1 truncates the longer one: then the shorter one decides, or none."""
     none = [0] * 8
 
     def said(serial: int, longer: int) -> Message:
@@ -729,8 +729,8 @@ def test_a_serial_number_that_one_version_of_the_protocol_lacks_is_no_other_vehi
         assert len(bench.heard_of("PARAM_REQUEST_LIST")) == reads, (before, after)
 
 
-def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> None:
-    """What was sent found no room: its heartbeats alone don't show that commands get through again."""
+def test_a_vehicle_that_stopped_reading_is_not_up_before_it_answers() -> None:
+    """Our packets found no room: its heartbeats alone don't show that commands get through again."""
     bench = Bench(Vehicle(PX4)).found()
     bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
     bench.go_on(1.0)
@@ -741,8 +741,8 @@ def test_a_vehicle_that_no_longer_reads_is_not_up_before_it_has_answered() -> No
     assert bench.link() is LinkState.UP
 
 
-def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answered() -> None:
-    """Nothing shows that the port, opened again, carries anything: what waits there would be followed late."""
+def test_a_vehicle_that_stopped_reading_gets_no_set_points_before_it_answers() -> None:
+    """Nothing shows that the reopened port works: waiting set-points would be followed late."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
@@ -754,7 +754,7 @@ def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answere
     assert not bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
     bench.apply(Land())
     bench.go_on(0.1)
-    assert (m.MAV_CMD_DO_SET_MODE, 1, 9, 0, 0) in bench.commands(), "what is repeated is sent all the same"
+    assert (m.MAV_CMD_DO_SET_MODE, 1, 9, 0, 0) in bench.commands(), "repeated commands are still sent"
     bench.answer(m.MAV_CMD_DO_SET_MODE)
     bench.apply(Hover())
     bench.go_on(0.1)
@@ -762,8 +762,8 @@ def test_a_vehicle_that_no_longer_reads_gets_no_set_points_before_it_has_answere
 
 
 @pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "tcp:127.0.0.1:5760"])
-def test_a_vehicle_that_stands_still_is_left_with_few_set_points(way: str) -> None:
-    """Sockets took all that were sent in 2.5 s, and it followed them one after the other when it went on."""
+def test_a_paused_vehicle_is_left_with_few_set_points(way: str) -> None:
+    """Sockets accepted all set-points of 2.5 s, and the vehicle followed them one by one when it resumed."""
     bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(1.0)
@@ -771,7 +771,7 @@ def test_a_vehicle_that_stands_still_is_left_with_few_set_points(way: str) -> No
     for _ in range(20):
         bench.apply(Velocity(forward=0.5))
         bench.go_on(0.1, silent=True)
-    assert len(bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")) <= 26, "of half a second"
+    assert len(bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")) <= 26, "half a second's worth"
     bench.go_on(0.1)
     bench.apply(Hover())
     bench.go_on(0.2)
@@ -779,8 +779,8 @@ def test_a_vehicle_that_stands_still_is_left_with_few_set_points(way: str) -> No
 
 
 @pytest.mark.parametrize("stop", [Hover(), Velocity()])
-def test_a_hover_is_sent_to_what_falls_silent(stop: AnyAction) -> None:
-    """With the other set-points it was held back: what only could not be heard flew on for seconds."""
+def test_a_hover_is_sent_to_a_silent_vehicle(stop: AnyAction) -> None:
+    """It was held back with the other set-points: a vehicle that was only inaudible flew on for seconds."""
     bench = Bench(Vehicle(ARDUPILOT), options("mavlink://udpin:127.0.0.1:14540?parameters=no")).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(1.0)
@@ -795,8 +795,8 @@ def test_a_hover_is_sent_to_what_falls_silent(stop: AnyAction) -> None:
 
 
 @pytest.mark.parametrize("wanted", [Velocity(forward=-0.5), Velocity(left=0.3)])
-def test_what_falls_silent_is_stopped_where_another_velocity_is_wanted(wanted: Velocity) -> None:
-    """It flew on for up to 3 s the way that its pilot had turned away from, if it only could not be heard."""
+def test_a_silent_vehicle_is_stopped_instead_of_redirected(wanted: Velocity) -> None:
+    """If it was only inaudible, it flew on for up to 3 s in a direction that its pilot had left."""
     bench = Bench(Vehicle(ARDUPILOT), options("mavlink://udpin:127.0.0.1:14540?parameters=no")).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(1.0)
@@ -812,7 +812,7 @@ def test_what_falls_silent_is_stopped_where_another_velocity_is_wanted(wanted: V
 
 
 def test_a_vehicle_whose_only_answer_was_lost_is_asked_again() -> None:
-    """It told its version, so nothing more was asked, and no set-point was ever sent again."""
+    """It had reported its version, so nothing more was requested, and no set-point was ever sent again."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.session.broken(ConnectionError("the vehicle no longer reads what we send"), bench.clock())
@@ -834,7 +834,7 @@ def asked_for_its_version(bench: Bench) -> int:
     return told.count((m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION))
 
 
-def test_an_emergency_stop_goes_before_all_else() -> None:
+def test_an_emergency_stop_precedes_everything() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.session.command(EmergencyStop(), bench.clock())
@@ -842,8 +842,8 @@ def test_an_emergency_stop_goes_before_all_else() -> None:
     assert rank_of(m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, *[0.0] * 7)) is Rank.COMMAND
 
 
-def test_what_can_not_be_encoded_keeps_no_stop_back() -> None:
-    """One pose with a number too large for its field, and nothing that was due with it was sent."""
+def test_a_message_that_can_not_be_encoded_holds_no_stop_back() -> None:
+    """After one pose with a number too large for its field, nothing that was due with it was sent."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     pose = ExternalPose((1e39, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), bench.clock())
     bench.session.command(EmergencyStop(), bench.clock())
@@ -852,10 +852,10 @@ def test_what_can_not_be_encoded_keeps_no_stop_back() -> None:
     assert [each.param2 for each in bench.heard_of("COMMAND_LONG")] == [21196.0]
     bench.session.send(pose_message(pose, PoseMessage.ODOMETRY))
     bench.tick()
-    assert sum("ODOMETRY is not sent" in text for text in bench.texts) == 1, "told once"
+    assert sum("ODOMETRY was not sent" in text for text in bench.texts) == 1, "reported once"
 
 
-def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_take_off_is_decided_by_a_single_state_of_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
     bench, read = Bench(Vehicle(ARDUPILOT)).found(), list[int]()
     state = MavlinkSession.vehicle_state
 
@@ -868,13 +868,13 @@ def test_a_take_off_is_decided_by_one_state_of_the_vehicle(monkeypatch: pytest.M
     assert len(read) == 1
 
 
-# Nothing comes, and what is sent may arrive --------------------------------------------------------------------------
+# Nothing is received, but packets may arrive -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "udpout:10.0.0.5:14550", "tcp:127.0.0.1:5760"])
 @pytest.mark.parametrize(("action", "mode"), [(Hover(), "BRAKE"), (Land(), "LAND")])
-def test_what_is_asked_of_a_vehicle_that_is_not_heard_is_sent(way: str, action: AnyAction, mode: str) -> None:
-    """It may still hear us: a dead receiver, a full downlink."""
+def test_actions_are_sent_to_a_vehicle_that_is_not_received(way: str, action: AnyAction, mode: str) -> None:
+    """It may still receive us: the cause may be a dead receiver or a full downlink."""
     bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(3.0, silent=True)
@@ -884,13 +884,13 @@ def test_what_is_asked_of_a_vehicle_that_is_not_heard_is_sent(way: str, action: 
     bench.apply(action)
     bench.go_on(10.0, silent=True)
     asked = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_DO_SET_MODE]
-    assert 4 <= len(asked) <= 8, "for some seconds, and not for ever: others may take it over meanwhile"
+    assert 4 <= len(asked) <= 8, "for some seconds only: others may take it over meanwhile"
     assert {each.param2 for each in asked} == {COPTER_NUMBERS[mode]}
     assert bench.peers == {PEER}
 
 
 @pytest.mark.parametrize("way", ["udpin:127.0.0.1:14540", "udpout:10.0.0.5:14550", "tcp:127.0.0.1:5760"])
-def test_an_emergency_stop_is_sent_to_a_vehicle_that_is_not_heard(way: str) -> None:
+def test_an_emergency_stop_is_sent_to_a_vehicle_that_is_not_received(way: str) -> None:
     bench = Bench(Vehicle(ARDUPILOT), options(f"mavlink://{way}?parameters=no")).flying("GUIDED")
     bench.go_on(3.0, silent=True)
     assert bench.link() is LinkState.LOST
@@ -903,8 +903,8 @@ def test_an_emergency_stop_is_sent_to_a_vehicle_that_is_not_heard(way: str) -> N
     assert bench.peers == {PEER}
 
 
-def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_from_acting() -> None:
-    """A failsafe's hover and landing aren't sent blindly, as a safety pilot may have it: its own failsafe is left."""
+def test_a_vehicle_that_is_not_received_gets_few_heartbeats_so_that_its_failsafe_acts() -> None:
+    """A failsafe's hover and landing aren't sent blindly, as a safety pilot may have it: its own failsafe must act."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(3.0, silent=True)
@@ -914,14 +914,14 @@ def test_a_vehicle_that_is_not_heard_gets_no_heartbeats_that_keep_its_failsafe_f
     bench.go_on(5.0, silent=True)
     bench.apply(Land(), alone=True)
     bench.go_on(5.0, silent=True)
-    assert not bench.said, "10 s without a word"
+    assert not bench.said, "10 s of silence"
     bench.go_on(20.0, silent=True)
-    assert 1 <= len(bench.heard_of("HEARTBEAT")) <= 2, "now and then one, for a vehicle that has lost our address"
+    assert 1 <= len(bench.heard_of("HEARTBEAT")) <= 2, "a few, for a vehicle that has lost our address"
     bench.go_on(1.2)
     assert bench.heard_of("HEARTBEAT")
 
 
-def test_a_landing_of_a_vehicle_that_is_not_heard_is_not_kept_for_ever() -> None:
+def test_a_landing_of_a_vehicle_that_is_not_received_expires() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.go_on(3.0, silent=True)
     bench.apply(Land(), alone=True)
@@ -933,8 +933,8 @@ def test_a_landing_of_a_vehicle_that_is_not_heard_is_not_kept_for_ever() -> None
     assert not modes_set(bench), "it may be another flight"
 
 
-def test_an_emergency_stop_outlives_what_is_known_of_the_vehicle() -> None:
-    """It was pressed while nothing was heard, and dropped when another serial number answered."""
+def test_an_emergency_stop_outlives_the_vehicles_state() -> None:
+    """It was pressed during silence, and dropped when another serial number answered."""
     bench = known(Bench(Vehicle(PX4), options(WITH_PARAMETERS)), serial=7)
     bench.flying("OFFBOARD")
     bench.go_on(3.0, silent=True)
@@ -955,8 +955,8 @@ def cuts(bench: Bench) -> int:
     return [each[:3] for each in bench.commands()].count((m.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196.0))
 
 
-def test_an_emergency_stop_of_a_vehicle_that_was_never_heard_is_sent_and_kept_until_it_is_found() -> None:
-    """As when its proxy was restarted in flight."""
+def test_an_emergency_stop_of_an_unknown_vehicle_is_sent_and_kept_until_it_is_found() -> None:
+    """As after a restart of its proxy in flight."""
     bench = Bench(Vehicle(ARDUPILOT, system=7), options("mavlink://udpout:10.0.0.5:14550?parameters=no&sysid=7"))
     assert bench.apply(EmergencyStop()) == EmergencyStop()
     bench.go_on(1.0, silent=True)
@@ -970,7 +970,7 @@ def test_an_emergency_stop_of_a_vehicle_that_was_never_heard_is_sent_and_kept_un
     assert bench.state() is FlightState.EMERGENCY
 
 
-def test_an_emergency_stop_of_a_vehicle_that_is_found_much_later_is_given_up() -> None:
+def test_an_emergency_stop_of_a_vehicle_found_much_later_expires() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.apply(EmergencyStop())
     bench.go_on(11.0, silent=True)
@@ -981,7 +981,7 @@ def test_an_emergency_stop_of_a_vehicle_that_is_found_much_later_is_given_up() -
     assert "stop_given_up" in [event.data.get("reason") for event in bench.sink.events]
 
 
-def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> None:
+def test_a_silent_vehicle_on_the_ground_is_called_each_second() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.go_on(3.0, silent=True)
     bench.said.clear()
@@ -989,15 +989,15 @@ def test_a_vehicle_on_the_ground_that_is_not_heard_is_called_each_second() -> No
     assert len(bench.heard_of("HEARTBEAT")) >= 4
 
 
-# Several of one thing, and the same from somewhere else --------------------------------------------------------------
+# Several of one thing, and one thing from elsewhere ------------------------------------------------------------------
 
 
 def battery(number: int, percent: int, function: int = 0) -> Message:
     return m.MAVLink_battery_status_message(number, function, 1, 0, [65535] * 10, -1, -1, -1, percent)
 
 
-def test_of_two_batteries_the_first_counts() -> None:
-    """The second may be for a gimbal, or nearly empty: its charge is not that of the flight."""
+def test_the_first_of_two_batteries_counts() -> None:
+    """The second may power a gimbal or be nearly empty: its charge is not the flight's."""
     bench = Bench(Vehicle(ARDUPILOT))
     bench.hear(bench.vehicle.heartbeat())
     told = set()
@@ -1007,18 +1007,18 @@ def test_of_two_batteries_the_first_counts() -> None:
         if step % 20 < 4:
             bench.hear(battery(0, 80))
         told.add(bench.newest.battery)
-    assert told == {0.8, None}, "not known, rather than that of the other, while the first is silent"
+    assert told == {0.8, None}, "unknown while the first is silent, not the other's"
 
 
-def test_the_charge_is_not_that_of_a_payload() -> None:
+def test_a_payloads_battery_does_not_count() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.hear(bench.vehicle.heartbeat(), battery(0, 5, function=4), battery(1, 80), bench.vehicle.heartbeat())
     assert bench.newest.battery == 0.8
 
 
 @pytest.mark.parametrize("facings", [(25, 0), (0, 25), (25, 25)])
-def test_of_two_range_finders_the_one_that_looks_down_counts(facings: tuple[int, int]) -> None:
-    """2.0 m below, and 5.0 m to a wall, or by a second one that looks down as well."""
+def test_the_downward_range_finder_counts(facings: tuple[int, int]) -> None:
+    """2.0 m to the ground, and 5.0 m to a wall or by a second downward sensor."""
     bench = Bench(Vehicle(ARDUPILOT)).found()
     below = facings.index(25)
     told = set()
@@ -1032,8 +1032,8 @@ def test_of_two_range_finders_the_one_that_looks_down_counts(facings: tuple[int,
     assert told - {0.0} == {2.0}
 
 
-def test_a_vehicle_that_goes_on_from_another_port_is_received_again_at_once() -> None:
-    """Its host, or an address translation, gave it a new one in flight."""
+def test_a_vehicle_that_continues_from_another_port_is_received_at_once() -> None:
+    """Its host, or an address translation, gave it a new port in flight."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
     bench.go_on(1.0)
@@ -1058,8 +1058,8 @@ def test_a_vehicle_that_goes_on_from_another_port_is_received_again_at_once() ->
 
 
 @pytest.mark.parametrize("other", [("127.0.0.1", 33_333), ("10.0.0.7", 14_580)])
-def test_a_second_vehicle_with_the_same_id_never_steps_in(other: tuple[str, int]) -> None:
-    """Received beside the first one, or from another host: it is another vehicle, and not the first one's new port."""
+def test_a_second_vehicle_with_the_same_id_never_takes_over(other: tuple[str, int]) -> None:
+    """Received beside the first one, or from another host: that is another vehicle, not the first one's new port."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.hear(bench.vehicle.heartbeat(), peer=other)
     bench.go_on(0.1)
@@ -1070,8 +1070,8 @@ def test_a_second_vehicle_with_the_same_id_never_steps_in(other: tuple[str, int]
         assert bench.session.identity is None or bench.session.identity.peer == PEER
 
 
-def test_a_request_that_was_lost_is_repeated_while_the_message_flows_too_slowly() -> None:
-    """PX4 sends positions once a second unasked: that is not the rate that was asked for."""
+def test_a_lost_request_is_repeated_while_the_message_is_too_slow() -> None:
+    """Unasked, PX4 sends positions once a second, which is not the requested rate."""
     bench = Bench(Vehicle(PX4))
     bench.hear(bench.vehicle.heartbeat())
     asked: list[float] = []
@@ -1087,5 +1087,5 @@ def test_a_request_that_was_lost_is_repeated_while_the_message_flows_too_slowly(
         for each in bench.heard_of("COMMAND_LONG"):
             if each.command == m.MAV_CMD_SET_MESSAGE_INTERVAL and each.param1 == m.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
                 asked.append(step * 0.02)
-    assert len(asked) == 3, "until it flows as asked for"
+    assert len(asked) == 3, "until it flows as requested"
     assert asked[2] < 8.0

@@ -1,4 +1,4 @@
-"""What the vehicle is told, for what is decided and heard: on a clock that the tests move."""
+"""Messages to the vehicle for decisions and reports, on a manual clock."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SET_POINT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
 def steering(autopilot: int, action: Velocity | Attitude | Position = Velocity(forward=1.0)) -> Bench:  # noqa: B008  immutable
-    """Flying by set-points."""
+    """Return a bench flown by set-points."""
     bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
     bench.apply(action)
     bench.go_on(1.2)
@@ -49,7 +49,7 @@ def steering(autopilot: int, action: Velocity | Attitude | Position = Velocity(f
 # Taking off ------------------------------------------------------------------------------------------------------
 
 
-def test_arducopter_is_guided_armed_and_told_a_relative_altitude() -> None:
+def test_arducopter_is_guided_armed_and_gets_a_relative_altitude() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     vehicle = bench.vehicle
     bench.apply(Takeoff())
@@ -59,7 +59,7 @@ def test_arducopter_is_guided_armed_and_told_a_relative_altitude() -> None:
     bench.tick()
     assert bench.commands() == [(ARM, 1.0, 0.0, 0.0, 0.0)]
     bench.answer(ARM)
-    bench.tick()  # the heartbeat says it a second later
+    bench.tick()  # the heartbeat reports it a second later
     assert bench.commands() == [(TAKEOFF, 0.0, 0.0, 0.0, 1.5)]
     assert bench.session.setpoints is not None
     bench.answer(TAKEOFF)
@@ -76,10 +76,10 @@ def test_arducopter_is_guided_armed_and_told_a_relative_altitude() -> None:
     assert bench.heard_of(SET_POINT)
 
 
-def test_px4_holds_is_armed_and_told_an_altitude_above_sea_level() -> None:
+def test_px4_holds_is_armed_and_gets_an_altitude_above_sea_level() -> None:
     bench = Bench(Vehicle(PX4)).found()
     vehicle = bench.vehicle
-    vehicle.mode = "OFFBOARD"  # left from a flight before: it can't be armed in it
+    vehicle.mode = "OFFBOARD"  # left over from an earlier flight: it can't be armed in this mode
     bench.hear(vehicle.heartbeat())
     bench.apply(Takeoff())
     assert bench.commands() == [HOLD[PX4][1]]
@@ -102,14 +102,14 @@ def test_px4_holds_is_armed_and_told_an_altitude_above_sea_level() -> None:
     bench.hear(vehicle.heartbeat())
     bench.commands()
     bench.go_on(0.1)
-    assert bench.commands() == [(MODE, 1.0, 6.0, 0.0, 0.0)], "set-points flowed meanwhile: it enters at once"
+    assert bench.commands() == [(MODE, 1.0, 6.0, 0.0, 0.0)], "set-points are flowing already: it enters at once"
     vehicle.mode = "OFFBOARD"
     bench.go_on(0.1)
     assert bench.state() is FlightState.HOVERING
 
 
-def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here() -> None:
-    """A real one does at 0.7 of 1.5 m (NAV_MC_ALT_RAD). It was left to others, and so by the failsafes."""
+def test_a_px4_whose_take_off_ends_below_its_height_is_still_flown_from_here() -> None:
+    """A real one ends at 0.7 of 1.5 m (NAV_MC_ALT_RAD). It was left to others, and so to the failsafes."""
     bench = about_to_rise(PX4)
     vehicle = bench.vehicle
     vehicle.status, vehicle.mode, vehicle.landed, vehicle.place = 4, "AUTO.TAKEOFF", Landed.IN_AIR, (0.0, 0.0, -0.6)
@@ -119,11 +119,11 @@ def test_a_px4_that_ends_its_take_off_below_its_height_is_still_flown_from_here(
     vehicle.mode = "OFFBOARD"
     bench.go_on(0.3)
     assert bench.state() is FlightState.HOVERING
-    assert [text for text in bench.texts if "not from here" in text] == []
+    assert [text for text in bench.texts if "not chosen here" in text] == []
 
 
 def just_landed(autopilot: int) -> Bench:
-    """It stands after a landing of ours, and is still armed."""
+    """Return a bench on the ground after our landing, still armed."""
     bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
     vehicle = bench.vehicle
     bench.apply(Hover())
@@ -135,14 +135,14 @@ def just_landed(autopilot: int) -> Bench:
 
 
 @AUTOPILOTS
-def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(autopilot: int) -> None:
-    """It was told "disarmed itself" 2.5 s later: what was heard before a request proves nothing about it."""
+def test_a_take_off_right_after_a_landing_arms_again_after_that_landing_disarms(autopilot: int) -> None:
+    """It was reported as "disarmed itself" 2.5 s later: messages before a request prove nothing about it."""
     bench = just_landed(autopilot)
     vehicle = bench.vehicle
     assert bench.state() is FlightState.LANDED
     bench.apply(Takeoff())
     bench.go_on(0.3)
-    assert bench.state() is FlightState.LANDED, "it is armed from the flight before"
+    assert bench.state() is FlightState.LANDED, "it is armed from the previous flight"
     bench.commands()
     vehicle.armed, vehicle.mode = False, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
     bench.go_on(0.3)
@@ -153,12 +153,12 @@ def test_a_take_off_right_after_a_landing_arms_again_when_that_landing_disarms(a
 
 
 @AUTOPILOTS
-def test_the_answer_to_disarming_after_a_landing_is_not_taken_for_one_to_arming(autopilot: int) -> None:
-    """Both commands have one number. A real PX4 was never told to arm, and "disarmed itself" 2.5 s later."""
+def test_the_answer_to_disarming_after_a_landing_does_not_count_for_arming(autopilot: int) -> None:
+    """Both commands have one number. A real PX4 was never armed, and reported as "disarmed itself" 2.5 s later."""
     bench = just_landed(autopilot)
     vehicle = bench.vehicle
     bench.apply(Takeoff())
-    bench.answer(ARM)  # to the command to disarm, on its way since before
+    bench.answer(ARM)  # to the earlier disarm command, delayed
     bench.go_on(0.2)
     vehicle.armed = False
     bench.go_on(0.2)
@@ -169,7 +169,7 @@ def test_the_answer_to_disarming_after_a_landing_is_not_taken_for_one_to_arming(
 
 @AUTOPILOTS
 def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again(autopilot: int) -> None:
-    """The landing before it is over by then: it was another's switch, and somebody may walk up to it."""
+    """The previous landing is over by then: another operator's switch did it, and a person may walk up to it."""
     bench = just_landed(autopilot)
     vehicle = bench.vehicle
     bench.apply(Takeoff())
@@ -187,8 +187,8 @@ def test_a_vehicle_killed_in_a_take_off_right_after_a_landing_is_not_armed_again
 
 
 @AUTOPILOTS
-def test_a_vehicle_that_others_armed_and_disarm_again_is_not_armed_from_here(autopilot: int) -> None:
-    """A pilot's switch, in a take-off that has not left the ground."""
+def test_a_vehicle_armed_and_disarmed_by_others_is_not_armed_from_here(autopilot: int) -> None:
+    """By a pilot's switch, during a take-off that has not left the ground."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.armed, vehicle.mode = True, {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -203,7 +203,7 @@ def test_a_vehicle_that_others_armed_and_disarm_again_is_not_armed_from_here(aut
 
 
 def about_to_rise(autopilot: int) -> Bench:
-    """Armed for a take-off, and on the ground still."""
+    """Return a bench armed for a take-off, still on the ground."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -218,7 +218,7 @@ def about_to_rise(autopilot: int) -> Bench:
 
 
 @AUTOPILOTS
-def test_a_hover_ends_the_climb_of_a_take_off(autopilot: int) -> None:
+def test_a_hover_ends_a_take_offs_climb(autopilot: int) -> None:
     """A cancelled takeoff() left it climbing to the end."""
     bench = climbing(autopilot)
     bench.apply(Hover())
@@ -229,7 +229,7 @@ def test_a_hover_ends_the_climb_of_a_take_off(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_a_hover_before_it_left_the_ground_disarms_it_and_a_failsafe_lets_it_take_off(autopilot: int) -> None:
+def test_a_hover_before_lift_off_disarms_it_and_a_failsafes_lets_it_take_off(autopilot: int) -> None:
     bench = about_to_rise(autopilot)
     bench.apply(Hover(), alone=True)
     bench.go_on(0.3)
@@ -240,7 +240,7 @@ def test_a_hover_before_it_left_the_ground_disarms_it_and_a_failsafe_lets_it_tak
 
 
 @AUTOPILOTS
-def test_a_refusal_is_told_with_the_vehicles_words_and_tried_again(autopilot: int) -> None:
+def test_a_refusal_is_reported_in_the_vehicles_words_and_retried(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
     bench.hear(bench.vehicle.heartbeat())
@@ -257,8 +257,8 @@ def test_a_refusal_is_told_with_the_vehicles_words_and_tried_again(autopilot: in
 
 
 @AUTOPILOTS
-def test_a_take_off_that_nobody_asks_for_any_more_is_given_up(autopilot: int) -> None:
-    """The pilot may be gone: a vehicle that gets ready later must not start then."""
+def test_a_take_off_that_is_no_longer_requested_is_given_up(autopilot: int) -> None:
+    """The pilot may be gone: a vehicle that becomes ready later must not start."""
     bench = Bench(Vehicle(autopilot)).found()
     bench.apply(Takeoff())
     bench.go_on(7.0)
@@ -269,7 +269,7 @@ def test_a_take_off_that_nobody_asks_for_any_more_is_given_up(autopilot: int) ->
 
 
 @AUTOPILOTS
-def test_landing_ends_a_take_off_on_the_ground_by_disarming(autopilot: int) -> None:
+def test_a_landing_ends_a_take_off_on_the_ground_by_disarming(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     bench.apply(Takeoff())
     bench.vehicle.armed = True
@@ -285,12 +285,12 @@ def test_landing_ends_a_take_off_on_the_ground_by_disarming(autopilot: int) -> N
     assert bench.commands() == []
 
 
-def test_a_cancelled_climb_goes_on_by_a_place() -> None:
+def test_a_cancelled_climb_continues_by_a_position() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     vehicle = bench.vehicle
     bench.apply(Takeoff())
     vehicle.armed, vehicle.mode, vehicle.status, vehicle.landed = True, "GUIDED", 4, Landed.IN_AIR
-    vehicle.place = (0.0, 0.0, -0.7)  # somebody's set-point stopped it here
+    vehicle.place = (0.0, 0.0, -0.7)  # another operator's set-point stopped it here
     bench.go_on(5.0)
     assert bench.heard_of(SET_POINT) == []
     bench.go_on(3.0)
@@ -298,7 +298,7 @@ def test_a_cancelled_climb_goes_on_by_a_place() -> None:
     assert (said.coordinate_frame, said.type_mask, said.z) == (1, 0xDF8, pytest.approx(-1.5, abs=0.01))
 
 
-def test_who_takes_it_over_on_the_way_up_keeps_it() -> None:
+def test_an_operator_who_takes_over_during_the_climb_keeps_it() -> None:
     bench = Bench(Vehicle(PX4)).found()
     vehicle = bench.vehicle
     bench.apply(Takeoff())
@@ -307,13 +307,13 @@ def test_who_takes_it_over_on_the_way_up_keeps_it() -> None:
     bench.go_on(1.0)
     vehicle.mode = "POSCTL"
     bench.go_on(1.0)
-    assert any("went to POSCTL" in text for text in bench.texts)
+    assert any("changed to POSCTL" in text for text in bench.texts)
     bench.said.clear()
     bench.go_on(1.0)
     assert (bench.commands(), bench.heard_of(SET_POINT)) == ([], [])
 
 
-def test_a_climb_that_ends_a_little_low_ends_all_the_same() -> None:
+def test_a_climb_that_ends_a_little_low_still_ends() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     vehicle = bench.vehicle
     bench.apply(Takeoff())
@@ -325,7 +325,7 @@ def test_a_climb_that_ends_a_little_low_ends_all_the_same() -> None:
     assert bench.state() is FlightState.HOVERING
 
 
-def test_it_does_not_take_off_unheard() -> None:
+def test_it_does_not_take_off_while_silent() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     with pytest.raises(DriverError, match="no data from"):
         bench.apply(Takeoff())
@@ -335,7 +335,7 @@ def test_it_does_not_take_off_unheard() -> None:
 
 
 @AUTOPILOTS
-def test_velocity_is_streamed_in_the_bodys_frame(autopilot: int) -> None:
+def test_velocity_is_streamed_in_body_axes(autopilot: int) -> None:
     bench = steering(autopilot, Velocity(forward=1.0, left=0.5, up=0.2, yaw_rate=0.3))
     bench.go_on(1.0)
     said = bench.heard_of(SET_POINT)
@@ -347,14 +347,14 @@ def test_velocity_is_streamed_in_the_bodys_frame(autopilot: int) -> None:
     assert bench.state() is FlightState.FLYING
 
 
-def test_a_new_velocity_goes_out_at_once() -> None:
+def test_a_new_velocity_is_sent_at_once() -> None:
     bench = steering(ARDUPILOT)
     bench.clock.advance(0.01)
     bench.apply(Velocity(forward=0.4))
     assert [each.vx for each in bench.heard_of(SET_POINT)] == [pytest.approx(0.4)]
 
 
-def test_px4_gets_set_points_for_a_second_before_it_is_to_follow_them() -> None:
+def test_px4_gets_set_points_for_a_second_before_it_follows_them() -> None:
     bench = Bench(Vehicle(PX4)).flying("AUTO.LOITER")
     bench.apply(Velocity(forward=1.0))
     bench.go_on(0.9)
@@ -367,7 +367,7 @@ def test_px4_gets_set_points_for_a_second_before_it_is_to_follow_them() -> None:
 
 
 @AUTOPILOTS
-def test_on_the_ground_nothing_comes_of_set_points(autopilot: int) -> None:
+def test_set_points_have_no_effect_on_the_ground(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     assert bench.apply(Velocity(up=1.0)) == Idle()
     assert bench.apply(Hover()) == Hover()
@@ -387,7 +387,7 @@ def test_arducopters_thrust_is_a_climb_rate(climb: float, thrust: float) -> None
     assert (roll, pitch) == pytest.approx((0.1, -0.2), abs=1e-5)
 
 
-def test_what_arducopter_can_not_climb_is_not_said_to_be_applied() -> None:
+def test_a_climb_beyond_arducopters_limit_is_not_reported_as_applied() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     applied = bench.apply(Attitude(climb=9.0))
     assert isinstance(applied, Attitude)
@@ -409,14 +409,14 @@ def test_px4s_thrust_is_a_force_that_holds_the_climb_rate() -> None:
     assert bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust < later
 
 
-def test_a_leaning_px4_pushes_harder() -> None:
+def test_a_leaning_px4_gets_more_thrust() -> None:
     bench = steering(PX4, Attitude(pitch=0.5))
     bench.go_on(0.1)
     assert bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust == pytest.approx(0.5 / math.cos(0.5), abs=0.01)
 
 
 @AUTOPILOTS
-def test_a_yaw_rate_beside_an_attitude_turns_the_heading_that_is_asked_for(autopilot: int) -> None:
+def test_a_yaw_rate_beside_an_attitude_turns_the_requested_heading(autopilot: int) -> None:
     bench = steering(autopilot, Attitude(yaw_rate=0.5))
     bench.go_on(3.0)
     _, _, yaw = angles_of(from_wire(bench.heard_of("SET_ATTITUDE_TARGET")[-1].q))
@@ -427,7 +427,7 @@ def test_a_yaw_rate_beside_an_attitude_turns_the_heading_that_is_asked_for(autop
 
 
 @AUTOPILOTS
-def test_hovering_stops_and_then_holds_the_place(autopilot: int) -> None:
+def test_hovering_stops_then_holds_the_position(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.vehicle.velocity = (1.0, 0.0, 0.0)
     bench.go_on(0.1)
@@ -442,7 +442,7 @@ def test_hovering_stops_and_then_holds_the_place(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_with_nobody_at_the_controls_it_holds_by_its_own_mode_and_the_stream_ends(autopilot: int) -> None:
+def test_without_a_pilot_it_holds_in_its_own_mode_and_the_stream_ends(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.apply(Hover(), alone=True)
     mode, order = HOLD[autopilot]
@@ -459,7 +459,7 @@ def test_with_nobody_at_the_controls_it_holds_by_its_own_mode_and_the_stream_end
 
 
 @AUTOPILOTS
-def test_landing_is_confirmed_by_the_mode_and_not_by_the_acknowledgement(autopilot: int) -> None:
+def test_a_landing_is_confirmed_by_the_mode_not_the_acknowledgement(autopilot: int) -> None:
     bench = steering(autopilot)
     mode, order = LAND[autopilot]
     bench.apply(Land(), alone=True)
@@ -476,11 +476,11 @@ def test_landing_is_confirmed_by_the_mode_and_not_by_the_acknowledgement(autopil
     assert bench.state() is FlightState.LANDED
 
 
-# Others at the controls --------------------------------------------------------------------------------------------
+# Other operators ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("autopilot", "mode"), [(ARDUPILOT, "LOITER"), (PX4, "POSCTL")])
-def test_somebody_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str) -> None:
+def test_an_operator_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str) -> None:
     bench = steering(autopilot)
     bench.vehicle.mode = mode
     bench.go_on(1.0)
@@ -495,13 +495,13 @@ def test_somebody_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str)
     assert bench.state() is FlightState.FLYING
     bench.apply(Hover())
     bench.go_on(1.2)
-    assert bench.commands(), "a fresh decision takes it back"
+    assert bench.commands(), "a new decision takes it back"
 
 
 @AUTOPILOTS
 @pytest.mark.parametrize("alone", [False, True])
-def test_who_holds_a_vehicle_that_lands_keeps_it_there(autopilot: int, alone: bool) -> None:
-    """Somebody stands below, and another station stops it; each repeat of the landing took it back."""
+def test_an_operator_who_holds_a_landing_vehicle_keeps_it(autopilot: int, alone: bool) -> None:
+    """A person stands below, and another station stops it. Each repeat of the landing took it back."""
     bench = steering(autopilot)
     bench.apply(Land())
     bench.vehicle.mode = LAND[autopilot][0]
@@ -518,12 +518,12 @@ def test_who_holds_a_vehicle_that_lands_keeps_it_there(autopilot: int, alone: bo
     bench.go_on(0.6)
     bench.apply(Land())
     bench.go_on(0.1)
-    assert bench.commands() == [LAND[autopilot][1]], "a fresh decision takes it back"
+    assert bench.commands() == [LAND[autopilot][1]], "a new decision takes it back"
 
 
 @AUTOPILOTS
-def test_a_landing_of_ours_is_asked_for_again_where_the_vehicle_is_found_holding(autopilot: int) -> None:
-    """What it does by itself while it hears nothing is nobody's decision."""
+def test_our_landing_is_requested_again_if_the_vehicle_is_found_holding(autopilot: int) -> None:
+    """Its own actions during a silence are no pilot's decision."""
     bench = steering(autopilot)
     bench.apply(Land())
     bench.vehicle.mode = LAND[autopilot][0]
@@ -536,8 +536,8 @@ def test_a_landing_of_ours_is_asked_for_again_where_the_vehicle_is_found_holding
 
 
 @AUTOPILOTS
-def test_an_order_of_our_own_that_comes_late_is_nobody_elses(autopilot: int) -> None:
-    """A pilot is back while the failsafe's mode is still on its way: it is asked for the mode that follows again."""
+def test_a_late_mode_of_our_own_is_no_other_operators(autopilot: int) -> None:
+    """A pilot is back while the failsafe's mode is still on its way: the guided mode is requested again."""
     bench = steering(autopilot)
     bench.apply(Hover(), alone=True)
     bench.apply(Velocity(forward=0.5))
@@ -553,7 +553,7 @@ def test_an_order_of_our_own_that_comes_late_is_nobody_elses(autopilot: int) -> 
     bench.apply(Velocity(forward=0.5))
 
 
-def test_who_only_repeats_a_hover_does_not_take_the_vehicle_back() -> None:
+def test_repeated_hovers_do_not_take_the_vehicle_back() -> None:
     bench = steering(PX4)
     for _ in range(50):
         bench.apply(Hover())
@@ -575,13 +575,13 @@ def test_a_failsafe_that_leaves_a_px4_to_absent_sticks_ends_in_hold() -> None:
     bench.vehicle.mode, bench.vehicle.status = "POSCTL", 5
     bench.go_on(1.0)
     assert HOLD[PX4][1] in bench.commands(), "without a remote control it would sink"
-    assert bench.heard_of(SET_POINT)[-1].vx == 1.0, "from before it was seen"
+    assert bench.heard_of(SET_POINT)[-1].vx == 1.0, "sent before it was seen"
     bench.go_on(1.0)
     assert bench.heard_of(SET_POINT) == []
 
 
 @AUTOPILOTS
-def test_when_a_lost_link_returns_nothing_old_is_flown(autopilot: int) -> None:
+def test_a_restored_link_flies_nothing_old(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.go_on(3.0, silent=True)
     bench.said.clear()
@@ -592,8 +592,8 @@ def test_when_a_lost_link_returns_nothing_old_is_flown(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_who_is_found_again_in_the_air_does_not_stand_before_it_says_so(autopilot: int) -> None:
-    """Heartbeat and attitude come first: neither tells of the ground, and a hold given up here would be missed."""
+def test_a_vehicle_found_again_in_the_air_is_not_landed_before_it_reports_that(autopilot: int) -> None:
+    """Heartbeat and attitude arrive first, without the landed state; a hold given up here would be missed."""
     bench = steering(autopilot)
     bench.go_on(4.0, silent=True)
     bench.said.clear()
@@ -611,8 +611,8 @@ def test_who_is_found_again_in_the_air_does_not_stand_before_it_says_so(autopilo
 
 
 @AUTOPILOTS
-def test_who_is_found_again_low_above_the_ground_has_not_landed_before_it_says_so(autopilot: int) -> None:
-    """A real PX4's position came before its landed state: ``land()`` returned 3.6 s before it stood."""
+def test_a_vehicle_found_again_low_above_the_ground_has_not_landed_before_it_reports_that(autopilot: int) -> None:
+    """A real PX4's position arrived before its landed state: ``land()`` returned 3.6 s too early."""
     bench = steering(autopilot)
     bench.apply(Land())
     bench.vehicle.mode = LAND[autopilot][0]
@@ -634,7 +634,7 @@ def test_who_is_found_again_low_above_the_ground_has_not_landed_before_it_says_s
 
 
 @AUTOPILOTS
-def test_an_armed_one_that_tells_nothing_of_the_ground(autopilot: int) -> None:
+def test_an_armed_vehicle_that_reports_no_landed_state(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot))
     bench.vehicle.armed = True
     bench.hear(bench.vehicle.heartbeat())
@@ -647,14 +647,14 @@ def test_an_armed_one_that_tells_nothing_of_the_ground(autopilot: int) -> None:
     bench.apply(Land())
     bench.hear(bench.vehicle.heartbeat())
     bench.tick()
-    assert LAND[autopilot][1] in bench.commands(), "whoever lands it does not disarm what may fly"
+    assert LAND[autopilot][1] in bench.commands(), "a landing does not disarm a vehicle that may fly"
 
 
 @AUTOPILOTS
 @pytest.mark.parametrize("mode", ["sticks", "RTL", "LAND"])
 @pytest.mark.parametrize("action", [Hover(), Land()])
-def test_what_somebody_else_flies_is_neither_held_nor_landed(autopilot: int, mode: str, action: Hover | Land) -> None:
-    """The proxy's ladder asks for it, as for a vehicle that is found in the air."""
+def test_a_vehicle_flown_by_others_is_neither_held_nor_landed(autopilot: int, mode: str, action: Hover | Land) -> None:
+    """The proxy's ladder requests both, as for a vehicle found in the air."""
     bench = Bench(Vehicle(autopilot)).flying(other_mode(autopilot, mode))
     for _ in range(10):
         assert bench.apply(action, alone=True) == Idle()
@@ -663,13 +663,13 @@ def test_what_somebody_else_flies_is_neither_held_nor_landed(autopilot: int, mod
     assert bench.heard_of(SET_POINT) == []
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.ownership.others == other_mode(autopilot, mode)
-    assert [text for text in bench.texts if "not from here" in text] != []
+    assert [text for text in bench.texts if "not chosen here" in text] != []
 
 
 @AUTOPILOTS
 @pytest.mark.parametrize("mode", ["sticks", "RTL", "LAND"])
-def test_a_mode_that_somebody_chooses_while_the_vehicle_holds_its_place_is_left(autopilot: int, mode: str) -> None:
-    """The ladder held it, and nobody streams: the other one's choice is seen all the same."""
+def test_a_mode_chosen_by_others_while_the_vehicle_holds_is_kept(autopilot: int, mode: str) -> None:
+    """The ladder held it, without a stream: the other operator's choice must still be seen."""
     bench = steering(autopilot)
     bench.apply(Hover(), alone=True)
     bench.vehicle.mode = HOLD[autopilot][0]
@@ -681,11 +681,11 @@ def test_a_mode_that_somebody_chooses_while_the_vehicle_holds_its_place_is_left(
     assert bench.apply(Land(), alone=True) == Idle()
     bench.go_on(1.0)
     assert bench.commands() == []
-    assert any("not from here" in text for text in bench.texts)
+    assert any("not chosen here" in text for text in bench.texts)
 
 
 @AUTOPILOTS
-def test_a_mode_that_somebody_chose_while_the_link_was_lost_is_left(autopilot: int) -> None:
+def test_a_mode_chosen_by_others_while_the_link_was_lost_is_kept(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.go_on(4.0, silent=True)
     bench.apply(Hover(), alone=True)
@@ -700,7 +700,7 @@ def test_a_mode_that_somebody_chose_while_the_link_was_lost_is_left(autopilot: i
 
 @AUTOPILOTS
 @pytest.mark.parametrize("action", [Takeoff(), Hover(), Land()])
-def test_a_repeat_never_takes_the_vehicle_back_and_a_new_order_does(
+def test_a_repeat_never_takes_the_vehicle_back_but_a_new_action_does(
     autopilot: int, action: Takeoff | Hover | Land
 ) -> None:
     bench = steering(autopilot)
@@ -720,12 +720,12 @@ def test_a_repeat_never_takes_the_vehicle_back_and_a_new_order_does(
 
 
 @AUTOPILOTS
-def test_another_stations_landing_during_a_take_off_stays(autopilot: int) -> None:
+def test_another_stations_landing_during_a_take_off_is_kept(autopilot: int) -> None:
     bench = climbing(autopilot)
     bench.vehicle.mode = other_mode(autopilot, "LAND")
     bench.go_on(1.0)
     bench.commands()
-    for hover in (Takeoff(), Hover()):  # a take-off of what flies is a hover to the proxy
+    for hover in (Takeoff(), Hover()):  # for the proxy, a take-off in flight is a hover
         for _ in range(10):
             with pytest.raises(DriverError, match="which was not chosen here"):
                 bench.apply(hover, new=False)
@@ -736,8 +736,8 @@ def test_another_stations_landing_during_a_take_off_stays(autopilot: int) -> Non
 
 @AUTOPILOTS
 @pytest.mark.parametrize("reached", [True, False])
-def test_who_lands_it_as_a_take_off_ends_keeps_it(autopilot: int, reached: bool) -> None:
-    """It stood in the mode of the landing before, and was taken from the other station within 0.3 s."""
+def test_an_operator_who_lands_it_as_a_take_off_ends_keeps_it(autopilot: int, reached: bool) -> None:
+    """It was in the previous landing's mode, and taken from the other station within 0.3 s."""
     bench = climbing(autopilot, stands_in=LAND[autopilot][0])
     vehicle = bench.vehicle
     if reached:
@@ -753,8 +753,8 @@ def test_who_lands_it_as_a_take_off_ends_keeps_it(autopilot: int, reached: bool)
     assert bench.session.setpoints.ownership.others == LAND[autopilot][0]
 
 
-def test_who_stops_a_px4_on_its_way_up_keeps_it() -> None:
-    """By the mode for holding the place, which a take-off ends in as well, at its height."""
+def test_an_operator_who_stops_a_px4s_climb_keeps_it() -> None:
+    """By the mode for position hold, in which a take-off also ends, at its height."""
     bench = climbing(PX4)
     bench.vehicle.mode = "AUTO.LOITER"
     bench.go_on(1.2)
@@ -764,7 +764,7 @@ def test_who_stops_a_px4_on_its_way_up_keeps_it() -> None:
 
 
 @AUTOPILOTS
-def test_a_mode_that_somebody_chooses_before_it_leaves_the_ground_stays(autopilot: int) -> None:
+def test_a_mode_chosen_by_others_before_lift_off_is_kept(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -778,10 +778,10 @@ def test_a_mode_that_somebody_chooses_before_it_leaves_the_ground_stays(autopilo
     bench.commands()
     bench.go_on(4.0)
     assert bench.commands() == []
-    assert any("not from here" in text for text in bench.texts)
+    assert any("not chosen here" in text for text in bench.texts)
 
 
-def test_what_others_armed_is_not_disarmed_when_a_take_off_is_given_up() -> None:
+def test_a_vehicle_armed_by_others_is_not_disarmed_after_a_failed_take_off() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.vehicle.armed, bench.vehicle.mode = True, "GUIDED"
     bench.found()
@@ -791,7 +791,7 @@ def test_what_others_armed_is_not_disarmed_when_a_take_off_is_given_up() -> None
     assert (ARM, 0.0, 0.0, 0.0, 0.0) not in bench.commands()
 
 
-def test_a_failsafe_that_hands_a_px4_to_somebody_who_has_a_remote_control_is_left() -> None:
+def test_a_failsafe_that_hands_a_px4_to_a_remote_control_is_accepted() -> None:
     bench = steering(PX4)
     bench.vehicle.remote = True
     bench.go_on(0.2)
@@ -802,7 +802,7 @@ def test_a_failsafe_that_hands_a_px4_to_somebody_who_has_a_remote_control_is_lef
 
 
 def climbing(autopilot: int, stands_in: str = "") -> Bench:
-    """Taking off to 1.5 m, and 0.4 m high. ``stands_in``: its mode when the take-off was asked for."""
+    """Return a bench taking off to 1.5 m, 0.4 m high. ``stands_in``: its mode when the take-off was requested."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     arming = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -837,7 +837,7 @@ def test_an_emergency_stop_disarms_by_force_until_it_shows(autopilot: int) -> No
     bench.apply(EmergencyStop())
     bench.go_on(0.5)
     assert set(bench.commands()) == {(ARM, 0.0, FORCE, 0.0, 0.0)}
-    assert bench.state() is FlightState.HOVERING, "what still flies is told as flying"
+    assert bench.state() is FlightState.HOVERING, "it is reported as flying while it flies"
     with pytest.raises(DriverError, match="still armed"):
         bench.apply(ResetEmergency())
     bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
@@ -855,14 +855,14 @@ def test_an_emergency_stop_disarms_by_force_until_it_shows(autopilot: int) -> No
 
 
 @AUTOPILOTS
-def test_a_stop_that_did_not_succeed_can_be_pressed_again_and_given_up(autopilot: int) -> None:
-    """The autopilot refuses, or the link was lost meanwhile: the vehicle is armed long after the first press."""
+def test_a_failed_stop_can_be_pressed_again_and_expires(autopilot: int) -> None:
+    """The autopilot refuses, or the link was lost: the vehicle is armed long after the first press."""
     bench = steering(autopilot)
     bench.apply(EmergencyStop())
     bench.go_on(11.0)
     bench.said.clear()
     bench.go_on(1.0)
-    assert bench.commands() == [], "what was pressed long ago is not done any more"
+    assert bench.commands() == [], "an old press has expired"
     bench.apply(EmergencyStop())
     bench.go_on(0.5)
     assert set(bench.commands()) == {(ARM, 0.0, FORCE, 0.0, 0.0)}
@@ -877,15 +877,15 @@ def test_a_stop_that_did_not_succeed_can_be_pressed_again_and_given_up(autopilot
 
 
 @AUTOPILOTS
-def test_a_stop_right_after_arming_goes_out_at_once_and_a_quick_reset_does_not_end_it(autopilot: int) -> None:
-    """The heartbeat that shows the arming comes up to a second later: it is not waited for."""
+def test_a_stop_right_after_arming_is_sent_at_once_and_survives_a_quick_reset(autopilot: int) -> None:
+    """The heartbeat that shows the arming arrives up to a second later: don't wait for it."""
     bench = arming(autopilot)
     bench.vehicle.armed = True
     bench.answer(ARM)
     bench.commands()
     bench.apply(EmergencyStop())
-    assert bench.commands() == [CUT], "though no heartbeat has shown that it is armed"
-    for _ in range(2):  # one that was on its way says that it is not
+    assert bench.commands() == [CUT], "before any heartbeat shows it as armed"
+    for _ in range(2):  # a delayed one says that it is not armed
         bench.clock.advance(0.1)
         bench.hear(stale_heartbeat(bench))
         bench.tick()
@@ -904,8 +904,8 @@ def test_a_stop_right_after_arming_goes_out_at_once_and_a_quick_reset_does_not_e
 
 
 @AUTOPILOTS
-def test_landing_while_arming_is_on_its_way_disarms_what_arms_then(autopilot: int) -> None:
-    """Nothing has acknowledged the arming, and no heartbeat has shown it: it must not stand there armed."""
+def test_a_landing_during_arming_disarms_a_late_arming(autopilot: int) -> None:
+    """Neither an acknowledgement nor a heartbeat has shown the arming: it must not stay armed on the ground."""
     bench = arming(autopilot)
     bench.apply(Land())
     bench.apply(Land())
@@ -924,8 +924,8 @@ def test_landing_while_arming_is_on_its_way_disarms_what_arms_then(autopilot: in
 
 @AUTOPILOTS
 @pytest.mark.parametrize("alone", [False, True])
-def test_a_hover_after_that_landing_leaves_it_to_disarm_what_arms_then(autopilot: int, alone: bool) -> None:
-    """A pilot who hovers and lands at once, or a failsafe after a take-off was withdrawn: nothing disarmed it."""
+def test_a_hover_after_that_landing_still_disarms_a_late_arming(autopilot: int, alone: bool) -> None:
+    """A pilot who hovers and lands at once, or a failsafe after a withdrawn take-off: nothing disarmed it."""
     bench = Bench(Vehicle(autopilot)).found()
     bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
     bench.hear(bench.vehicle.heartbeat())
@@ -945,8 +945,8 @@ def test_a_hover_after_that_landing_leaves_it_to_disarm_what_arms_then(autopilot
 
 
 @AUTOPILOTS
-def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilot: int) -> None:
-    """Its acknowledgement was lost, and a PX4's heartbeat comes once a second."""
+def test_an_arming_that_shows_after_its_take_off_failed_is_undone(autopilot: int) -> None:
+    """Its acknowledgement was lost, and a PX4's heartbeat arrives once a second."""
     bench = arming(autopilot)
     while not any("does not answer" in text for text in bench.texts):
         bench.go_on(0.02)
@@ -963,16 +963,16 @@ def test_an_arming_that_shows_after_its_take_off_was_given_up_is_undone(autopilo
 @AUTOPILOTS
 @pytest.mark.parametrize("held", [False, True])
 @pytest.mark.parametrize("acknowledged", [False, True])
-def test_what_a_take_off_armed_that_a_lost_link_cut_is_disarmed_again(
+def test_a_vehicle_armed_by_a_take_off_that_a_lost_link_cut_off_is_disarmed(
     autopilot: int, acknowledged: bool, held: bool
 ) -> None:
-    """Its propellers turned until it disarmed itself, 10 s later: nobody wanted that take-off any more."""
+    """Its propellers turned until it disarmed itself 10 s later, though the take-off was no longer wanted."""
     bench = arming(autopilot)
     bench.vehicle.armed = True
     if acknowledged:
         bench.answer(ARM)
     bench.go_on(3.0, silent=True)
-    if held:  # as the proxy asks for, not knowing whether it flies
+    if held:  # as the proxy requests, unsure whether it flies
         bench.apply(Hover(), alone=True)
         bench.go_on(0.5, silent=True)
     bench.commands()
@@ -990,8 +990,8 @@ def test_what_a_take_off_armed_that_a_lost_link_cut_is_disarmed_again(
 
 @AUTOPILOTS
 @pytest.mark.parametrize("switched", [True, False])
-def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left(autopilot: int, switched: bool) -> None:
-    """A safety pilot takes over what did not start: it was told to land twice a second, for the whole flight."""
+def test_an_operator_who_flies_it_right_after_a_failed_take_off_keeps_it(autopilot: int, switched: bool) -> None:
+    """A safety pilot took over a vehicle that had not started, and got landings twice a second all flight long."""
     bench = arming(autopilot)
     while not any("does not answer" in text for text in bench.texts):
         bench.go_on(0.02)
@@ -1002,14 +1002,14 @@ def test_who_arms_and_flies_it_right_after_a_take_off_was_given_up_is_left(autop
     if switched:
         vehicle.mode = {ARDUPILOT: "STABILIZE", PX4: "POSCTL"}[autopilot]
     bench.go_on(0.5)
-    assert bool(bench.commands()) is not switched, "only in that mode it may be our own arming that shows"
+    assert bool(bench.commands()) is not switched, "only in that mode may it be our own late arming"
     vehicle.landed, vehicle.place, vehicle.status = Landed.IN_AIR, (0.0, 0.0, -1.0), 4
     bench.go_on(3.0)
     assert bench.commands() == []
 
 
 @AUTOPILOTS
-def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> None:
+def test_a_landing_before_an_arming_that_never_shows_ends_soon(autopilot: int) -> None:
     bench = arming(autopilot)
     bench.apply(Land())
     bench.go_on(3.0)
@@ -1020,13 +1020,13 @@ def test_landing_before_an_arming_that_never_comes_ends_soon(autopilot: int) -> 
 
 
 @AUTOPILOTS
-def test_a_stop_that_the_vehicle_never_shows_is_given_up_and_it_can_be_landed(autopilot: int) -> None:
-    """The link is out when it is pressed, and back after it was given up: it flies, which is told, and lands."""
+def test_a_stop_that_never_shows_expires_and_the_vehicle_can_be_landed(autopilot: int) -> None:
+    """The link is lost when it is pressed, and returns after it expired: it reports flying, and lands."""
     bench = steering(autopilot)
     bench.go_on(3.0, silent=True)
     assert bench.link() is LinkState.LOST
     bench.apply(EmergencyStop())
-    assert bench.commands() == [CUT], "it may hear what is sent, though it is not heard"
+    assert bench.commands() == [CUT], "it may receive us although it is not received"
     bench.go_on(9.0, silent=True)
     assert len(bench.commands()) > 80
     bench.go_on(3.0, silent=True)
@@ -1042,7 +1042,7 @@ def test_a_stop_that_the_vehicle_never_shows_is_given_up_and_it_can_be_landed(au
 
 @AUTOPILOTS
 def test_a_stop_shows_while_it_is_repeated(autopilot: int) -> None:
-    """As the library does, until it shows: the repeats must not put that off."""
+    """The library repeats it until it shows: the repeats must not delay that."""
     bench = steering(autopilot)
     bench.apply(EmergencyStop())
     bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
@@ -1053,7 +1053,7 @@ def test_a_stop_shows_while_it_is_repeated(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_a_stopped_vehicle_that_others_arm_again_is_told_as_it_flies(autopilot: int) -> None:
+def test_a_stopped_vehicle_that_others_arm_again_is_reported_flying(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.apply(EmergencyStop())
     bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
@@ -1068,7 +1068,7 @@ def test_a_stopped_vehicle_that_others_arm_again_is_told_as_it_flies(autopilot: 
 
 
 def arming(autopilot: int) -> Bench:
-    """Asked to arm for a take-off, and nothing came of it yet."""
+    """Return a bench asked to arm for a take-off, without effect so far."""
     bench = Bench(Vehicle(autopilot))
     bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
     bench.found()
@@ -1079,18 +1079,18 @@ def arming(autopilot: int) -> Bench:
 
 
 def stale_heartbeat(bench: Bench) -> Message:
-    """What it sent just before it was armed."""
+    """Return its last heartbeat from before the arming."""
     bench.vehicle.armed = False
     message = bench.vehicle.heartbeat()
     bench.vehicle.armed = True
     return message
 
 
-# Places ----------------------------------------------------------------------------------------------------------
+# Positions -------------------------------------------------------------------------------------------------------
 
 
 def follows(bench: Bench, seconds: float) -> list[Message]:
-    """The vehicle is wherever it was told to be 0.1 s before."""
+    """Make the vehicle be where it was sent 0.1 s before."""
     said: list[Message] = []
     for _ in range(round(seconds / 0.1)):
         bench.go_on(0.1)
@@ -1101,7 +1101,7 @@ def follows(bench: Bench, seconds: float) -> list[Message]:
 
 
 @AUTOPILOTS
-def test_a_place_is_told_in_the_vehicles_axes_step_by_step(autopilot: int) -> None:
+def test_a_position_is_sent_in_the_vehicles_axes_step_by_step(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
     bench.vehicle.place, bench.vehicle.yaw = (1.0, 2.0, -3.0), 0.0
     bench.go_on(0.1)
@@ -1111,14 +1111,14 @@ def test_a_place_is_told_in_the_vehicles_axes_step_by_step(autopilot: int) -> No
     assert bench.state() is FlightState.FLYING
     assert {(each.coordinate_frame, each.type_mask) for each in said} == {(1, 0x9F8)}
     first, last = said[0], said[-1]
-    assert (first.x, first.y, first.z) == pytest.approx((1.0, 2.0, -3.0), abs=0.05), "it begins where the vehicle is"
+    assert (first.x, first.y, first.z) == pytest.approx((1.0, 2.0, -3.0), abs=0.05), "it starts at the vehicle"
     assert (last.x, last.y, last.z) == pytest.approx((4.0, 2.0, -3.5), abs=1e-3), "north, east, down"
     assert last.yaw == pytest.approx(0.6, abs=1e-3), "clockwise from north"
     steps = [math.dist((a.x, a.y, a.z), (b.x, b.y, b.z)) for a, b in pairwise(said)]
-    assert max(steps) <= 0.8 * 0.05, "no faster than it was asked to, at 25 Hz"
+    assert max(steps) <= 0.8 * 0.05, "no faster than requested, at 25 Hz"
     assert max(abs(b.yaw - a.yaw) for a, b in pairwise(said)) <= 0.5 * 0.05
     assert steps[-1] < 1e-3
-    assert max(steps[:3]) < max(steps), "it begins slowly"
+    assert max(steps[:3]) < max(steps), "it starts slowly"
 
 
 @AUTOPILOTS
@@ -1134,15 +1134,15 @@ def test_without_a_yaw_the_heading_is_kept(autopilot: int) -> None:
     assert {round(each.yaw, 2) for each in follows(bench, 1.0)} == {0.0}
 
 
-def test_what_it_is_told_waits_for_a_vehicle_that_does_not_follow() -> None:
+def test_the_sent_position_waits_for_a_vehicle_that_does_not_follow() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Position(0.0, 50.0, 3.0, speed=2.0))
     bench.go_on(10.0)
     said = bench.heard_of(SET_POINT)
-    assert max(each.x for each in said) == pytest.approx(3.0, abs=0.01), "1.5 s ahead, however long it stands"
+    assert max(each.x for each in said) == pytest.approx(3.0, abs=0.01), "at most 1.5 s ahead"
 
 
-def test_a_way_begins_only_in_the_mode_that_follows_it() -> None:
+def test_a_path_starts_only_in_the_mode_that_follows_it() -> None:
     bench = Bench(Vehicle(PX4)).flying("AUTO.LOITER")
     bench.apply(Position(0.0, 5.0, 3.0))
     bench.go_on(1.5)
@@ -1153,7 +1153,7 @@ def test_a_way_begins_only_in_the_mode_that_follows_it() -> None:
 
 
 @AUTOPILOTS
-def test_it_stops_where_its_position_is_lost(autopilot: int) -> None:
+def test_it_stops_when_its_position_is_lost(autopilot: int) -> None:
     bench = steering(autopilot, Position(0.0, 5.0, 3.0))
     bench.go_on(0.2)
     bench.said.clear()
@@ -1164,7 +1164,7 @@ def test_it_stops_where_its_position_is_lost(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_on_the_ground_nothing_comes_of_a_place(autopilot: int) -> None:
+def test_a_position_has_no_effect_on_the_ground(autopilot: int) -> None:
     bench = Bench(Vehicle(autopilot)).found()
     assert bench.apply(Position(0.0, 0.0, 2.0)) == Idle()
     bench.go_on(1.5)
@@ -1172,7 +1172,7 @@ def test_on_the_ground_nothing_comes_of_a_place(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_who_takes_it_over_on_the_way_keeps_it(autopilot: int) -> None:
+def test_an_operator_who_takes_it_over_on_the_way_keeps_it(autopilot: int) -> None:
     bench = steering(autopilot, Position(0.0, 5.0, 3.0))
     bench.vehicle.mode = LAND[autopilot][0]
     bench.go_on(1.0)
@@ -1185,7 +1185,7 @@ def test_who_takes_it_over_on_the_way_keeps_it(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_hovering_and_a_failsafe_end_the_way(autopilot: int) -> None:
+def test_a_hover_and_a_failsafe_end_the_flight_to_a_position(autopilot: int) -> None:
     bench = steering(autopilot, Position(0.0, 5.0, 3.0))
     bench.apply(Hover())
     bench.go_on(0.5)
@@ -1200,8 +1200,8 @@ def test_hovering_and_a_failsafe_end_the_way(autopilot: int) -> None:
 
 
 @AUTOPILOTS
-def test_what_is_found_armed_on_the_ground_before_it_says_that_it_has_landed_gets_no_velocity(autopilot: int) -> None:
-    """After a hover a velocity upwards went out, and OFFBOARD was asked for, without a take-off."""
+def test_a_vehicle_found_armed_on_the_ground_gets_no_velocity_before_it_reports_landed(autopilot: int) -> None:
+    """After a hover an upward velocity was sent, and OFFBOARD requested, without a take-off."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -1220,11 +1220,11 @@ def test_what_is_found_armed_on_the_ground_before_it_says_that_it_has_landed_get
                 bench.apply(action)
     told = bench.heard_of("SET_POSITION_TARGET_LOCAL_NED")
     assert all((each.vx, each.vy, each.vz) == (0.0, 0.0, 0.0) for each in told)
-    assert told == [] or autopilot == ARDUPILOT, "which stays on the ground by them"
+    assert told == [] or autopilot == ARDUPILOT, "ArduPilot stays on the ground with these"
 
 
 @AUTOPILOTS
-def test_an_autopilot_that_does_not_know_whether_it_has_landed_is_disarmed_by_its_height(autopilot: int) -> None:
+def test_an_autopilot_that_does_not_report_landed_is_disarmed_by_its_height(autopilot: int) -> None:
     bench = steering(autopilot)
     bench.vehicle.landed = Landed.UNKNOWN
     bench.apply(Land())
@@ -1234,7 +1234,7 @@ def test_an_autopilot_that_does_not_know_whether_it_has_landed_is_disarmed_by_it
 
 
 @AUTOPILOTS
-def test_a_second_take_off_that_is_cut_disarms_what_the_first_one_armed(autopilot: int) -> None:
+def test_a_second_take_off_that_is_cut_off_disarms_after_the_first_ones_arming(autopilot: int) -> None:
     bench = arming(autopilot)
     bench.go_on(3.0, silent=True)
     bench.vehicle.armed = True

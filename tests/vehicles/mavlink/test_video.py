@@ -1,4 +1,4 @@
-"""A camera beside the autopilot: over RTSP, and as a device as far as one can be had without a camera."""
+"""A camera beside the autopilot: over RTSP, and as a device as far as possible without a camera."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def key_picture() -> bytes:
 
 @contextmanager
 def watching(source: str, sink: RecordingSink | None = None) -> Iterator[tuple[MavlinkDriver, RecordingSink]]:
-    """Of a vehicle that nobody hears. Closing neither takes long nor is anything told afterwards."""
+    """Watch a camera of a vehicle that is never received. Closing must be quick, and nothing reported afterwards."""
     sink = sink or RecordingSink()
     nobody = f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}"
     driver = MavlinkDriver(parse_uri(f"{nobody}?camera={source}"))
@@ -53,7 +53,7 @@ def watching(source: str, sink: RecordingSink | None = None) -> Iterator[tuple[M
     assert took_s < CLOSE_S
     assert not sink.problems
     threading.Event().wait(0.05)
-    assert sink.calls == calls, "it told something after it was closed"
+    assert sink.calls == calls, "it reported something after it was closed"
 
 
 def told(sink: RecordingSink) -> list[str]:
@@ -77,7 +77,7 @@ def shows(sink: RecordingSink, count: int) -> None:
 
 
 @pytest.mark.parametrize("way", ["tcp", "udp"])
-def test_pictures_come_in_order_and_with_the_times_at_which_they_were_taken(way: str) -> None:
+def test_images_arrive_in_order_with_their_capture_times(way: str) -> None:
     with (
         RtspServer(key_picture(), ways=(way,)) as server,
         watching(server.address) as (_, sink),
@@ -86,9 +86,9 @@ def test_pictures_come_in_order_and_with_the_times_at_which_they_were_taken(way:
         shows(sink, 40)
     numbers = [number_of(frame.pixels) for frame in sink.frames]
     assert numbers == sorted(set(numbers))
-    assert len(numbers) > 0.8 * (numbers[-1] - numbers[0])  # a busy machine passes some over
+    assert len(numbers) > 0.8 * (numbers[-1] - numbers[0])  # a busy machine skips some
     late_s = [(frame.captured_ns - projector.taken_ns[number_of(frame.pixels)]) / 1e9 for frame in sink.frames]
-    assert min(late_s) > -0.01, "no picture comes before it was taken"
+    assert min(late_s) > -0.01, "no image arrives before its capture"
     assert float(np.median(late_s)) < 0.05
     ages_s = [(frame.arrived_ns - frame.captured_ns) / 1e9 for frame in sink.frames]
     assert 1 / FPS * 0.8 < float(np.median(ages_s)) < 0.5
@@ -96,10 +96,10 @@ def test_pictures_come_in_order_and_with_the_times_at_which_they_were_taken(way:
     assert states(sink) == ["camera streaming"]
 
 
-def test_what_nobody_looks_at_is_not_decoded_and_the_newest_is_there_for_who_does() -> None:
+def test_unwatched_images_are_not_decoded_and_a_new_viewer_gets_the_newest() -> None:
     sink = RecordingSink(watch=set())
     with RtspServer(key_picture()) as server, watching(server.address, sink) as (driver, _), Projector(server.send):
-        wait_until(lambda: counts(driver)["camera.received"] > 25, "pictures come")
+        wait_until(lambda: counts(driver)["camera.received"] > 25, "images arrive")
         assert counts(driver)["camera.frames"] == 0
         looked_ns = monotonic_ns()
         sink.watch = None
@@ -113,7 +113,7 @@ def counts(driver: MavlinkDriver) -> dict[str, int]:
 
 
 class SlowSink(RecordingSink):
-    """Takes the first picture only when it is let go on."""
+    """Keeps the first image until it is released."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -125,7 +125,7 @@ class SlowSink(RecordingSink):
         self.gate.wait(PATIENCE_S)
 
 
-def test_of_a_slow_reader_the_newest_pictures_count() -> None:
+def test_a_slow_reader_gets_the_newest_images() -> None:
     sink = SlowSink()
     with (
         RtspServer(key_picture()) as server,
@@ -135,7 +135,7 @@ def test_of_a_slow_reader_the_newest_pictures_count() -> None:
         try:
             assert sink.begun.wait(PATIENCE_S)
             before = counts(driver)["camera.received"]
-            wait_until(lambda: counts(driver)["camera.received"] > before + 30, "pictures come meanwhile")
+            wait_until(lambda: counts(driver)["camera.received"] > before + 30, "images arrive meanwhile")
         finally:
             sink.gate.set()
         shows(sink, 10)
@@ -148,7 +148,7 @@ def test_of_a_slow_reader_the_newest_pictures_count() -> None:
 
 
 @pytest.mark.parametrize("abruptly", [False, True])
-def test_a_server_that_is_ended_and_comes_back_is_found_again(abruptly: bool) -> None:
+def test_a_server_that_ends_and_returns_is_found_again(abruptly: bool) -> None:
     with RtspServer(key_picture()) as server, watching(server.address) as (_, sink), Projector(server.send):
         shows(sink, 5)
         server.stop(abruptly=abruptly)
@@ -161,10 +161,10 @@ def test_a_server_that_is_ended_and_comes_back_is_found_again(abruptly: bool) ->
     assert set(seen[1:-1]) == {"camera lost"}
     lost = [event for event in sink.events if event.text.startswith("camera lost")]
     assert {str(event.kind) for event in lost} == {"vehicle_message"}
-    assert len({event.text for event in lost}) == len(lost), "each reason is told once"
+    assert len({event.text for event in lost}) == len(lost), "each reason is reported once"
 
 
-def test_a_server_that_goes_silent_is_told_and_found_again() -> None:
+def test_a_silent_server_is_reported_and_found_again() -> None:
     with (
         RtspServer(key_picture()) as server,
         watching(server.address) as (_, sink),
@@ -177,7 +177,7 @@ def test_a_server_that_goes_silent_is_told_and_found_again() -> None:
         shows(sink, 3)
 
 
-def test_a_wrong_path_is_told() -> None:
+def test_a_wrong_path_is_reported() -> None:
     with RtspServer(key_picture()) as server, watching(f"rtsp://{HOST}:{server.port}/dead") as (_, sink):
         is_told(sink, "404 Not Found")
         wait_until(lambda: server.requests.count("DESCRIBE") > 2, "it tries again")
@@ -185,7 +185,7 @@ def test_a_wrong_path_is_told() -> None:
     assert sink.events[-1].kind is EventKind.VEHICLE_MESSAGE
 
 
-def test_a_password_is_used_and_never_told() -> None:
+def test_a_password_is_used_and_never_shown() -> None:
     with RtspServer(key_picture(), user="admin:s3cret") as server:
         with watching(server.address) as (_, sink):
             is_told(sink, "401 Unauthorized")
@@ -198,22 +198,22 @@ def test_a_password_is_used_and_never_told() -> None:
         assert server.address in told(sink)[0]
 
 
-def test_a_port_where_nobody_listens_is_told() -> None:
+def test_a_port_without_a_server_is_reported() -> None:
     with watching(f"rtsp://{HOST}:{Ports.free(Kind.PX4).remote}/live") as (_, sink):
         is_told(sink, "Connection refused")
 
 
-def test_a_host_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_that_does_not_answer_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera, "OPEN_S", 1.0)
     with socket.create_server((HOST, 0), backlog=0) as full, socket.socket() as first, socket.socket() as second:
-        for each in (first, second):  # the kernel drops what asks for a connection beyond those that wait
+        for each in (first, second):  # the kernel drops connection requests beyond its backlog
             each.setblocking(False)
             each.connect_ex(full.getsockname())
         with watching(f"rtsp://{HOST}:{full.getsockname()[1]}/live") as (_, sink):
             is_told(sink, "no answer, or no frame, within 1 s")
 
 
-def test_a_host_without_an_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_host_without_an_address_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def nobody(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
@@ -222,7 +222,7 @@ def test_a_host_without_an_address_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         is_told(sink, "rtsp://camera.invalid/live: Name or service not known")
 
 
-def test_a_server_that_never_answers_is_told_and_does_not_hold_up_the_closing(
+def test_a_server_that_never_answers_is_reported_and_does_not_delay_closing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked = threading.Event()
@@ -242,7 +242,7 @@ def test_a_server_that_never_answers_is_told_and_does_not_hold_up_the_closing(
             is_told(sink, "no answer, or no frame, within 1 s")
 
 
-def test_answers_that_are_noise_are_told() -> None:
+def test_noise_in_place_of_answers_is_reported() -> None:
     def noise(connection: socket.socket) -> None:
         connection.recv(4096)
         connection.sendall(np.random.default_rng(2).bytes(20_000))
@@ -252,7 +252,7 @@ def test_answers_that_are_noise_are_told() -> None:
         assert "camera streaming" not in states(sink)
 
 
-def test_a_stream_that_is_noise_from_the_beginning_is_told() -> None:
+def test_a_stream_that_is_noise_from_the_start_is_reported() -> None:
     with RtspServer() as server, watching(server.address) as (_, sink), Projector(server.send) as projector:
         projector.spoilt.set()
         assert sink.wait(lambda: bool(told(sink)), PATIENCE_S)
@@ -261,7 +261,7 @@ def test_a_stream_that_is_noise_from_the_beginning_is_told() -> None:
         shows(sink, 3)
 
 
-def test_a_stream_that_becomes_noise_is_told_and_seen_again_when_it_is_none() -> None:
+def test_a_stream_that_becomes_noise_is_reported_and_shown_again_afterwards() -> None:
     with (
         RtspServer(key_picture()) as server,
         watching(server.address) as (_, sink),
@@ -284,11 +284,11 @@ def test_an_address_without_a_host_is_refused(source: str) -> None:
         MavlinkDriver(parse_uri(f"mavlink://udpin:127.0.0.1:14540?camera={source}"))
 
 
-def test_pictures_that_come_close_together_go_out_with_stamps_of_their_own() -> None:
+def test_images_close_together_get_different_stamps() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind((HOST, 0))
         stream = TransportStream(HOST, listener.getsockname()[1])
-        for number in range(12):  # FFmpeg refuses a second picture of one stamp
+        for number in range(12):  # FFmpeg refuses a second image with the same stamp
             stream.pack(picture_of(number), emulator._SETTINGS, number * 20_000_000)
         stream.close()
         assert listener.recv(2048)[0] == 0x47
@@ -301,14 +301,14 @@ needs_dev = pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="a file tha
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A pipe below /dev that raw pictures are read from, with the options that a camera is asked by."""
+    """A pipe below /dev to read raw images from, with the options that a camera needs."""
     monkeypatch.setattr(camera, "DEVICE_FORMAT", "rawvideo")
     with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="skyloop-") as folder:
         yield Path(folder) / "video0"
 
 
 def feed(device: Path, ended: Callable[[], bool]) -> None:
-    """Grey pictures, 64×48, as yuv420p, at 25 a second."""
+    """Write grey images, 64×48, as yuv420p, at 25 a second."""
     os.mkfifo(device)
     pause = threading.Event()
     with device.open("wb", buffering=0) as pipe:
@@ -324,7 +324,7 @@ def feed(device: Path, ended: Callable[[], bool]) -> None:
 
 
 @needs_dev
-def test_a_device_is_asked_for_its_size_shown_missed_and_found_again(device: Path) -> None:
+def test_a_device_is_set_to_its_size_shown_missed_and_found_again(device: Path) -> None:
     sink = RecordingSink()
     asked = f"{device}&camera_width=64&camera_height=48&camera_fps=25"
     with watching(asked, sink):
@@ -347,5 +347,5 @@ def test_a_device_is_asked_for_its_size_shown_missed_and_found_again(device: Pat
     assert levels == sorted(levels)
 
 
-def test_the_pictures_of_the_tests_carry_their_numbers() -> None:
+def test_the_tests_images_carry_their_numbers() -> None:
     assert [number_of(picture_of(number)) for number in (0, 1, 77, 4095)] == [0, 1, 77, 4095]

@@ -1,4 +1,4 @@
-"""The driver's session and the emulated board with nothing between them, in simulated time: no thread, no socket."""
+"""The driver's session connected directly to the emulated board, in simulated time: no thread, no socket."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ def options(text: str = "msp://tcp:127.0.0.1:5761") -> MspOptions:
 class Bench:
     """A drone on the ground, seen by cameras if ``poses``; ``cut``: nothing passes; ``deaf``: no reply passes.
 
-    ``world_speed``: of the simulated world, beside the clock of board and driver. ``noise_m``: of the poses' height.
-    ``unanswered``: functions whose replies do not pass. ``refused``: functions that it does not know.
-    ``seed``: of the noise.
+    ``world_speed``: speed of the simulated world relative to board and driver. ``noise_m``: noise of the poses' height.
+    ``unanswered``: functions whose replies are lost. ``refused``: functions that it does not know.
+    ``seed``: seed of the noise.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class Bench:
         return self.sink.newest
 
     def reconnect(self, text: str = "msp://tcp:127.0.0.1:5761") -> None:
-        """Another proxy takes over: a new session."""
+        """Start a new session, as when another proxy takes over."""
         self.session = MspSession(options(text), self.clock.now_ns)
         self._parser.reset()
 
     def fly(self, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> None:
-        """Steer it; a climb from the ground is a take-off that somebody asked for."""
+        """Steer it; a climb from the ground is a requested take-off."""
         if climb > 0:
             self.session.ask_takeoff(self.clock.now_ns)
         self.session.command(Attitude(roll, pitch, climb, yaw_rate), self.clock.now_ns)
@@ -131,7 +131,7 @@ class Bench:
             self.tick()
 
     def until(self, condition: Callable[[], bool], within_s: float) -> float:
-        """How long it took [s]."""
+        """Return how long it took [s]."""
         for ticks in range(round(within_s / TICK_S)):
             if condition():
                 return ticks * TICK_S
@@ -139,11 +139,11 @@ class Bench:
         raise AssertionError(f"not within {within_s} s: {self.simulation.truth(0)}, {self.sink.events}")
 
     def ready(self) -> None:
-        """Wait until it could be armed."""
+        """Wait until it can be armed."""
         self.until(lambda: self.sink.newest is not None and not self.session.setpoints.report.hindrances, 5.0)
 
     def take_off(self, hover: float | None = 0.32) -> None:
-        """Rise to a metre and hold there; ``hover``: the throttle that was learnt in an earlier flight."""
+        """Rise to a metre and hold there; ``hover``: the throttle learnt in an earlier flight."""
         self.ready()
         self.session.setpoints.hover = hover
         self.fly(climb=0.7)
@@ -152,5 +152,5 @@ class Bench:
         self.run(1.0)
 
     def texts(self, reason: str) -> list[str]:
-        """Of the events with this reason."""
+        """Return the texts of events with this reason."""
         return [event.text for event in self.sink.events if event.data.get("reason") == reason]

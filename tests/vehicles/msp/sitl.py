@@ -1,4 +1,4 @@
-"""Real Betaflight, as a program beside the tests: its own simulation target in a world that stands still."""
+"""Real Betaflight SITL beside the tests, in a world at rest."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SETTINGS: Final = (
 
 
 class Sitl:
-    """Starts it in a folder, sets it up as ``docs/msp.md`` says, and feeds it a level world at rest."""
+    """Starts it in a folder, configures it as ``docs/msp.md`` says, and feeds it a level world at rest."""
 
     def __init__(self, folder: Path) -> None:
         self.roll_rad = 0.0
@@ -60,7 +60,7 @@ class Sitl:
     def _start(self) -> None:
         self._stop()
         self._log = (self._folder / "log").open("wb")
-        for _ in range(3):  # one in twenty never listens, by a race between its threads
+        for _ in range(3):  # one in twenty never listens, because of a race between its threads
             self._process = subprocess.Popen(
                 [program_path()],
                 cwd=self._folder,
@@ -85,8 +85,8 @@ class Sitl:
         self._process = self._log = None
 
     def _configure(self) -> None:
-        """Use its command line, which ``save`` ends together with the program."""
-        time.sleep(0.5)  # for the client that looked whether it listens to be gone
+        """Configure it on its command line; ``save`` ends that and the program."""
+        time.sleep(0.5)  # until the client that checked its port is gone
         with socket.create_connection(("127.0.0.1", MSP_PORT), 5) as line:
             line.settimeout(10)
             self._say(line, b"#")
@@ -111,7 +111,7 @@ class Sitl:
             motors.setblocking(False)
             while not self._ending.wait(_STEP_S):
                 half = self.roll_rad / 2
-                # A constant time keeps its clock at the pace of ours.
+                # A constant time keeps its clock in step with ours.
                 numbers = (1.0, *(0.0,) * 5, -9.80665, math.cos(half), math.sin(half), *(0.0,) * 8, 101_325.0)
                 state.sendto(struct.pack("<18d", *numbers), ("127.0.0.1", _STATE))
                 try:

@@ -1,4 +1,4 @@
-"""Parts of the driver by themselves: addresses, motion, settings, parameters, requests, INAV."""
+"""Units of the driver: addresses, motion, settings, parameters, requests, INAV."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def test_addresses() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("msp://", "names no place"),
-        ("msp://ttyACM0", "names no place"),
-        ("msp://tcp:127.0.0.1", "names no place"),
-        ("msp://tcp:127.0.0.1:0", "names no place"),
+        ("msp://", "names no host or device"),
+        ("msp://ttyACM0", "names no host or device"),
+        ("msp://tcp:127.0.0.1", "names no host or device"),
+        ("msp://tcp:127.0.0.1:0", "names no host or device"),
         ("msp://tcp:127.0.0.1:5761?baud=9600", "baud is for a serial port"),
         ("msp:///dev/ttyACM0?rate=5", "from 20 to 250"),
         ("msp:///dev/ttyACM0?speed=5", "option of msp://"),
@@ -71,12 +71,12 @@ def test_velocity_from_noisy_poses(rate: int) -> None:
     assert motion.precise
 
 
-def test_an_old_pose_counts_no_more_but_its_heading_does() -> None:
+def test_an_old_pose_expires_but_its_heading_does_not() -> None:
     estimate = MotionEstimate()
     estimate.on_attitude(msp.Attitude(0.0, 0.0, 90.0))  # east by the compass: yaw 0
     estimate.on_pose(pose((0.0, 0.0, 1.0), 0, yaw=1.0))
     estimate.on_pose(pose((0.0, 0.0, 1.0), NS_PER_S // 50, yaw=1.0))
-    estimate.on_pose(pose((9.0, 9.0, 9.0), 0, yaw=2.0))  # older: left out
+    estimate.on_pose(pose((9.0, 9.0, 9.0), 0, yaw=2.0))  # older: ignored
     estimate.on_altitude(msp.Altitude(1.5, 0.1), NS_PER_S)
     motion = estimate.at(NS_PER_S)
     assert (motion.climb_m_s, motion.height_m, motion.velocity_m_s) == (0.1, 1.5, None)
@@ -107,26 +107,26 @@ BOXES = ((0, "ARM"), (1, "ANGLE"), (28, "AIR MODE"), (36, "PREARM"), (50, "MSP O
 BETAFLIGHT = Identity("BTFL", (4, 6, 0), (1, 47), "SITL")
 
 
-def test_switches_are_set_as_wanted_and_nothing_else() -> None:
+def test_wanted_switches_are_on_and_no_others() -> None:
     setup = Setup(
         BETAFLIGHT,
         BOXES,
         (
             ModeRange(0, 0, 1700, 2100),
             ModeRange(1, 1, 1300, 1700),
-            ModeRange(28, 1, 1700, 2100),  # air mode on the same switch, higher
+            ModeRange(28, 1, 1700, 2100),  # air mode on the same switch, at higher values
             ModeRange(36, 5, 900, 1200),  # prearm while it is low
         ),
     )
     off, on = setup.aux_us(arm=False, given={}), setup.aux_us(arm=True, given={2: 1234, 0: 1000})
     assert len(off) == len(on) == 6
-    assert off[0] < 1700 <= on[0], "the arm switch is nobody else's"
+    assert off[0] < 1700 <= on[0], "the arm switch is used for nothing else"
     assert 1300 <= off[1] < 1700, "ANGLE, and no air mode"
     assert on[2] == 1234
     assert on[5] < 1200 <= off[5]
 
 
-def test_inav_that_does_nothing_is_refused() -> None:
+def test_inav_without_a_failsafe_is_refused() -> None:
     inav = Identity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
     setup = Setup(
         inav,
@@ -139,8 +139,8 @@ def test_inav_that_does_nothing_is_refused() -> None:
     assert str(inav) == "INAV 8.0.0 on MATEKF405"
     unknown = Setup(inav, BOXES, setup.ranges, receiver_is_msp=False)
     told = hindrances(unknown.diagnose(override=False))
-    assert "sticks do not come by MSP" in told
-    assert "failsafe is not known" in told
+    assert "sticks do not arrive by MSP" in told
+    assert "failsafe is unknown" in told
 
 
 def test_charge() -> None:
@@ -194,11 +194,11 @@ def test_a_question_is_asked_three_times() -> None:
     assert questions.idle
 
 
-def test_states_are_asked_for_singly_or_together() -> None:
+def test_states_are_requested_singly_or_together() -> None:
     single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0})
-    assert single.requests(0) == [Frame(1), Frame(2)], "two without an answer are the most"
+    assert single.requests(0) == [Frame(1), Frame(2)], "at most two unanswered requests"
     assert single.requests(1) == []
-    assert single.on_frame(Frame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the one before it is lost"
+    assert single.on_frame(Frame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
     assert single.unanswered == 1
     assert single.requests(2) == [Frame(3)]
     assert single.on_frame(Frame(3, b"", Direction.ERROR)) == [(3, None)]
@@ -208,7 +208,7 @@ def test_states_are_asked_for_singly_or_together() -> None:
     assert single.on_frame(Frame(1, b"a", Direction.REPLY)) == []
 
 
-def test_a_lost_answer_makes_no_other_be_mistaken() -> None:
+def test_after_a_lost_answer_no_other_is_mistaken_for_it() -> None:
     together = Telemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
     assert together.requests(0) == [Frame(Function.MULTIPLE, b"\1\2"), Frame(3)]
     reply = Frame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
@@ -254,7 +254,7 @@ def inav_reply(frame: Frame, flags: int) -> Frame:
     return Frame(frame.function, b"", Direction.ERROR)
 
 
-def test_inav_is_read_and_armed() -> None:
+def test_inav_is_identified_and_armed() -> None:
     session, parser, sink = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0), Parser(), RecordingSink()
     flags, sticks, now_ns = 0, [0], 0
 
@@ -296,24 +296,24 @@ def test_inav_is_read_and_armed() -> None:
 # A pilot's receiver --------------------------------------------------------------------------------------------------
 
 
-def test_a_pilot_gives_the_sticks_away_and_takes_them_back() -> None:
+def test_a_pilot_hands_over_the_sticks_and_takes_them_back() -> None:
     setpoints = given_away()
     assert setpoints.left_to == ""
     assert setpoints.channels(NS_PER_S // 50)[2] == pytest.approx(1420, abs=2), "nothing jumps"
     setpoints.on_report(Report(armed=True), 2)
     assert setpoints.left_to == "RECEIVER"
     assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
-    with pytest.raises(DriverError, match="by the pilot's receiver"):
+    with pytest.raises(DriverError, match="at the pilot's receiver"):
         setpoints.apply(Attitude(climb=0.5), 3)
 
 
-def test_a_pilots_switch_off_and_on_starts_no_throttle_after_a_stop_that_was_not_reset() -> None:
+def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_reset() -> None:
     setpoints = given_away()
     setpoints.apply(EmergencyStop(), 0)
     now_ns = 0
 
     def see(overridden: bool, seconds: float) -> int:
-        """The throttle after this time [µs]."""
+        """Return the throttle after this time [µs]."""
         nonlocal now_ns
         for _ in range(round(seconds / 0.02)):
             now_ns += NS_PER_S // 50
@@ -327,18 +327,16 @@ def test_a_pilots_switch_off_and_on_starts_no_throttle_after_a_stop_that_was_not
     see(overridden=False, seconds=1.0)
     assert see(overridden=True, seconds=1.0) == 1000
     see(overridden=False, seconds=30.0)
-    assert see(overridden=True, seconds=1.0) == 1000, "however long the pilot flew it"
+    assert see(overridden=True, seconds=1.0) == 1000, "however long the pilot flies"
     assert setpoints.flight_state() is FlightState.EMERGENCY
     setpoints.apply(ResetEmergency(), now_ns)
     assert see(overridden=True, seconds=1.0) == 1000
     see(overridden=False, seconds=1.0)
-    assert see(overridden=True, seconds=0.02) == pytest.approx(1420, abs=2), (
-        "after the reset it is taken over in flight"
-    )
+    assert see(overridden=True, seconds=0.02) == pytest.approx(1420, abs=2), "after the reset it is adopted in flight"
 
 
 def given_away() -> SetpointController:
-    """A pilot flew it by the receiver at a throttle of 0.42, and gave the sticks away."""
+    """Return a controller after a pilot flew by receiver at a throttle of 0.42 and handed over the sticks."""
     setpoints = SetpointController(override=True)
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     setpoints.on_report(Report(armed=True), 0)
@@ -352,7 +350,7 @@ def given_away() -> SetpointController:
 
 
 @pytest.mark.parametrize("climbs", [False, True])
-def test_one_that_is_disarmed_in_its_take_off_is_not_armed_again_by_the_take_off_that_goes_on(climbs: bool) -> None:
+def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(climbs: bool) -> None:
     """It tipped over, or a switch killed it: 20 ms later the software take-off armed it again."""
     setpoints = SetpointController()
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
@@ -372,8 +370,8 @@ def test_one_that_is_disarmed_in_its_take_off_is_not_armed_again_by_the_take_off
     assert setpoints.phase is Phase.STANDING
 
 
-def test_one_that_was_found_again_disarmed_may_be_taken_off_at_once() -> None:
-    """Its firmware was restarted in flight: what ended then is over, and no take-off goes on."""
+def test_a_vehicle_found_again_disarmed_can_take_off_at_once() -> None:
+    """Its firmware restarted in flight: the earlier take-off is over, and none continues."""
     setpoints = SetpointController()
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     estimate = MotionEstimate()
@@ -391,7 +389,7 @@ def test_one_that_was_found_again_disarmed_may_be_taken_off_at_once() -> None:
 # Without a vehicle ---------------------------------------------------------------------------------------------------
 
 
-def test_a_take_off_is_refused_before_it_begins() -> None:
+def test_a_hopeless_take_off_is_refused_before_it_starts() -> None:
     driver = MspDriver(parse_uri("msp://tcp:127.0.0.1:1"))
     with pytest.raises(DriverError, match="is not open"):
         driver.check(Takeoff())

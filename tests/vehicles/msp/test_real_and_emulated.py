@@ -1,4 +1,4 @@
-"""What the driver relies on, asked of real Betaflight and of the emulated one by the same test."""
+"""The driver's assumptions, checked against real and emulated Betaflight by the same tests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PATIENCE_S: Final = 20.0
 
 @dataclass
 class Vehicle:
-    """One of the two. ``tilt`` puts it on its side, or upright again."""
+    """Real or emulated Betaflight. ``tilt`` puts it on its side, or upright again."""
 
     host: str
     port: int
@@ -62,7 +62,7 @@ def vehicle(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Vehicle]
 
 
 class Line:
-    """A client of our own, to be silent when the test wants it."""
+    """A separate client, silent when the test wants it."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._socket = socket.create_connection((vehicle.host, vehicle.port), 5)
@@ -83,7 +83,7 @@ class Line:
         self.ask(Function.SET_RAW_RC, pack_channels([1500, 1500, throttle, 1500, arm, 1000, 1000, 1000]))
 
     def state(self) -> tuple[bool, set[str], int]:
-        """Whether it is armed, what hinders it, and the throttle that is in force [µs]."""
+        """Return whether it is armed, what prevents arming, and the throttle in force [µs]."""
         status = Status.of_betaflight(self.ask(Function.STATUS_EX))
         names = flag_names("BTFL", status.flags or 0, status.count)
         return bool(status.modes & 1), set(names), channels(self.ask(Function.RC))[3]
@@ -99,7 +99,7 @@ class Line:
         self._socket.close()
 
 
-#: What Betaflight 4.6.0's own simulation answers of the requests without arguments that only read.
+#: Betaflight 4.6.0 SITL's answers to the requests that take no arguments and only read.
 ANSWERED: Final = (
     *(1, 2, 3, 4, 5, 32, 34, 36, 38, 40, 42, 44, 50, 52, 54, 56, 58, 64, 70, 75, 79, 80, 82, 90, 92, 94, 96),
     *(101, 102, 104, 105, 108, 109, 110, 111, 112, 116, 117, 119, 124, 125, 126, 128, 129, 130, 131, 133, 139, 140),
@@ -107,8 +107,8 @@ ANSWERED: Final = (
 )
 
 
-def test_what_a_configurator_asks_is_answered(vehicle: Vehicle) -> None:
-    """The emulated one refused 40 of these requests."""
+def test_a_configurators_requests_are_answered(vehicle: Vehicle) -> None:
+    """The emulator refused 40 of these requests."""
     line = Line(vehicle)
     try:
         lengths = {function: len(line.ask(function)) for function in ANSWERED}
@@ -118,7 +118,7 @@ def test_what_a_configurator_asks_is_answered(vehicle: Vehicle) -> None:
     assert (lengths[70], lengths[112], lengths[92]) == (13, 15, 49)
 
 
-def test_what_the_driver_relies_on(vehicle: Vehicle) -> None:
+def test_the_drivers_assumptions(vehicle: Vehicle) -> None:
     driver, sink = MspDriver(parse_uri(vehicle.address)), RecordingSink()
     driver.open(sink)
     try:
@@ -167,7 +167,7 @@ def native(sink: RecordingSink) -> dict[str, object]:
 
 
 def _silence(line: Line) -> None:
-    """What ``docs/msp.md`` says of the time after the last stick: held, throttle off, disarmed."""
+    """Check ``docs/msp.md`` on the time after the last stick: hold, throttle off, disarm."""
     line.send_until(1000, lambda: not line.state()[1])
     line.send_until(2000, lambda: line.state()[0])
     line.sticks(1090, 2000)
@@ -175,14 +175,14 @@ def _silence(line: Line) -> None:
     seen: list[tuple[float, bool, set[str], int]] = []
     while not seen or seen[-1][1]:
         seen.append((time.monotonic() - begun, *line.state()))
-        assert seen[-1][0] < PATIENCE_S, "it is never disarmed"
+        assert seen[-1][0] < PATIENCE_S, "it never disarms"
         time.sleep(0.01)
-    # What comes when: on a busy machine all of it comes later, and in the same order.
+    # The order of events: on a busy machine all are later, in the same order.
     lost_s = next(at_s for at_s, _, flags, _ in seen if "RXLOSS" in flags)
     low_s = next(at_s for at_s, _, _, throttle in seen if throttle < 1000)
     assert 0.1 < lost_s <= low_s < seen[-1][0]
     assert low_s > 0.2, "the last sticks are held at first"
     assert all(throttle == 1090 for at_s, _, _, throttle in seen if 0.05 < at_s < low_s)
-    assert seen[-1][0] > 1.2, "armed until the failsafe begins"
+    assert seen[-1][0] > 1.2, "armed until the failsafe starts"
     assert "FAILSAFE" in line.state()[1]
     line.send_until(1000, lambda: not line.state()[1])

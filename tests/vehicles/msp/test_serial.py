@@ -1,4 +1,4 @@
-"""A flight controller on a serial port: a pseudo-terminal with the emulated one behind it."""
+"""A flight controller on a serial port: a pseudo-terminal in front of the emulated one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.vehicles.msp.bench import Bench
 
 
 class Wire(threading.Thread):
-    """Carries bytes between a pseudo-terminal and the emulated firmware."""
+    """Copies bytes between a pseudo-terminal and the emulated firmware."""
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
@@ -47,7 +47,7 @@ class Wire(threading.Thread):
                     os.write(self._master, self._line.recv(4096))
 
     def hang(self) -> None:
-        """Carry nothing any more, and leave no room for what is sent."""
+        """Stop copying, and leave no room for new bytes."""
         self._ending.set()
         self.join()
         os.set_blocking(self._slave, False)
@@ -57,12 +57,12 @@ class Wire(threading.Thread):
                     os.write(self._slave, b"x")
 
     def stall(self) -> None:
-        """Carry nothing any more, as a process that stands still: what is sent waits in the system."""
+        """Stop copying, like a paused process: bytes wait in the system."""
         self._ending.set()
         self.join()
 
     def waiting(self) -> bytes:
-        """Return what waits there."""
+        """Return the waiting bytes."""
         return os.read(self._master, 65_536) if select.select([self._master], [], [], 0)[0] else b""
 
     def cut(self) -> None:
@@ -98,8 +98,8 @@ def test_a_serial_port_is_read_and_lost(firmware: BetaflightFirmware) -> None:
         driver.close()
 
 
-def test_a_serial_port_that_is_no_longer_read_stops_nobody(firmware: BetaflightFirmware) -> None:
-    """A flight controller that hangs: commands return, the link is lost, and closing takes no time."""
+def test_an_unread_serial_port_blocks_nothing(firmware: BetaflightFirmware) -> None:
+    """A flight controller hangs: commands return, the link is lost, and closing is quick."""
     pytest.importorskip("serial")
     wire = Wire(firmware.port)
     wire.start()
@@ -117,8 +117,8 @@ def test_a_serial_port_that_is_no_longer_read_stops_nobody(firmware: BetaflightF
         wire.cut()
 
 
-def test_a_flight_controller_that_stands_still_finds_few_old_sticks(firmware: BetaflightFirmware) -> None:
-    """The system tells of no byte that waits in a pseudo-terminal: only that no answer comes shows it."""
+def test_a_paused_flight_controller_finds_few_old_sticks(firmware: BetaflightFirmware) -> None:
+    """The system does not report bytes that wait in a pseudo-terminal: only missing answers show them."""
     pytest.importorskip("serial")
     wire = Wire(firmware.port)
     wire.start()
@@ -135,8 +135,8 @@ def test_a_flight_controller_that_stands_still_finds_few_old_sticks(firmware: Be
         wire.cut()
 
 
-def test_a_stop_is_sent_as_one_whatever_waits_on_the_line() -> None:
-    """As a set-point it would be dropped where the line is behind."""
+def test_a_stop_is_sent_with_its_own_rank_despite_a_backlog() -> None:
+    """As a set-point it would be dropped when the line is behind."""
     bench, ranks = Bench(), list[Rank]()
     bench.take_off()
     link = MspLink(bench.session, lambda _: None, lambda: bench.clock.now_ns)
@@ -151,7 +151,7 @@ def test_a_stop_is_sent_as_one_whatever_waits_on_the_line() -> None:
     assert len(ranks) > 1
 
 
-def test_the_last_connection_has_more_time_to_deliver_what_was_sent() -> None:
+def test_the_last_connection_has_longer_to_deliver_its_bytes() -> None:
     link, line = MspLink(Bench().session, lambda _: None), create_autospec(TcpStream, instance=True)
     link._connection = line
     link._stopping.set()

@@ -22,7 +22,7 @@ from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRan
 from tests.vehicles.msp.bench import TICK_S, Bench, options
 
 
-def test_it_learns_the_throttle_and_holds_its_height() -> None:
+def test_it_learns_the_hover_throttle_and_holds_its_height() -> None:
     bench = Bench()
     bench.take_off(hover=None)
     bench.run(2.0)
@@ -36,7 +36,7 @@ def test_it_learns_the_throttle_and_holds_its_height() -> None:
     assert 0.27 < hover < 0.37, "the emulated racer hovers at 0.32"
 
 
-def test_climbs_and_descends_as_asked() -> None:
+def test_it_climbs_and_descends_as_requested() -> None:
     bench = Bench()
     bench.take_off()
     for climb in (0.8, -0.4):
@@ -54,7 +54,7 @@ def test_feedback_has_our_axes(poses: bool) -> None:
     truth, feedback = bench.simulation.truth(0), bench.feedback
     assert feedback.roll_rad == pytest.approx(truth.roll_rad, abs=0.02)
     assert feedback.pitch_rad == pytest.approx(truth.pitch_rad, abs=0.02)
-    assert truth.pitch_rad == pytest.approx(0.15, abs=0.02), "the stick leans it as far as it was asked to"
+    assert truth.pitch_rad == pytest.approx(0.15, abs=0.02), "the stick leans it as far as requested"
     assert truth.roll_rad == pytest.approx(-0.1, abs=0.02)
     assert feedback.yaw_rad == pytest.approx(truth.yaw_rad, abs=math.radians(1))
     assert feedback.velocity_m_s is not None
@@ -69,7 +69,7 @@ def test_feedback_has_our_axes(poses: bool) -> None:
     assert 0.5 < feedback.battery <= 1.0
 
 
-def test_turns_as_fast_as_asked() -> None:
+def test_it_turns_as_fast_as_requested() -> None:
     bench = Bench()
     bench.take_off()
     bench.fly(yaw_rate=0.7)
@@ -79,7 +79,7 @@ def test_turns_as_fast_as_asked() -> None:
     assert bench.simulation.truth(0).yaw_rad - before == pytest.approx(0.7, abs=0.05)
 
 
-def test_lands_and_disarms() -> None:
+def test_it_lands_and_disarms() -> None:
     bench = Bench()
     bench.take_off()
     bench.fly(climb=-0.4)
@@ -87,12 +87,12 @@ def test_lands_and_disarms() -> None:
     assert bench.height_m < 0.06
     bench.run(0.2)
     assert bench.feedback.state is FlightState.LANDED
-    assert not bench.texts("disarmed"), "that was our own doing"
+    assert not bench.texts("disarmed"), "that was our own action"
     bench.fly(climb=0.5)  # and again
     bench.until(lambda: bench.height_m > 0.8, 20.0)
 
 
-def test_a_descent_from_height_is_not_taken_for_the_ground() -> None:
+def test_a_descent_from_height_is_not_mistaken_for_the_ground() -> None:
     bench = Bench()
     bench.take_off()
     bench.fly(climb=1.0)
@@ -109,7 +109,7 @@ SEEDS = 20
 
 
 def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[SetpointController, list[float]]:
-    """One that is asked to sink at 0.4 m/s, and what it does; the throttle, as share of the one that carries it."""
+    """Return a vehicle asked to sink at 0.4 m/s, and its throttle as a share of the hover throttle."""
     setpoints, chance, now_ns, shares = SetpointController(), random.Random(seed), NS_PER_S, []
     setpoints.on_report(Report(True), now_ns)
     setpoints.adopt(0.3, now_ns)
@@ -126,26 +126,26 @@ def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[Setp
 
 
 @pytest.mark.parametrize("noise", [0.0, *NOISES])
-def test_a_touch_down_is_seen_through_the_noise_of_positions(noise: float) -> None:
-    """It stayed armed while its throttle fell: 0.6 s of noise below 0.1 m/s never came."""
+def test_a_touch_down_is_detected_despite_position_noise(noise: float) -> None:
+    """It stayed armed while its throttle fell: the noise never stayed below 0.1 m/s for 0.6 s."""
     for seed in range(SEEDS):
         setpoints, shares = descent(0.0, noise, seed, 1.0 + 3.0)
         assert setpoints.phase is Phase.STANDING, seed
-        assert setpoints.hover == pytest.approx(0.3, rel=0.2), "the throttle that carries it is not unlearnt"
+        assert setpoints.hover == pytest.approx(0.3, rel=0.2), "the hover throttle is not unlearnt"
         assert len(shares) * 0.02 > 1.0 + 0.6
 
 
 @pytest.mark.parametrize("noise", [0.0, *NOISES])
-def test_a_slow_sink_is_not_taken_for_a_touch_down(noise: float) -> None:
+def test_a_slow_descent_is_not_mistaken_for_a_touch_down(noise: float) -> None:
     for seed in range(SEEDS):
         setpoints, shares = descent(-0.15, noise, seed, 30.0)
         assert setpoints.phase is Phase.FLYING, seed
-        assert min(shares) > 0.7, "nothing is taken away"
+        assert min(shares) > 0.7, "the throttle is not reduced"
 
 
 @pytest.mark.parametrize("climb", [-0.15, -0.4])
 @pytest.mark.parametrize("noise", NOISES)
-def test_a_landing_by_noisy_positions(noise: float, climb: float) -> None:
+def test_a_landing_with_noisy_positions(noise: float, climb: float) -> None:
     bench = Bench()
     bench.take_off()
     bench.noise_m = noise / 5.6
@@ -161,7 +161,7 @@ def test_a_landing_by_noisy_positions(noise: float, climb: float) -> None:
 @pytest.mark.parametrize("noise_m", [0.018, 0.036])
 @pytest.mark.parametrize("seed", range(3))
 def test_noisy_heights_show_no_lift_off(noise_m: float, seed: int) -> None:
-    """They did, on the ground: it stood there armed, told to fly, and learnt a throttle that carries nothing."""
+    """They did, on the ground: it stayed there armed, in flight mode, and learnt a useless hover throttle."""
     bench = Bench(seed=seed)
     bench.noise_m = noise_m
     stands_m = bench.height_m
@@ -178,8 +178,8 @@ def test_noisy_heights_show_no_lift_off(noise_m: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("world_speed", [1.0, 0.6, 0.45, 0.3])
-def test_what_still_rises_when_it_should_sink_does_not_stand(world_speed: float) -> None:
-    """A real one rose past its height, in a simulation slower than its clock: it was disarmed at 1.6 m, and fell."""
+def test_a_vehicle_still_rising_when_it_should_sink_is_not_on_the_ground(world_speed: float) -> None:
+    """A real one overshot its height in a slow simulation: it was disarmed at 1.6 m, and fell."""
     bench = Bench()
     bench.take_off()
     bench.world_speed = world_speed
@@ -204,8 +204,8 @@ def test_an_interrupted_take_off_disarms() -> None:
 
 
 @pytest.mark.parametrize("climb", [0.0, -0.5])
-def test_a_take_off_that_is_withdrawn_while_it_arms_does_not_arm_later(climb: float) -> None:
-    """It armed as soon as what kept it from that had passed, and its propellers turned for a second."""
+def test_a_take_off_withdrawn_while_arming_does_not_arm_later(climb: float) -> None:
+    """It armed as soon as the obstacle had passed, and its propellers turned for a second."""
     bench = Bench(BoardSettings(boot_s=4.0))
     bench.run(2.0)
     bench.fly(climb=0.7)
@@ -232,7 +232,7 @@ def test_limits() -> None:
 # Refusals ------------------------------------------------------------------------------------------------------------
 
 
-def test_refused_arming_is_told_by_name() -> None:
+def test_a_refused_arming_is_reported_by_name() -> None:
     bench = Bench(BoardSettings(flags=bit("NO_ACC_CAL") | bit("ANGLE")))
     bench.run(2.0)
     with pytest.raises(DriverError, match=r"ANGLE \(it is not level\); NO_ACC_CAL \(its accelerometer was never"):
@@ -241,10 +241,10 @@ def test_refused_arming_is_told_by_name() -> None:
     assert any(not each.good and "NO_ACC_CAL" in each.detail for each in bench.session.diagnose())
 
 
-def test_what_appears_while_it_arms_is_told_by_name() -> None:
+def test_an_obstacle_that_appears_while_arming_is_reported_by_name() -> None:
     bench = Bench(BoardSettings(boot_s=30.0))
     bench.run(2.0)
-    bench.fly(climb=0.5)  # waits for what passes by itself
+    bench.fly(climb=0.5)  # waits for temporary conditions
     bench.until(lambda: bool(bench.texts("arming_refused")), 10.0)
     assert "BOOTGRACE" in bench.texts("arming_refused")[0]
     assert not bench.board.armed
@@ -257,8 +257,8 @@ def test_what_appears_while_it_arms_is_told_by_name() -> None:
     [
         (BoardSettings(ranges=(ModeRange(1, 1, 900, 2100),)), "no AUX channel arms it"),
         (BoardSettings(ranges=(ModeRange(0, 0, 1700, 2100),)), "no AUX channel switches ANGLE mode on"),
-        (BoardSettings(rx_msp=False), "sticks do not come by MSP"),
-        (BoardSettings(on_loss=()), "before its failsafe, is not known"),
+        (BoardSettings(rx_msp=False), "sticks do not arrive by MSP"),
+        (BoardSettings(on_loss=()), "before the failsafe is unknown"),
         (BoardSettings(on_loss=((OnLoss.HOLD, 1500),) * 18), "holds the last roll, pitch, yaw, throttle"),
     ],
 )
@@ -268,13 +268,13 @@ def test_unsafe_settings_are_refused(settings: BoardSettings, told: str) -> None
     with pytest.raises(DriverError, match=told):
         bench.fly(climb=0.5)
     assert any(told in text for text in bench.texts("setup"))
-    assert bench.sink.link_state is LinkState.UP, "it can be watched all the same"
+    assert bench.sink.link_state is LinkState.UP, "it can still be watched"
 
 
-def test_a_late_failsafe_is_warned_of() -> None:
+def test_a_late_failsafe_gets_a_warning() -> None:
     bench = Bench(BoardSettings(failsafe=FailsafeConfig(5.0, 10.0, 1300, 10.0, 0)))
     bench.run(1.0)
-    assert any("after 5 s only" in text for text in bench.texts("setup"))
+    assert any("only after 5 s" in text for text in bench.texts("setup"))
     bench.take_off()
 
 
@@ -285,8 +285,8 @@ def test_without_a_measured_climb_nothing_takes_off() -> None:
         bench.fly(climb=0.5)
 
 
-def test_one_pose_that_is_stamped_ahead_changes_nothing() -> None:
-    """8 s, by a wrong clock, and nothing but poses measures the height: it would be blind, and cut its motors."""
+def test_one_pose_with_a_stamp_in_the_future_changes_nothing() -> None:
+    """8 s ahead by a wrong clock, with poses as the only height: it would fly blind, and cut its motors."""
     bench = Bench(BoardSettings(barometer=False, gps=False))
     bench.take_off()
     now_ns, truth = bench.clock.now_ns, bench.simulation.truth(0)
@@ -318,7 +318,7 @@ def test_other_firmware_is_not_flown() -> None:
 # Silence -------------------------------------------------------------------------------------------------------------
 
 
-def test_silence_drops_it_after_the_firmwares_failsafe() -> None:
+def test_silence_makes_the_firmwares_failsafe_drop_it() -> None:
     bench = Bench()
     bench.take_off()
     bench.cut = True
@@ -329,11 +329,11 @@ def test_silence_drops_it_after_the_firmwares_failsafe() -> None:
     bench.run(0.5)
     assert bench.feedback.state is FlightState.LANDED
     bench.run(3.0)
-    assert not bench.board.armed, "it is not armed again by itself"
+    assert not bench.board.armed, "it is not armed again"
 
 
-def test_what_is_found_on_the_ground_stays_there() -> None:
-    """The firmware stood still in flight and has disarmed; what hovered it goes on and asks for a climb."""
+def test_a_vehicle_found_on_the_ground_stays_there() -> None:
+    """The firmware was paused in flight and has disarmed; the hovering application continues to request a climb."""
     bench = Bench()
     bench.take_off()
     bench.cut = True
@@ -351,7 +351,7 @@ def test_what_is_found_on_the_ground_stays_there() -> None:
     bench.until(lambda: bench.height_m > 1.0, 20.0)
 
 
-def test_a_take_off_that_was_asked_for_long_ago_does_not_begin_now() -> None:
+def test_an_old_take_off_request_does_not_start_now() -> None:
     bench = Bench()
     bench.ready()
     assert bench.session.ask_takeoff(bench.clock.now_ns) == ""
@@ -360,7 +360,7 @@ def test_a_take_off_that_was_asked_for_long_ago_does_not_begin_now() -> None:
         bench.session.command(Attitude(climb=0.3), bench.clock.now_ns)
 
 
-def test_a_short_cut_is_flown_through() -> None:
+def test_a_short_outage_is_flown_through() -> None:
     landing = FailsafeConfig(1.5, 10.0, 1310, 10.0, 0)
     on_loss = tuple((OnLoss.SET, 1310) if n == 3 else each for n, each in enumerate(BoardSettings().on_loss))
     bench = Bench(BoardSettings(failsafe=landing, on_loss=on_loss))
@@ -408,25 +408,25 @@ def test_hover_survives_a_new_proxy() -> None:
     bench.reconnect()
     bench.until(lambda: bench.sink.link_state is LinkState.UP, 3.0)
     bench.run(2.0)
-    assert bench.board.armed, "what flies is not disarmed by a new connection"
+    assert bench.board.armed, "a new connection does not disarm it in flight"
     assert bench.feedback.state is FlightState.FLYING
     assert abs(bench.climb_m_s) < 0.15
 
 
-def test_standing_is_disarmed_with_the_last_words() -> None:
+def test_closing_disarms_a_vehicle_on_the_ground() -> None:
     bench = Bench()
     bench.ready()
     bench.fly(climb=0.5)
     bench.until(lambda: bench.board.armed, 2.0)
-    words = bench.session.last_words(bench.clock.now_ns)
+    words = bench.session.final_bytes(bench.clock.now_ns)
     assert channels(words[5:-1])[4] == 1000, "the arm switch is off"
     bench.until(lambda: not bench.board.armed, 1.0)
     bench.run(0.2)
     bench.take_off()
-    assert bench.session.last_words(bench.clock.now_ns) == b""
+    assert bench.session.final_bytes(bench.clock.now_ns) == b""
 
 
-def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
+def test_sticks_are_held_back_while_unacknowledged() -> None:
     bench = Bench()
     bench.ready()
     bench.deaf = True
@@ -434,16 +434,16 @@ def test_sticks_are_held_back_while_none_is_acknowledged() -> None:
     before = len([frame for frame in bench.sent if frame.function == Function.SET_RAW_RC])
     bench.run(0.5)
     sent = len([frame for frame in bench.sent if frame.function == Function.SET_RAW_RC]) - before
-    assert sent <= 21, "not the 25 of a healthy link: what waits would be obeyed late"
+    assert sent <= 21, "not the 25 of a healthy link: waiting sticks would be obeyed late"
 
 
 def sticks(bench: Bench) -> list[list[int]]:
-    """What was sent of them."""
+    """Return the stick frames sent."""
     return [channels(frame.payload) for frame in bench.sent if frame.function == Function.SET_RAW_RC]
 
 
-def test_a_flight_controller_that_stands_still_is_left_with_few_sticks() -> None:
-    """A pseudo-terminal or a socket took them all, and it obeyed seconds of old ones when it went on."""
+def test_a_paused_flight_controller_is_left_with_few_sticks() -> None:
+    """A pseudo-terminal or a socket accepted them all, and it obeyed seconds of old ones when it resumed."""
     bench = Bench()
     bench.take_off()
     bench.fly(pitch=0.3)
@@ -455,10 +455,10 @@ def test_a_flight_controller_that_stands_still_is_left_with_few_sticks() -> None
         bench.run(0.5)
     assert bench.sink.link_state is LinkState.LOST
     assert len(sticks(bench)) <= 4 + 9 + 3, "four, then ten a second until it is lost, then three"
-    assert sticks(bench)[-1][:2] == [1500, 1500], "what is obeyed last is level"
+    assert sticks(bench)[-1][:2] == [1500, 1500], "the last ones obeyed are level"
 
 
-def test_nothing_but_questions_and_stops_is_sent_while_the_link_is_lost() -> None:
+def test_only_requests_and_stops_are_sent_while_the_link_is_lost() -> None:
     bench = Bench()
     bench.take_off()
     bench.deaf = True
@@ -470,7 +470,7 @@ def test_nothing_but_questions_and_stops_is_sent_while_the_link_is_lost() -> Non
             bench.session.command(Attitude(pitch=0.3, climb=0.5), bench.clock.now_ns)
         bench.run(0.1)
     assert not sticks(bench)
-    assert len(bench.sent) >= 6, "it is still asked"
+    assert len(bench.sent) >= 6, "requests continue"
     bench.session.command(EmergencyStop(), bench.clock.now_ns)
     bench.tick()
     assert sticks(bench)
@@ -479,8 +479,8 @@ def test_nothing_but_questions_and_stops_is_sent_while_the_link_is_lost() -> Non
     assert bench.feedback.state in (FlightState.EMERGENCY, FlightState.LANDED)
 
 
-def test_what_is_found_again_gets_no_sticks_before_it_has_told_its_state() -> None:
-    """Another pilot may have it by then, or it may stand: sticks of before the loss are not for it."""
+def test_a_vehicle_found_again_gets_no_sticks_before_it_reports_its_state() -> None:
+    """Another pilot may have it by then, or it may be on the ground: earlier sticks are not for it."""
     bench = Bench()
     bench.take_off()
     bench.deaf = True
@@ -495,8 +495,8 @@ def test_what_is_found_again_gets_no_sticks_before_it_has_told_its_state() -> No
 
 
 @pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
-def test_what_is_found_again_in_flight_is_not_steered_by_guesses(function: Function) -> None:
-    """One lost answer made its arm switch or its order of sticks unknown: it was disarmed in the air."""
+def test_a_vehicle_found_again_in_flight_is_not_steered_by_guesses(function: Function) -> None:
+    """One lost answer left its arm switch or stick order unknown: it was disarmed in the air."""
     bench = Bench()
     bench.take_off()
     bench.fly(climb=0.8)
@@ -514,10 +514,10 @@ def test_what_is_found_again_in_flight_is_not_steered_by_guesses(function: Funct
     bench.unanswered = set()
     bench.run(2.5)
     assert bench.board.armed
-    assert len(bench.texts("firmware")) == 2, "they were read at last"
+    assert len(bench.texts("firmware")) == 2, "they were finally read"
 
 
-def test_what_does_not_tell_the_order_of_its_sticks_is_asked_until_it_does() -> None:
+def test_the_order_of_the_sticks_is_requested_until_it_is_known() -> None:
     bench = Bench()
     bench.unanswered = {Function.RX_MAP}
     bench.run(5.0)
@@ -545,7 +545,7 @@ def test_emergency_stop_until_the_reset() -> None:
     assert [*states, bench.feedback.state] == [FlightState.EMERGENCY, FlightState.LANDED]
 
 
-def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None:
+def test_a_stop_is_sent_at_once_to_a_lagging_flight_controller() -> None:
     bench = Bench()
     bench.take_off()
     bench.deaf = True
@@ -560,8 +560,8 @@ def test_a_stop_is_sent_at_once_though_the_flight_controller_is_behind() -> None
 
 @pytest.mark.parametrize("silent", [False, True])
 @pytest.mark.parametrize("function", [Function.BOXNAMES, Function.MODE_RANGES, Function.RX_MAP])
-def test_a_stop_reaches_what_does_not_tell_its_settings(function: Function, silent: bool) -> None:
-    """It was not sent at all to what a new proxy found in flight."""
+def test_a_stop_reaches_a_vehicle_that_does_not_report_its_settings(function: Function, silent: bool) -> None:
+    """It was not sent at all to a vehicle that a new proxy found in flight."""
     bench = Bench(BoardSettings(failsafe=FailsafeConfig(20.0, 60.0, 1000, 10.0, 1)))
     bench.take_off()
     bench.reconnect()
@@ -572,8 +572,8 @@ def test_a_stop_reaches_what_does_not_tell_its_settings(function: Function, sile
     bench.until(lambda: not bench.board.armed, 0.1)
 
 
-def test_a_stop_waits_for_no_settings() -> None:
-    """A new proxy had to read nine answers first."""
+def test_a_stop_does_not_wait_for_settings() -> None:
+    """A new proxy used to read nine answers first."""
     bench = Bench()
     bench.take_off()
     bench.reconnect()
@@ -582,14 +582,14 @@ def test_a_stop_waits_for_no_settings() -> None:
     assert not bench.board.armed
 
 
-#: Its arm switch is on while it is low, where every guess puts it.
+#: An arm switch that is on when low, where every guess puts it.
 INVERTED = BoardSettings(ranges=(ModeRange(0, 0, 900, 1300), ModeRange(1, 1, 900, 2100)))
 
 
 @pytest.mark.parametrize("silent", [Function.STATUS, Function.MODE_RANGES, Function.RX_MAP, None])
 @pytest.mark.parametrize("text", ["msp://tcp:127.0.0.1:5761", "msp://tcp:127.0.0.1:5761?override=1"])
-def test_no_stop_arms_what_stands(silent: Function | None, text: str) -> None:
-    """Before its settings are read its arm switch can only be guessed, and a low one may be on."""
+def test_no_stop_arms_a_vehicle_on_the_ground(silent: Function | None, text: str) -> None:
+    """Before its settings are read its arm switch is a guess, and a low one may be on."""
     bench = Bench(INVERTED)
     bench.ready()
     bench.reconnect(text)
@@ -602,8 +602,8 @@ def test_no_stop_arms_what_stands(silent: Function | None, text: str) -> None:
 
 
 @pytest.mark.parametrize("silent", [Function.RX_MAP, Function.BOXNAMES])
-def test_a_stop_keeps_to_the_switches_that_an_earlier_round_of_questions_found(silent: Function) -> None:
-    """While they were asked for again, it fell back to guesses for some frames."""
+def test_a_stop_keeps_the_switches_found_in_an_earlier_round(silent: Function) -> None:
+    """While they were requested again, it fell back to guesses for some frames."""
     bench = Bench(INVERTED)
     bench.ready()
     bench.reconnect()
@@ -614,13 +614,13 @@ def test_a_stop_keeps_to_the_switches_that_an_earlier_round_of_questions_found(s
     for _ in range(round(2.0 / TICK_S)):
         bench.tick()
         assert not bench.board.armed
-    assert bool(sticks(bench)) is (silent is Function.RX_MAP), "without names it only tells that it stands"
+    assert bool(sticks(bench)) is (silent is Function.RX_MAP), "without names it only reports that it is disarmed"
     assert all(widths[4] > 1300 for widths in sticks(bench))
 
 
 @pytest.mark.parametrize("silent", [{Function.BOXNAMES}, {Function.BOXIDS}])
-def test_a_stop_reaches_what_flies_with_an_inverted_switch_and_does_not_name_its_modes(silent: set[int]) -> None:
-    """It was sent throttle off, with the arm switch on: its motors ran on, and nothing ended that."""
+def test_a_stop_reaches_a_flying_vehicle_with_an_inverted_switch_and_unknown_modes(silent: set[int]) -> None:
+    """It was sent throttle off with the arm switch on: its motors kept running, and nothing ended that."""
     bench = Bench(replace(INVERTED, failsafe=FailsafeConfig(20.0, 60.0, 1000, 10.0, 1)))
     bench.take_off()
     bench.reconnect()
@@ -629,13 +629,13 @@ def test_a_stop_reaches_what_flies_with_an_inverted_switch_and_does_not_name_its
     assert bench.board.armed
     bench.session.command(EmergencyStop(), bench.clock.now_ns)
     bench.until(lambda: not bench.board.armed, 2.0)
-    for _ in range(round(14.0 / TICK_S)):  # over several rounds of questions, and after it is given up
+    for _ in range(round(14.0 / TICK_S)):  # over several rounds of requests, and after it has expired
         bench.tick()
         assert not bench.board.armed
 
 
 @pytest.mark.parametrize("silent", [Function.BOXNAMES, Function.BOXIDS, Function.MODE_RANGES])
-def test_no_stop_arms_what_tells_neither_whether_it_stands_nor_the_names_of_its_modes(silent: Function) -> None:
+def test_no_stop_arms_a_vehicle_with_unknown_state_and_mode_names(silent: Function) -> None:
     bench = Bench(INVERTED)
     bench.ready()
     bench.reconnect()
@@ -646,18 +646,18 @@ def test_no_stop_arms_what_tells_neither_whether_it_stands_nor_the_names_of_its_
         assert not bench.board.armed
 
 
-def test_a_stop_takes_the_throttle_away_where_the_order_of_the_sticks_is_not_known() -> None:
-    """The middle of roll may be half of the throttle: a stop that no arm switch carries went out so."""
+def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -> None:
+    """The centre of roll may be half throttle; a stop without an arm switch was sent like that."""
     setpoints = SetpointController()
     setpoints.on_report(Report(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)
     assert setpoints.channels(10**9)[:4] == [1000] * 4
-    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_told=True), "")
+    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_known=True), "")
     assert setpoints.channels(10**9)[:4] == [1000, 1500, 1500, 1500]
 
 
-def test_a_stop_reaches_what_can_not_be_heard_by_a_new_proxy() -> None:
-    """What flies may hear it, and what stands had no sticks for so long that it wants its arm switch off first."""
+def test_a_stop_by_a_new_proxy_reaches_a_vehicle_that_is_not_received() -> None:
+    """A flying one may receive it; one on the ground got no sticks for a while, so its arm switch must first be off."""
     bench = Bench()
     bench.take_off()
     bench.reconnect()
@@ -666,7 +666,7 @@ def test_a_stop_reaches_what_can_not_be_heard_by_a_new_proxy() -> None:
     bench.until(lambda: not bench.board.armed, 0.6)
 
 
-def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it_over() -> None:
+def test_a_stop_while_a_flying_vehicle_is_found_is_not_undone_by_adopting_it() -> None:
     bench = Bench()
     bench.take_off()
     bench.reconnect()
@@ -678,8 +678,8 @@ def test_a_stop_of_what_is_just_being_found_in_flight_is_not_undone_by_taking_it
     assert bench.feedback.state is FlightState.EMERGENCY
 
 
-def test_what_does_not_disarm_by_a_stop_is_not_told_to_have_landed() -> None:
-    """Neither while it is stopped, nor when that is given up: nobody would look at it, or land it, any more."""
+def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() -> None:
+    """Neither during the stop nor after it has expired: else no pilot would look at it, or land it, any more."""
     setpoints, now_ns = SetpointController(), 10**9
     setpoints.on_report(Report(True), now_ns)
     setpoints.adopt(0.3, now_ns)
@@ -706,8 +706,8 @@ def test_what_does_not_disarm_by_a_stop_is_not_told_to_have_landed() -> None:
     assert "still armed" not in setpoints.ask_takeoff(now_ns)
 
 
-def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_is_back() -> None:
-    """Its failsafe has it in the air for minutes: the stop was given up long before, and it is flown on."""
+def test_a_stop_pressed_during_a_long_loss_does_not_disarm_the_vehicle_afterwards() -> None:
+    """Its failsafe keeps it in the air for minutes: the stop has long expired, and the flight continues."""
     bench = Bench(BoardSettings(failsafe=FailsafeConfig(1.5, 60.0, 1322, 10.0, 0)))
     bench.take_off()
     bench.cut = True
@@ -725,7 +725,7 @@ def test_a_stop_pressed_in_a_long_loss_does_not_disarm_what_flies_when_the_link_
     assert {feedback.state for feedback in bench.sink.feedbacks} == {FlightState.FLYING}
 
 
-def test_a_crash_disarms_and_is_told() -> None:
+def test_a_crash_disarms_and_is_reported() -> None:
     bench = Bench()
     bench.take_off()
     bench.board.crashed()
@@ -743,25 +743,25 @@ def test_override_needs_its_switch_and_a_receiver() -> None:
     bench = Bench(text=OVERRIDE)
     bench.run(1.0)
     told = " ".join(bench.texts("setup"))
-    assert "no switch gives the sticks away" in told
-    assert "there is no pilot's" in told
+    assert "no switch hands over the sticks" in told
+    assert "not a pilot's" in told
     assert "holds the last sticks for ever" in told
-    with pytest.raises(DriverError, match="no switch gives"):
+    with pytest.raises(DriverError, match="no switch hands"):
         bench.fly(climb=0.5)
     assert options(OVERRIDE).override
 
 
-def test_actions_that_it_does_not_name_are_no_surprise() -> None:
+def test_unsupported_actions_are_no_surprise() -> None:
     bench = Bench()
     with pytest.raises(AssertionError):
         bench.session.command(Hover(), bench.clock.now_ns)
 
 
-def test_what_does_not_leave_the_ground_is_given_up() -> None:
+def test_a_vehicle_that_does_not_leave_the_ground_is_given_up() -> None:
     bench = Bench()
     bench.ready()
     setpoints = bench.session.setpoints
-    setpoints.limits = replace(setpoints.limits, throttle=0.2)  # less than carries it
+    setpoints.limits = replace(setpoints.limits, throttle=0.2)  # less than the hover throttle
     bench.fly(climb=0.5)
     bench.until(lambda: bool(bench.texts("no_takeoff")), 5.0)
     assert "did not leave the ground at 20% throttle" in bench.texts("no_takeoff")[0]
@@ -770,7 +770,7 @@ def test_what_does_not_leave_the_ground_is_given_up() -> None:
         bench.fly(climb=0.5)
 
 
-def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
+def test_a_climb_lost_before_the_lift_off_ends_the_take_off() -> None:
     bench = Bench(BoardSettings(barometer=False, gps=False))
     bench.ready()
     bench.fly(climb=0.5)
@@ -780,8 +780,8 @@ def test_a_climb_that_is_lost_before_the_lift_off_ends_the_take_off() -> None:
     assert "no longer measured" in bench.texts("no_takeoff")[0]
 
 
-def test_the_throttle_is_not_raised_while_the_flight_controller_is_not_heard() -> None:
-    """Poses still told its climb, and the take-off went on asking for one."""
+def test_the_throttle_does_not_rise_while_the_flight_controller_is_silent() -> None:
+    """Poses still measured its climb, and the take-off kept requesting one."""
     bench = Bench()
     bench.ready()
     bench.fly(climb=0.5)
@@ -791,13 +791,13 @@ def test_the_throttle_is_not_raised_while_the_flight_controller_is_not_heard() -
         with suppress(DriverError):
             bench.session.command(Attitude(climb=0.5), bench.clock.now_ns)
         bench.tick()
-    assert "nothing is received" in bench.texts("no_takeoff")[0]
+    assert "it sends no data" in bench.texts("no_takeoff")[0]
     assert not bench.board.armed
     assert bench.height_m < 0.06
 
 
-def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
-    """``connect()`` returned seconds before it could be armed, and nothing said so."""
+def test_a_vehicle_that_has_just_started_says_what_it_waits_for() -> None:
+    """``connect()`` returned seconds before it could be armed, without a word about that."""
     bench = Bench(BoardSettings(boot_s=5.0))
     bench.until(lambda: bench.sink.newest is not None, 2.0)
     state, reason = bench.sink.links[-1]
@@ -813,18 +813,18 @@ def test_one_that_was_started_just_now_says_what_it_waits_for() -> None:
     settles.until(lambda: settles.sink.links[-1] == (LinkState.UP, ""), 6.0)
     stays = Bench(BoardSettings(boot_s=5.0, flags=bit("MSP")))
     stays.until(lambda: stays.sink.newest is not None, 2.0)
-    assert stays.sink.links[-1] == (LinkState.UP, ""), "what keeps it from being armed does not pass by itself"
+    assert stays.sink.links[-1] == (LinkState.UP, ""), "the obstacle does not pass with time"
 
 
-# Beside a real one ----------------------------------------------------------------------------------------------------
+# Compared with a real one ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("number", sorted(EMPTY_WRITES))
-def test_an_empty_write_is_acknowledged_as_by_a_real_one_and_changes_nothing(number: int) -> None:
-    """A configurator was told that its write was refused. Compared with Betaflight 4.6.0's own simulation."""
+def test_an_empty_write_is_acknowledged_as_by_a_real_one_without_effect(number: int) -> None:
+    """A configurator's write was reported as refused. Compared with Betaflight 4.6.0 SITL."""
     bench = Bench()
     reply = bench.board.answer(Frame(number, b""), bench.clock.now_ns)
     assert reply == Frame(number, b"", Direction.REPLY)
     written = bench.board.answer(Frame(number, b"\0"), bench.clock.now_ns)
     assert written is not None
-    assert written.direction is Direction.ERROR, "what is written is not kept"
+    assert written.direction is Direction.ERROR, "the written value is not kept"

@@ -1,4 +1,4 @@
-"""The driver keeps the drivers' contract, against the emulated Betaflight: by its own sensors, and by poses."""
+"""The drivers' contract, checked against the emulated Betaflight: with its own sensors, and with poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.support.betaflight import Cameras, SeenDriver, world
 
 
 class TestBetaflight(DriverSuite):
-    """The vehicle's own barometer and GPS."""
+    """With the vehicle's own barometer and GPS."""
 
     firmware: BetaflightFirmware
     uri = "msp://tcp:127.0.0.1:5761"
@@ -45,7 +45,7 @@ class TestBetaflight(DriverSuite):
 
 @pytest.mark.slow
 class TestBetaflightSeenByCameras(TestBetaflight):
-    """Poses from outside tell height, climb and velocity."""
+    """External poses provide height, climb and velocity."""
 
     cameras: Cameras
 

@@ -1,4 +1,4 @@
-"""Pause, seek and speed of a replay: by a clock of the test's own, and through a proxy."""
+"""Pause, seek and speed of a replay: with a manual clock, and through a proxy."""
 
 from __future__ import annotations
 
@@ -37,19 +37,19 @@ END_S = 3.9  #: within 0.1 s of the end of the flight
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four seconds with ten frames and fifty states a second. Not to be changed."""
+    """Four seconds with ten frames and fifty states a second. Don't change it."""
     return write_flight(tmp_path_factory.mktemp("flights") / "flight.mcap", Plan(seconds=4.0, lossy=False))
 
 
 class Script:
-    """A replay on this thread, in no time: while the player waits, the clock goes on to what is to be done next."""
+    """A replay on this thread, without waiting: when the player waits, the clock jumps to the next due time."""
 
     def __init__(self, path: Path, *actions: tuple[float, Action], loop: bool = False, until_s: float = 60.0) -> None:
         recording = Recording.open(path)
         self.source = ReplaySource(recording, recording.drone())
         self.playback = Playback(self.source.seconds)
         self.sink = RecordingSink(keep=4096)
-        self._clock = ManualClock(monotonic_ns() - nanoseconds(1000.0))  # a sink wants no times of the future
+        self._clock = ManualClock(monotonic_ns() - nanoseconds(1000.0))  # a sink wants no times in the future
         self._begin_ns = self._clock.now_ns
         self._until_ns = self._begin_ns + nanoseconds(until_s)
         self._actions = [(self._begin_ns + nanoseconds(at_s), action) for at_s, action in actions]
@@ -69,12 +69,12 @@ class Script:
             self._clock.now_ns = due_ns
 
     def at_s(self, captured_ns: int) -> float:
-        """A time stamp as seconds since the script began."""
+        """Return a time stamp as seconds since the script started."""
         return (captured_ns - self._begin_ns) / 1e9
 
     @property
     def held(self) -> list[Feedback]:
-        """What was published while it was paused."""
+        """Return the feedback published while paused."""
         return [state for state in self.sink.feedbacks if (state.native or {})["replay.paused"]]
 
     def frame_of(self, state: Feedback) -> SeenFrame:
@@ -99,7 +99,7 @@ def at_speed(speed: float) -> Action:
 
 
 def number_of(frame: SeenFrame) -> int:
-    """Which frame of the flight it is: its bright column moves by three pixels with each."""
+    """Return a frame's number in the flight: its bright column moves by three pixels per frame."""
     column = int(np.argmax(frame.pixels[:, :, 2].mean(axis=0)))
     return next(number for number in range(1, 21) if (number * 3) % WIDTH in range(column - 1, column + 2))
 
@@ -108,7 +108,7 @@ def recorded_state(at_ms: int) -> Feedback:
     return feedback_at(Plan(seconds=4.0), at_ms, 1)
 
 
-def test_a_paused_seek_shows_picture_and_state_of_one_instant(flight: Path) -> None:
+def test_a_paused_seek_shows_image_and_state_of_one_instant(flight: Path) -> None:
     script = Script(flight, (1.0, paused), (1.5, to(0.5)), (2.0, to(1.71)), (3.0, played))
     shown = {(state.native or {})["replay.position_s"]: state for state in script.held}
     assert [round(float(position), 2) for position in shown if not isinstance(position, str | bool | tuple)] == [
@@ -120,28 +120,28 @@ def test_a_paused_seek_shows_picture_and_state_of_one_instant(flight: Path) -> N
         state = shown[position_s]
         frame = script.frame_of(state)
         assert number_of(frame) == frame_ms // 100 + 1
-        captured_ms = frame_ms - 30  # the state of then: 20 ms apart, captured 4 ms before they were published
+        captured_ms = frame_ms - 30  # the state at that time: 20 ms apart, captured 4 ms before publishing
         nearest = min(range(0, 4000, 20), key=lambda at_ms: abs(at_ms - 4 - captured_ms))
         assert state.position_m == pytest.approx(recorded_state(nearest).position_m)
         assert (state.native or {})["replay.applied"] in ("takeoff", "velocity")
 
 
-def test_times_never_go_back_and_nothing_is_old(flight: Path) -> None:
+def test_times_never_go_back_and_samples_are_fresh(flight: Path) -> None:
     script = Script(flight, (2.0, to(0.2)), (3.0, paused), (3.5, to(3.0)), (3.8, to(0.0)), (4.0, played))
     for captured in (
         [one.captured_ns for one in script.sink.feedbacks],
         [one.captured_ns for one in script.sink.frames],
     ):
         assert captured == sorted(captured)
-        assert all(later - earlier < 300 * MS for earlier, later in pairwise(captured)), "no silence that looks lost"
+        assert all(later - earlier < 300 * MS for earlier, later in pairwise(captured)), "no suspicious silence"
     jumps = [(state.native or {})["replay.jumps"] for state in script.sink.feedbacks]
     assert (jumps[0], jumps[-1]) == (0, 3)
 
 
-def test_it_goes_on_where_it_was_held(flight: Path) -> None:
+def test_it_resumes_where_it_was_paused(flight: Path) -> None:
     script = Script(flight, (1.001, paused), (31.001, played))
     playing = [state for state in script.sink.feedbacks if not (state.native or {})["replay.paused"]]
-    assert len(playing) == 200, "nothing is left out, and nothing comes twice"
+    assert len(playing) == 200, "nothing is missing, and nothing is repeated"
     assert [state.position_m for state in playing] == [recorded_state(at).position_m for at in range(0, 4000, 20)]
     assert script.at_s(playing[-1].captured_ns) == pytest.approx(34.0, abs=0.1)
     assert len(script.held) == pytest.approx(150, abs=2)
@@ -156,14 +156,14 @@ def test_speed_changes_at_once(flight: Path) -> None:
     assert (script.sink.feedbacks[-1].native or {})["replay.speed"] == 0.5
 
 
-def test_the_end_is_no_end_for_who_goes_back(flight: Path) -> None:
+def test_a_viewer_can_seek_back_from_the_end(flight: Path) -> None:
     script = Script(flight, (10.0, to(END_S)), (20.0, played), (30.0, paused), (31.0, to(1.0)))
     assert [state for state, _ in script.sink.links] == [
         LinkState.UP,
         *(LinkState.CLOSED, LinkState.UP) * 3,
-    ], "closed at each end; held at last"
+    ], "closed at each end; finally paused"
     assert (script.sink.feedbacks[-1].native or {})["replay.position_s"] == 1.0
-    assert script.sink.feedback_count > 2 * 200, "played again from its begin"
+    assert script.sink.feedback_count > 2 * 200, "played again from the start"
 
 
 def test_a_loop_is_a_jump(flight: Path) -> None:
@@ -172,11 +172,11 @@ def test_a_loop_is_a_jump(flight: Path) -> None:
     assert (native["replay.loops"], native["replay.jumps"]) == (2, 2)
 
 
-def test_wherever_it_goes_it_finds_its_way_without_reading_all(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_seek_reads_only_part_of_the_file(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = Script(flight, until_s=0.0)
     parts = script.source._recording.found.pieces
     assert len(parts) > 8
-    script.source.moment(BEGIN_NS + 2000 * MS)  # learns where the parts begin
+    script.source.moment(BEGIN_NS + 2000 * MS)  # finds the start of each part
     read: list[int] = []
     real = Recording._piece
 
@@ -206,7 +206,7 @@ def test_wherever_it_goes_it_finds_its_way_without_reading_all(flight: Path, mon
         max_size=8,
     )
 )
-def test_whatever_is_written_times_grow_and_positions_are_in_the_recording(
+def test_with_any_writes_times_grow_and_positions_stay_in_the_recording(
     flight: Path, actions: list[tuple[float, Action]]
 ) -> None:
     script = Script(flight, *sorted(actions, key=lambda action: action[0]), until_s=8.0)
@@ -221,7 +221,7 @@ def test_whatever_is_written_times_grow_and_positions_are_in_the_recording(
     st.integers(0, 10**12),
     st.floats(0.01, 1000.0),
 )
-def test_a_timeline_can_be_read_both_ways(speed: float, begin: int, origin: int, passed: int, other: float) -> None:
+def test_a_timeline_is_invertible(speed: float, begin: int, origin: int, passed: int, other: float) -> None:
     timeline = Timeline(speed, begin, origin)
     now_ns = origin + passed
     recorded_ns = timeline.recorded(now_ns)
@@ -242,14 +242,14 @@ def test_a_timeline_can_be_read_both_ways(speed: float, begin: int, origin: int,
         (PAUSED, 1, "true or false"),
     ],
 )
-def test_what_it_does_not_take(name: str, value: skyloop.messages.Value, words: str) -> None:
+def test_invalid_values_are_refused(name: str, value: skyloop.messages.Value, words: str) -> None:
     with pytest.raises(ParameterError, match=words):
         Playback(4.0).set(name, value)
     with pytest.raises(UnknownNameError):
         Playback(4.0).set("replay.colour", 1.0)
 
 
-def test_in_step_it_refuses_and_says_why(flight: Path) -> None:
+def test_in_step_it_refuses_with_the_reason(flight: Path) -> None:
     with skyloop.connect(f"replay://{flight}?speed=max") as drone:
         with pytest.raises(ParameterError, match="in step with its application"):
             drone.config["replay.position_s"] = 1.0
@@ -270,12 +270,12 @@ def served(flight: Path) -> Iterator[MemoryServer]:
         proxy.end()
 
 
-def test_who_watches_moves_it_and_a_controller_goes_on(flight: Path) -> None:
+def test_a_viewer_moves_it_and_a_controller_continues(flight: Path) -> None:
     with (
         served(flight) as server,
         open_drone(server.dial, app="controller", authority=Authority(priority=0), on_exit="hover") as controller,
         open_drone(server.dial, app="page", access="observe") as watching,
-        PilotConnection.open(server.dial, "page of a pilot", 5.0) as pilot,  # without the authority
+        PilotConnection.open(server.dial, "page of a pilot", 5.0) as pilot,  # without authority
     ):
         assert controller.authority.state == "held"
         pilot.config["replay.paused"] = True
@@ -284,7 +284,7 @@ def test_who_watches_moves_it_and_a_controller_goes_on(flight: Path) -> None:
         assert pilot.config["replay.position_s"] == 1.0
         assert controller.authority.state == "held"
         newest = 0
-        for _ in range(2):  # frames go on, each newer, also for whoever comes late
+        for _ in range(2):  # frames continue, each newer, also for late subscribers
             frame = watching.next_frame()
             assert frame.captured_ns > newest
             newest = frame.captured_ns
@@ -294,4 +294,4 @@ def test_who_watches_moves_it_and_a_controller_goes_on(flight: Path) -> None:
         with pytest.raises(skyloop.errors.AuthorityError):
             watching.config["replay.paused"] = False
         kinds = [event.text for event in watching.recent_events() if "replay." in event.text]
-        assert kinds == [], "moving it is no event: a hand on the bar would fill the list"
+        assert kinds == [], "moving it is no event: dragging the slider would fill the list"

@@ -1,4 +1,4 @@
-"""What a replay tells, when, and what it does with commands."""
+"""A replay's samples, their times, and its reaction to commands."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ WAIT_S = 10.0
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Not to be changed."""
+    """Don't change it."""
     return write_flight(tmp_path_factory.mktemp("flights") / "flight.mcap")
 
 
@@ -74,7 +74,7 @@ def played(path: Path, query: str = "?speed=20", keep: int = 4096) -> Iterator[t
     assert not sink.problems, sink.problems
 
 
-def test_everything_is_told_again(flight: Path) -> None:
+def test_all_samples_are_published_again(flight: Path) -> None:
     with played(flight) as (_, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
         assert sink.links[0] == (LinkState.UP, "")
@@ -110,7 +110,7 @@ def test_the_recorded_commands_are_in_the_native_telemetry(flight: Path) -> None
     assert positions[-1] == pytest.approx(1.98, abs=0.03)
 
 
-def test_an_error_of_our_own_is_told_in_words(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_internal_error_is_reported_in_words(flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise TypeError("float() argument must be a string or a real number, not 'NoneType'")
 
@@ -119,10 +119,10 @@ def test_an_error_of_our_own_is_told_in_words(flight: Path, monkeypatch: pytest.
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, WAIT_S)
         (event,) = [event for event in sink.events if event.severity is Severity.ERROR]
     assert event.text == sink.links[-1][1]
-    assert "can't be played beyond 0.0 s: an error in Skyloop, which the proxy's output has" in event.text
+    assert "can't be played beyond 0.0 s: an error in Skyloop (see the proxy's output)" in event.text
 
 
-def test_events_of_the_old_proxy_are_no_news_of_the_new_one(flight: Path) -> None:
+def test_the_old_proxys_events_are_not_repeated(flight: Path) -> None:
     with played(flight) as (_, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
         events = list(sink.events)
@@ -155,7 +155,7 @@ def test_it_is_paced_by_the_recording(flight: Path) -> None:
     assert 7 * MS < ages[len(ages) // 2] < 30 * MS  # captured 30 ms before it was published, at four times the speed
 
 
-def test_it_starts_where_it_is_told_to(flight: Path) -> None:
+def test_it_starts_where_requested(flight: Path) -> None:
     with played(flight, "?speed=20&start=1.5") as (driver, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
         assert sink.feedback_count == 25
@@ -172,7 +172,7 @@ def test_it_starts_over(flight: Path) -> None:
         assert sink.link_state is LinkState.UP
 
 
-def test_it_waits_for_somebody_to_look(flight: Path) -> None:
+def test_it_waits_for_a_viewer(flight: Path) -> None:
     driver, sink = driver_of(flight, "?speed=20&wait=1"), RecordingSink(watch=set())
     driver.open(sink)
     try:
@@ -185,7 +185,7 @@ def test_it_waits_for_somebody_to_look(flight: Path) -> None:
         driver.close()
 
 
-def test_frames_that_nobody_wants_are_not_decoded(flight: Path) -> None:
+def test_unwanted_frames_are_not_decoded(flight: Path) -> None:
     driver, sink = driver_of(flight, "?speed=50"), RecordingSink(watch=set())
     driver.open(sink)
     try:
@@ -208,7 +208,7 @@ def test_a_lost_link_is_lost_again(tmp_path: Path) -> None:
         assert [state for state, _ in sink.links] == [LinkState.UP, LinkState.LOST, LinkState.UP, LinkState.CLOSED]
 
 
-def test_a_cut_file_is_played_as_far_as_it_goes_and_that_is_told(tmp_path: Path, flight: Path) -> None:
+def test_a_cut_file_is_played_to_its_end_and_reported(tmp_path: Path, flight: Path) -> None:
     path = tmp_path / "cut.mcap"
     data = flight.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -218,7 +218,7 @@ def test_a_cut_file_is_played_as_far_as_it_goes_and_that_is_told(tmp_path: Path,
         assert any("the file was cut off" in event.text for event in sink.events)
 
 
-def test_commands_are_taken_and_change_nothing(flight: Path) -> None:
+def test_commands_are_accepted_without_effect(flight: Path) -> None:
     with played(flight) as (driver, _):
         assert driver.apply(Velocity(forward=0.5)) == Velocity(forward=0.5)
         assert driver.failsafe(Land())
@@ -226,7 +226,7 @@ def test_commands_are_taken_and_change_nothing(flight: Path) -> None:
 
 
 def merged(path: Path, plans: list[Plan]) -> Path:
-    """One recording of several drones, by the times of their flights."""
+    """Merge several drones' flights into one recording, by time."""
     with ExitStack() as stack:
         parts = []
         for plan in plans:
@@ -251,8 +251,8 @@ def merged(path: Path, plans: list[Plan]) -> Path:
     return path
 
 
-def test_each_drone_of_a_recording_gives_its_own_samples(tmp_path: Path) -> None:
-    """They flew at the same time: one a circle, the other stood, slower to tell, with another camera and battery."""
+def test_each_drone_of_a_recording_has_its_own_samples(tmp_path: Path) -> None:
+    """They flew at the same time: one a circle; the other hovered, with slower feedback, another camera and battery."""
     camera = CameraInfo("bottom", 64, 48, 5.0)
     standing = msgspec.structs.replace(CAPABILITIES, cameras=(camera,), description="the second one")
 
@@ -305,7 +305,7 @@ def test_capabilities(flight: Path, tmp_path: Path) -> None:
     path = write_flight(tmp_path / "plain.mcap", Plan(capabilities=plain, seconds=0.3))
     found = driver_of(path).capabilities()
     assert (found.actions, found.why_not) == (frozenset(), "it is a picture only")
-    assert [camera.name for camera in found.cameras] == ["front"]  # frames there were, whatever was announced
+    assert [camera.name for camera in found.cameras] == ["front"]  # frames were recorded, though not announced
 
 
 @pytest.mark.parametrize(
@@ -314,15 +314,15 @@ def test_capabilities(flight: Path, tmp_path: Path) -> None:
         ("?speed=0", "speed"),
         ("?speed=fast", "speed"),
         ("?start=-1", "start"),
-        ("?speed=max&loop=1", "neither with loop"),
+        ("?speed=max&loop=1", "combined with loop"),
     ],
 )
-def test_options_that_make_no_sense(flight: Path, query: str, words: str) -> None:
+def test_invalid_options(flight: Path, query: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         driver_of(flight, query)
 
 
-def test_what_can_not_be_played_says_so(flight: Path, tmp_path: Path) -> None:
+def test_an_unplayable_recording_is_reported(flight: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="names no file"):
         make_driver("replay://")
     missing = driver_of(tmp_path / "none.mcap")
@@ -331,7 +331,7 @@ def test_what_can_not_be_played_says_so(flight: Path, tmp_path: Path) -> None:
         missing.open(RecordingSink())
     with pytest.raises(UnknownNameError, match="drone"):
         driver_of(flight, "?drone=beta").open(RecordingSink())
-    with pytest.raises(UsageError, match=r"lasts 2\.0 s, and start is 7 s"):
+    with pytest.raises(UsageError, match=r"lasts 2\.0 s, but start is 7 s"):
         driver_of(flight, "?start=7").open(RecordingSink())
     with pytest.raises(UsageError, match=r"in step with one application: call skyloop\.connect"):
         driver_of(flight, "?speed=max").open(RecordingSink())
@@ -340,13 +340,13 @@ def test_what_can_not_be_played_says_so(flight: Path, tmp_path: Path) -> None:
 # Step by step ------------------------------------------------------------------------------------------------------
 
 
-def test_steps_tell_one_moment_each_and_leave_nothing_out(flight: Path) -> None:
+def test_each_step_publishes_one_moment_and_skips_none(flight: Path) -> None:
     driver, sink, clock = driver_of(flight, "?speed=max"), RecordingSink(keep=4096), ManualClock(BEGIN_NS)
     driver.clock = clock
     driver.open(sink)
     steps = driver.steps
     assert steps is not None
-    assert sink.feedback_count == 1  # the first state, for whoever connects
+    assert sink.feedback_count == 1  # the first state, for new subscribers
     while (due_ns := steps.due_ns) is not None:
         assert due_ns >= clock.now_ns
         clock.now_ns = due_ns
@@ -369,7 +369,7 @@ def test_a_timeline() -> None:
     assert timeline.at(1000) == 50_100
 
 
-def test_a_source_knows_its_begin(flight: Path) -> None:
+def test_a_source_knows_its_start(flight: Path) -> None:
     recording = Recording.open(flight)
     source = ReplaySource(recording, recording.drone())
     assert source.begin_ns == BEGIN_NS
@@ -387,7 +387,7 @@ def test_closing_ends_the_thread(flight: Path) -> None:
     assert threading.active_count() == before
 
 
-def test_the_page_lists_the_options_and_what_is_added_to_the_telemetry(flight: Path) -> None:
+def test_the_page_lists_the_options_and_the_added_telemetry(flight: Path) -> None:
     text = section("docs/replay.md", "## `replay://`")
     options, _, rest = text.partition("The vehicle's data is published again")
     assert {row[0].strip("`") for row in rows(options)} == KNOWN

@@ -1,4 +1,4 @@
-"""A replay keeps the drivers' contract, of a drone that flew and of a camera that can't."""
+"""The drivers' contract, checked with replays of a drone that flew and of a camera."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ class ReplaySuite(DriverSuite):
         return super().make(VehicleUri(uri.scheme, str(FOLDER["recordings"] / uri.place), uri.options))
 
     def test_flight(self) -> None:
-        raise unittest.SkipTest("a replay does what was recorded, whatever it is told")
+        raise unittest.SkipTest("a replay ignores commands")
 
     def test_a_landing_withdraws_a_takeoff(self) -> None:
-        raise unittest.SkipTest("a replay does what was recorded, whatever it is told")
+        raise unittest.SkipTest("a replay ignores commands")
 
     def test_emergency_stop_and_reset(self) -> None:
-        raise unittest.SkipTest("a replay does what was recorded, whatever it is told")
+        raise unittest.SkipTest("a replay ignores commands")
 
 
 class TestReplay(ReplaySuite):

@@ -1,7 +1,6 @@
 """GStreamer's RTSP server with one stream, /live: ``gst_rtsp_server.py PORT tcp|udp PIPELINE``. Prints its port.
 
-A program of its own, for a Python that has GStreamer's bindings: Debian's ``python3-gi`` and
-``gir1.2-gst-rtsp-server-1.0``.
+A separate program, for a Python with GStreamer's bindings: Debian's ``python3-gi`` and ``gir1.2-gst-rtsp-server-1.0``.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""``video://``: recordings played in order and in time, devices, and files that are not what they should be."""
+"""``video://``: files played in order and on time, devices, and files that are invalid."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FRAMES = 24
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clip of 24 grey pictures, 64×48 at 25 a second; picture n is of brightness 40 + 8 n."""
+    """A clip of 24 grey images, 64×48 at 25 a second; image n has brightness 40 + 8 n."""
     path = tmp_path_factory.mktemp("clip") / "clip.mp4"
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
@@ -59,7 +59,7 @@ def playing(uri: str, sink: RecordingSink) -> Iterator[Driver]:
 
 
 def play(uri: str, *, keep_pixels: bool = False, timeout_s: float = 20.0) -> RecordingSink:
-    """All of a recording."""
+    """Play a whole recording."""
     sink = RecordingSink(keep_pixels=keep_pixels)
     with playing(uri, sink):
         ended = sink.wait(lambda: sink.link_state in (LinkState.CLOSED, LinkState.LOST), timeout_s)
@@ -70,7 +70,7 @@ def play(uri: str, *, keep_pixels: bool = False, timeout_s: float = 20.0) -> Rec
 # Recordings ------------------------------------------------------------------------------------------------------
 
 
-def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
+def test_all_240_images_of_a_real_drone_arrive_in_order() -> None:
     sink = play(f"video://{recorded(LONG)}?{FAST}")
     assert sink.frame_counts == {"front": 240}
     assert sink.links == [(LinkState.UP, ""), (LinkState.CLOSED, "end of the recording after 240 frames")]
@@ -81,8 +81,8 @@ def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
     assert (newest.native["video.frames"], newest.native["video.damaged"]) == (240, 0)
 
 
-def test_pictures_of_a_real_drone_are_handed_on_as_they_came() -> None:
-    sink = RecordingSink(watch=set(), record=True)  # which is why it begins: nobody looks
+def test_encoded_images_of_a_real_drone_are_passed_on_unchanged() -> None:
+    sink = RecordingSink(watch=set(), record=True)  # starts it without viewers
     with playing(f"video://{recorded(LONG)}?{FAST}", sink) as driver:
         assert [camera.stream for camera in driver.capabilities().cameras] == ["h264"]
         assert sink.wait(lambda: len(sink.pictures) == 240, 20.0)
@@ -91,7 +91,7 @@ def test_pictures_of_a_real_drone_are_handed_on_as_they_came() -> None:
     assert not sink.frames
 
 
-def test_who_comes_late_gets_pictures_from_the_next_key_on() -> None:
+def test_a_late_subscriber_gets_images_from_the_next_key_frame_on() -> None:
     sink = RecordingSink(keep_pixels=False)
     with playing(f"video://{recorded(LONG)}?speed=20&fx=500", sink):
         assert sink.wait(lambda: sink.frame_counts["front"] > 3, 20.0)
@@ -119,7 +119,7 @@ def h264_clip(path: Path, b_frames: int) -> Path:
     return path
 
 
-def test_h264_in_a_file_is_handed_on_with_the_times_of_its_frames(tmp_path: Path) -> None:
+def test_h264_in_a_file_is_passed_on_with_its_frame_times(tmp_path: Path) -> None:
     path = h264_clip(tmp_path / "clip.mp4", 0)
     assert [camera.stream for camera in make_driver(f"video://{path}").capabilities().cameras] == ["h264"]
     sink = RecordingSink(record=True)
@@ -142,13 +142,13 @@ def test_h264_with_b_frames_has_no_stream_and_plays(tmp_path: Path) -> None:
     assert sink.frame_counts == {"front": FRAMES}
 
 
-def test_a_torn_start_is_waited_out() -> None:
+def test_a_torn_start_is_skipped() -> None:
     sink = play(f"video://{recorded(TORN)}?{FAST}", keep_pixels=True)
     assert sink.frame_counts == {"front": 17}
-    assert sink.frames[0].pixels.std() > 20  # a picture, not the grey of a decoder without its key frame
+    assert sink.frames[0].pixels.std() > 20  # an image, not the grey of a decoder without its key frame
 
 
-def test_pictures_come_at_the_times_of_their_stamps() -> None:
+def test_images_arrive_at_the_times_of_their_stamps() -> None:
     begun_ns = monotonic_ns()
     sink = play(f"video://{recorded(TORN)}?camera=nose")
     took_s = (monotonic_ns() - begun_ns) / 1e9
@@ -173,7 +173,7 @@ def test_a_clip_plays_in_order_with_its_intrinsics(clip: Path) -> None:
     assert intrinsics.distortion == (0.1, 0, 0, 0)
 
 
-def test_the_capabilities_tell_the_size_before_it_is_opened(clip: Path) -> None:
+def test_the_capabilities_have_the_size_before_it_is_opened(clip: Path) -> None:
     capabilities = make_driver(f"video://{clip}?fx=50").capabilities()
     camera = capabilities.cameras[0]
     assert (camera.name, camera.width, camera.height, camera.fps) == ("front", 64, 48, 25)
@@ -182,14 +182,14 @@ def test_the_capabilities_tell_the_size_before_it_is_opened(clip: Path) -> None:
     assert "not a vehicle" in capabilities.why_not
 
 
-def test_it_takes_no_command_and_is_always_safe(clip: Path) -> None:
+def test_it_accepts_no_command_and_is_always_safe(clip: Path) -> None:
     with playing(f"video://{clip}", RecordingSink()) as driver:
         with pytest.raises(UsageError, match="video does not support hover"):
             driver.apply(Hover())
         assert driver.failsafe(Hover())
 
 
-def test_it_begins_when_somebody_looks(clip: Path) -> None:
+def test_it_starts_with_a_viewer(clip: Path) -> None:
     sink = RecordingSink(watch=set())
     with playing(f"video://{clip}?{FAST}", sink):
         assert sink.wait(lambda: sink.feedback_count >= 3, 5.0)
@@ -199,7 +199,7 @@ def test_it_begins_when_somebody_looks(clip: Path) -> None:
     assert sink.frame_counts == {"front": FRAMES}
 
 
-def test_without_wait_it_plays_to_nobody(clip: Path) -> None:
+def test_without_wait_it_plays_without_viewers(clip: Path) -> None:
     sink = RecordingSink(watch=set())
     with playing(f"video://{clip}?{FAST}&wait=0", sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, 5.0)
@@ -213,7 +213,7 @@ def test_a_loop_starts_over(clip: Path) -> None:
     assert [state for state, _ in sink.links] == [LinkState.UP]
 
 
-def test_a_loop_whose_file_is_gone_is_told(clip: Path, tmp_path: Path) -> None:
+def test_a_loop_whose_file_is_gone_is_reported(clip: Path, tmp_path: Path) -> None:
     copy = tmp_path / "gone.mp4"
     copy.write_bytes(clip.read_bytes())
     sink = RecordingSink(watch=set())
@@ -225,7 +225,7 @@ def test_a_loop_whose_file_is_gone_is_told(clip: Path, tmp_path: Path) -> None:
     assert "cannot start over" in sink.links[-1][1]
 
 
-def test_numbered_pictures_play_as_well(tmp_path: Path) -> None:
+def test_numbered_images_play_as_well(tmp_path: Path) -> None:
     for n in range(5):
         with av.open(str(tmp_path / f"shot{n:03}.png"), "w", format="image2", options={"update": "1"}) as container:
             stream = container.add_stream("png", rate=1)
@@ -237,7 +237,7 @@ def test_numbered_pictures_play_as_well(tmp_path: Path) -> None:
     assert [int(frame.pixels.mean()) for frame in sink.frames] == [0, 50, 100, 150, 200]
 
 
-# What is wrong with the address or the file ----------------------------------------------------------------------
+# Invalid addresses and files -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -303,11 +303,11 @@ def _sound(folder: Path) -> Path:
         (_sound, FileFormatError, "sound.wav holds no video stream"),
     ],
 )
-def test_a_bad_file_is_told_when_opened(
+def test_a_bad_file_is_reported_on_opening(
     tmp_path: Path, make: Callable[[Path], Path], error: type[Exception], message: str
 ) -> None:
     driver = make_driver(f"video://{make(tmp_path)}")
-    assert driver.capabilities().cameras[0].name == "front"  # asking what it can do raises nothing
+    assert driver.capabilities().cameras[0].name == "front"  # asking for capabilities raises nothing
     with pytest.raises(error, match=message):
         driver.open(RecordingSink())
     driver.close()
@@ -329,7 +329,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_a_stream_that_was_cut_off_plays_as_far_as_it_goes(tmp_path: Path, share: float) -> None:
+def test_a_truncated_stream_plays_to_its_end(tmp_path: Path, share: float) -> None:
     whole = recorded(LONG).read_bytes()
     path = tmp_path / "cut.pave"
     path.write_bytes(whole[: int(len(whole) * share)])
@@ -340,7 +340,7 @@ def test_a_stream_that_was_cut_off_plays_as_far_as_it_goes(tmp_path: Path, share
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", [TORN, "clip.mp4"])
-def test_flipped_bits_end_in_no_error(tmp_path: Path, clip: Path, name: str, seed: int) -> None:
+def test_flipped_bits_cause_no_error(tmp_path: Path, clip: Path, name: str, seed: int) -> None:
     data = bytearray((clip if name == "clip.mp4" else recorded(name)).read_bytes())
     chance = random.Random(seed)
     for _ in range(12):
@@ -350,12 +350,12 @@ def test_flipped_bits_end_in_no_error(tmp_path: Path, clip: Path, name: str, see
     try:
         sink = play(f"video://{path}?{FAST}")
     except FileFormatError:
-        return  # so damaged that it can't be opened: told clearly
+        return  # too damaged to open: clearly reported
     assert sink.link_state in (LinkState.CLOSED, LinkState.LOST)
     assert not [event for event in sink.events if event.kind == "driver_error"]
 
 
-def test_damaged_pictures_are_left_out_up_to_the_next_key_frame(tmp_path: Path) -> None:
+def test_damaged_images_are_dropped_up_to_the_next_key_frame(tmp_path: Path) -> None:
     data = bytearray(recorded(LONG).read_bytes())
     at = data.find(b"PaVE", 20_000)
     data[at : at + 4] = b"xxxx"  # the header of the sixth frame or so
@@ -365,19 +365,19 @@ def test_damaged_pictures_are_left_out_up_to_the_next_key_frame(tmp_path: Path) 
     assert 225 < sink.frame_counts["front"] < 238
 
 
-def test_a_stream_without_a_key_frame_shows_nothing_and_says_so(tmp_path: Path) -> None:
+def test_a_stream_without_a_key_frame_shows_nothing_and_reports_that(tmp_path: Path) -> None:
     torn = recorded(TORN).read_bytes()
     path = tmp_path / "headless.pave"
     path.write_bytes(torn[:7431])  # the stale frame and the two P frames after it
     sink = play(f"video://{path}?{FAST}")
     assert not sink.frame_counts
-    assert sink.links[-1] == (LinkState.LOST, "no picture of the recording can be decoded")
+    assert sink.links[-1] == (LinkState.LOST, "no image of the recording can be decoded")
 
 
 # Devices ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_device_that_is_not_there_is_no_error() -> None:
+def test_a_missing_device_is_no_error() -> None:
     sink = RecordingSink()
     with playing("video:///dev/skyloop-no-such-camera?width=320&height=240&fps=15", sink) as driver:
         camera = driver.capabilities().cameras[0]
@@ -389,7 +389,7 @@ def test_a_device_that_is_not_there_is_no_error() -> None:
     assert not sink.events
 
 
-def test_a_file_that_is_no_camera_is_told() -> None:
+def test_a_file_that_is_no_camera_is_reported() -> None:
     sink = RecordingSink()
     with playing("video:///dev/null?exposure=10&gain=3", sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
@@ -398,7 +398,7 @@ def test_a_file_that_is_no_camera_is_told() -> None:
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A pipe below /dev that raw pictures are read from, with the options that a camera is asked by."""
+    """A pipe below /dev to read raw images from, with the options that a camera needs."""
     if not Path("/dev/shm").is_dir():
         pytest.skip("a file that looks like a device needs /dev/shm")
     monkeypatch.setattr("skyloop.drivers.live_camera.DEVICE_FORMAT", "rawvideo")
@@ -406,7 +406,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield Path(folder) / "video0"
 
 
-def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and_gain(device: Path) -> None:
+def test_a_device_that_disappears_is_reopened_with_exposure_and_gain(device: Path) -> None:
     sink = RecordingSink()
     asked = f"video://{device}?width=64&height=48&fps=25&exposure=8&gain=auto"
     with playing(asked, sink):
@@ -427,7 +427,7 @@ def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and
     assert newest is not None
     assert newest.native is not None
     assert int(str(newest.native["camera.received"])) >= 10
-    # A pipe is no device of Video4Linux: each setting that it refuses is told once.
+    # A pipe is no Video4Linux device: each refused setting is reported once.
     assert [event.text.split(":")[0] for event in sink.events] == ["camera"] * 2
     assert any("exposure" in event.text for event in sink.events)
     assert any("gain" in event.text for event in sink.events)
@@ -436,8 +436,8 @@ def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and
 @pytest.mark.parametrize(
     ("uri", "message"),
     [
-        ("video:///dev/video0?loop=1", "a live camera has no loop and no speed"),
-        ("video:///dev/video0?speed=2", "a live camera has no loop and no speed"),
+        ("video:///dev/video0?loop=1", "loop and speed are for files, not live cameras"),
+        ("video:///dev/video0?speed=2", "loop and speed are for files, not live cameras"),
         ("video:///tmp/x.mp4?gain=3", "only a device has gain"),
         ("video://rtp://:5600?format=mjpeg", "only a device has format"),
         ("video:///dev/video0?format=png", "format of video:// named 'png'"),
@@ -447,12 +447,12 @@ def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and
         ("video://rtsp:///live", "names no host"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(uri: str, message: str) -> None:
+def test_unsuitable_options_are_refused(uri: str, message: str) -> None:
     with pytest.raises((UsageError, UnknownNameError), match=message):
         make_driver(uri)
 
 
-def test_what_sends_h264_announces_a_stream() -> None:
+def test_an_h264_source_announces_a_stream() -> None:
     for uri, stream in {
         "video://rtsp://user:secret@camera/live": "h264",
         "video://rtp://:5600": "h264",
@@ -467,10 +467,10 @@ def test_what_sends_h264_announces_a_stream() -> None:
 
 @pytest.mark.parametrize(("turned", "matrix"), [("clockwise", (0, 1, -1, 0)), ("upside down", (-1, 0, 0, -1))])
 def test_a_phone_s_portrait_video_is_upright(tmp_path: Path, turned: str, matrix: tuple[int, int, int, int]) -> None:
-    """The sensor lies on its side; the container says how its pictures are turned."""
+    """The sensor lies on its side; the container stores the rotation."""
     path = tmp_path / "phone.mp4"
     picture = np.full((48, 64, 3), 40, np.uint8)
-    picture[:24, :32] = 220  # the top left corner of what is stored
+    picture[:24, :32] = 220  # the top left corner of the stored image
     with av.open(str(path), "w") as container:
         stream = container.add_stream("mpeg4", rate=25)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
@@ -486,11 +486,11 @@ def test_a_phone_s_portrait_video_is_upright(tmp_path: Path, turned: str, matrix
     seen = sink.frames[-1].pixels
     if turned == "clockwise":
         assert seen.shape == (64, 48, 3)
-        assert seen[10, 40].mean() > 180, "its bright corner is at the top right now"
+        assert seen[10, 40].mean() > 180, "its bright corner is now at the top right"
         assert seen[10, 8].mean() < 80
     else:
         assert seen.shape == (48, 64, 3)
         assert seen[40, 56].mean() > 180
     (camera,) = make_driver(f"video://{path}").capabilities().cameras
     assert (camera.height, camera.width) == seen.shape[:2]
-    assert camera.stream == "", "the stored pictures lie on their side"
+    assert camera.stream == "", "the stored images lie on their side"

@@ -1,7 +1,7 @@
-"""Cameras that GStreamer plays, as PX4's simulation, Jetsons and companion computers have it: RTSP, RTP and MPEG-TS.
+"""Cameras played by GStreamer, as in PX4's simulation, on Jetsons and companion computers: RTSP, RTP and MPEG-TS.
 
 They need Debian's gstreamer1.0-tools, -plugins-base, -good, -bad and -ugly, and for RTSP python3-gi and
-gir1.2-gst-rtsp-server-1.0, and are skipped without.
+gir1.2-gst-rtsp-server-1.0; without these they are skipped.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SERVER = Path(__file__).parent / "gst_rtsp_server.py"
 
 @functools.cache
 def launcher() -> str:
-    """``gst-launch-1.0``, if it has what the tests play; else they are skipped."""
+    """Return ``gst-launch-1.0`` if it has the tests' plugins; else skip."""
     program, inspect = shutil.which("gst-launch-1.0"), shutil.which("gst-inspect-1.0")
     if program is None or inspect is None:
         pytest.skip("needs GStreamer: apt install gstreamer1.0-tools gstreamer1.0-plugins-{base,good,bad,ugly}")
@@ -46,7 +46,7 @@ def launcher() -> str:
 
 @functools.cache
 def python_with_bindings() -> str:
-    """A Python with GStreamer's RTSP server; else the tests are skipped."""
+    """Return a Python with GStreamer's RTSP server; else skip."""
     needed = "import gi; gi.require_version('GstRtspServer', '1.0'); from gi.repository import GstRtspServer"
     for program in dict.fromkeys((sys.executable, "/usr/bin/python3")):
         if (
@@ -68,7 +68,7 @@ def running(command: list[str]) -> Iterator[subprocess.Popen[str]]:
 
 @contextmanager
 def serving(port: int, way: str, encoder: str = ENCODER) -> Iterator[int]:
-    """GStreamer's RTSP server; it is killed at the end. Yields its port."""
+    """Run GStreamer's RTSP server, killed at the end. Yields its port."""
     launcher()
     pipeline = f"{SOURCE} ! {encoder} ! rtph264pay name=pay0 pt=96"
     with running([python_with_bindings(), str(SERVER), str(port), way, pipeline]) as process:
@@ -93,12 +93,12 @@ def told(sink: RecordingSink) -> object:
 
 
 def comes(sink: RecordingSink, count: int = 45) -> None:
-    """So many frames and pictures come, the pictures can be decoded, and both have the same times."""
+    """Check that this many frames and images arrive, decode, and have the same times."""
     pictures, frames = len(sink.pictures) + count, sink.frame_counts["front"] + count
     assert sink.wait(lambda: len(sink.pictures) >= pictures and sink.frame_counts["front"] >= frames, PATIENCE_S), told(
         sink
     )
-    taken, shown = list(sink.pictures), list(sink.frames)  # more come meanwhile
+    taken, shown = list(sink.pictures), list(sink.frames)  # more arrive meanwhile
     assert taken[0].key
     assert {(picture.width, picture.height) for picture in taken} == {(WIDTH, HEIGHT)}
     assert {(frame.width, frame.height) for frame in shown} == {(WIDTH, HEIGHT)}
@@ -144,7 +144,7 @@ def test_a_transport_stream_over_udp() -> None:
         comes(sink)
 
 
-def test_a_sender_with_b_frames_is_shown_and_not_handed_on() -> None:
+def test_a_sender_with_b_frames_is_shown_but_not_passed_on() -> None:
     port = free_port()
     encoder = "x264enc speed-preset=veryfast bframes=2 b-adapt=false key-int-max=15 bitrate=800"
     sender = f"{launcher()} -q {SOURCE} ! {encoder} ! rtph264pay config-interval=1 ! udpsink host={HOST} port={port}"

@@ -1,4 +1,4 @@
-"""When recorded pictures are due, and when live ones were taken."""
+"""Due times of recorded images, and capture times of live ones."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from skyloop.vehicles.video.player import FilePacer
 MS = 1_000_000
 
 
-def test_stamps_are_kept_to_whatever_the_decoder_takes() -> None:
+def test_stamps_are_kept_however_long_decoding_takes() -> None:
     pacer = FilePacer(speed=1.0, period_s=0.04)
     due = [pacer.due_ns(0.04 * n, 100 * MS + n * 40 * MS + (n % 3) * 10 * MS) for n in range(10)]
     assert due == [100 * MS + n * 40 * MS for n in range(10)]
 
 
-def test_twice_the_speed_is_half_the_time() -> None:
+def test_twice_the_speed_takes_half_the_time() -> None:
     pacer = FilePacer(speed=2.0, period_s=0.04)
     assert [pacer.due_ns(stamp, 0) for stamp in (5.0, 5.04, 5.1)] == [0, 20 * MS, 50 * MS]
 
@@ -47,10 +47,10 @@ def test_live_a_slower_clock_is_followed() -> None:
         arrived = n * 33 * MS
         stamp_s = arrived * (1 - 1e-3) / NS_PER_S  # the camera's clock loses 1 ms a second
         age = arrived - clock.captured_ns(stamp_s, arrived)
-    assert age <= 4 * MS  # and would be 20 ms by now
+    assert age <= 4 * MS  # would be 20 ms by now
 
 
-def test_live_a_clock_that_is_set_back_is_learned_anew() -> None:
+def test_live_a_clock_that_is_set_back_is_learned_again() -> None:
     clock = LiveClock()
     assert clock.captured_ns(1000.0, 50 * MS) == 50 * MS
     assert clock.captured_ns(0.0, 90 * MS) == 90 * MS

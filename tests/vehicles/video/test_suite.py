@@ -1,4 +1,4 @@
-"""The video driver keeps the drivers' contract: with a recording, and with a camera over RTSP."""
+"""The drivers' contract, checked with a recording and with a camera over RTSP."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Video4Linux by the kernel's own structures, filled by hand as a webcam's driver fills them: no device is needed."""
+"""Video4Linux with the kernel's own structures, filled by hand like a webcam's: no device is needed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MJPG, YUYV, BGR = (int.from_bytes(code, "little") for code in (b"MJPG", b"YUYV",
 
 
 class Webcam:
-    """Answers as the driver of a USB camera does."""
+    """Answers like the driver of a USB camera."""
 
     def __init__(self) -> None:
         self.values = {v4l2.AUTO_EXPOSURE: 3, v4l2.EXPOSURE: 157, v4l2.GAIN: 64, v4l2.AUTO_GAIN: 1}
@@ -87,7 +87,7 @@ def webcam() -> Webcam:
 
 
 def test_requests_are_the_kernels() -> None:
-    # As a C program prints them with linux/videodev2.h, on x86-64.
+    # As printed by a C program with linux/videodev2.h, on x86-64.
     assert (v4l2.QUERYCAP, v4l2.ENUM_FMT, v4l2.QUERYCTRL) == (0x80685600, 0xC0405602, 0xC0445624)
     assert (v4l2.G_CTRL, v4l2.S_CTRL) == (0xC008561B, 0xC008561C)
     assert (v4l2.ENUM_FRAMESIZES, v4l2.ENUM_FRAMEINTERVALS) == (0xC02C564A, 0xC034564B)
@@ -104,13 +104,13 @@ def test_formats_sizes_and_rates_are_listed(webcam: Webcam) -> None:
         "format=mjpeg: 1280x720 at 30, 15; 640x480 at 29.97",
         "format=yuyv: 640x480 at 10",
         "BGR3 (BGR): 32x24 to 1920x1080 at 60, 5",
-        "BGR3 (BGR, big-endian): sizes not known",
+        "BGR3 (BGR, big-endian): unknown sizes",
     ]
 
 
-def test_a_node_that_gives_no_pictures_is_none(webcam: Webcam) -> None:
+def test_a_node_without_images_is_not_listed(webcam: Webcam) -> None:
     assert V4l2Device(7, webcam).captures()
-    webcam.capabilities = 0x84A00001, 0x04A00000  # the device has some, this node gives metadata
+    webcam.capabilities = 0x84A00001, 0x04A00000  # the device captures images, this node gives metadata
     assert not V4l2Device(7, webcam).captures()
     webcam.capabilities = 0x00000001, 0
     assert V4l2Device(7, webcam).captures()
@@ -125,7 +125,7 @@ def test_settings_are_described(webcam: Webcam) -> None:
     assert device.settings() == []
 
 
-def test_exposure_and_gain_are_set_by_hand_and_left_to_the_camera_again(webcam: Webcam) -> None:
+def test_exposure_and_gain_are_set_manually_and_automatic_again(webcam: Webcam) -> None:
     device = V4l2Device(7, webcam)
     assert DeviceOptions(exposure=8.0, gain=12).apply(device) == []
     assert webcam.values == {v4l2.AUTO_EXPOSURE: 1, v4l2.EXPOSURE: 80, v4l2.GAIN: 12, v4l2.AUTO_GAIN: 0}
@@ -134,7 +134,7 @@ def test_exposure_and_gain_are_set_by_hand_and_left_to_the_camera_again(webcam: 
     assert DeviceOptions().apply(device) == []
 
 
-def test_what_a_camera_refuses_is_told_with_its_range(webcam: Webcam) -> None:
+def test_a_refused_setting_is_reported_with_its_range(webcam: Webcam) -> None:
     device = V4l2Device(7, webcam)
     assert device.set_exposure(900.0) == "exposure is 900 ms and must be from 0.1 to 500 for this camera"
     assert device.set_gain(256) == "gain is 256 and must be from 0 to 255 for this camera"
@@ -143,11 +143,11 @@ def test_what_a_camera_refuses_is_told_with_its_range(webcam: Webcam) -> None:
     webcam.ranges.clear()
     assert device.set_exposure(10.0) == "the camera's exposure can't be set"
     assert device.set_gain(3) == "the camera's gain can't be set"
-    assert "no automatic exposure: the camera has no such setting" in device.set_exposure(None)
+    assert "no automatic exposure: the camera does not support this setting" in device.set_exposure(None)
     assert "no automatic gain" in device.set_gain(None)
 
 
-def test_a_setting_that_is_switched_off_is_none(webcam: Webcam) -> None:
+def test_a_disabled_setting_is_none(webcam: Webcam) -> None:
     answer = webcam.answer
 
     def off(request: int, index: int, asked: bytes) -> bytes:
@@ -158,7 +158,7 @@ def test_a_setting_that_is_switched_off_is_none(webcam: Webcam) -> None:
     assert V4l2Device(7, webcam).control(v4l2.GAIN) is None
 
 
-def test_what_is_no_camera_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_no_camera_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "video0"
     path.touch()
     assert DeviceOptions(gain=3).configure(str(path)) == ["the camera's gain can't be set"]
@@ -178,10 +178,10 @@ def test_a_listing_has_the_address_the_formats_and_the_settings(webcam: Webcam, 
     assert len(lines) == 7
 
 
-def test_a_listing_of_what_can_not_be_opened_says_why(webcam: Webcam, tmp_path: Path) -> None:
+def test_a_listing_of_an_unreadable_camera_says_why(webcam: Webcam, tmp_path: Path) -> None:
     assert listed(CameraDevice(tmp_path / "gone", "Webcam", True))[1] == "  can't be opened: No such file or directory"
     (tmp_path / "video0").touch()
     device = CameraDevice(tmp_path / "video0", "Webcam", True)
     assert listed(device)[1] == f"  can't be opened: {os.strerror(errno.ENOTTY)}"
     webcam.capabilities = 0, 0
-    assert listed(device, lambda _descriptor, *asked: webcam(7, *asked))[1] == "  gives no pictures"
+    assert listed(device, lambda _descriptor, *asked: webcam(7, *asked))[1] == "  captures no images"

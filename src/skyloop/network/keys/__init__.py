@@ -1,8 +1,7 @@
 """A lab's keys: who may join the network, and what each may do there.
 
 A lab has one certificate authority, a folder (:mod:`skyloop.network.keys.lab`) that issues identities. An identity is a
-folder too, to be copied to the machine that it is for;
-:func:`skyloop.network.keys.credentials.load` reads and checks one.
+folder, too, to copy to its machine; :func:`skyloop.network.keys.credentials.load` reads and checks one.
 """
 
 from __future__ import annotations

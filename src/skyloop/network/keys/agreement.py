@@ -1,10 +1,10 @@
-"""A process's keys while it runs: who is shut out by a newer roster, and how two ends prove to each other who they are.
+"""A running process's keys: identities excluded by a newer roster, and the mutual proof of identity of two ends.
 
-The certificates of a link show who is at the other end of that *link*: a router, where there is one. So the two ends of
-a connection show theirs to each other as well, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each
-signs a fresh X25519 share together with the terms of the connection, and the proxy also all that the application sent.
-The secrets, which nobody between them knows, are derived from both shares and the transcript (HKDF-SHA256), so recorded
-messages open nothing, and a key that is lost later opens nothing that was recorded before.
+A link's certificates show the neighbour on that *link*, which may be a router. So the two ends of a connection also
+show theirs to each other, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each signs a fresh X25519
+share together with the terms of the connection, and the proxy also the application's whole message. The secrets,
+unknown to any router, are derived from both shares and the transcript (HKDF-SHA256). Hence recorded messages
+open nothing, and a key that is lost later opens no earlier recording.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from skyloop.network.keys import certificates
 from skyloop.network.keys.credentials import Credentials, Roster
 from skyloop.network.keys.identity import Identity
 
-AGAIN: Final = timedelta(hours=1)  #: how often an expiry that is near is announced
+AGAIN: Final = timedelta(hours=1)  #: how often to announce an approaching expiry
 SECRET_BYTES: Final = 32
-_PURPOSE: Final = "fabric connection 1"  # what is signed begins with it: no signature of anything else fits
+_PURPOSE: Final = "fabric connection 1"  # prefix of all signed content, which no other signature has
 _OFFER, _ANSWER = "offer", "answer"
 
 
 class KeyRing:
-    """Reads the folder of keys from time to time. All methods may be called from any thread."""
+    """Reads the key folder periodically. All methods may be called from any thread."""
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
-        #: Names that were revoked, or whose rights were changed, after this process took its roster into force.
+        #: Names revoked, or with changed rights, since this process applied its roster.
         self.shut_out: frozenset[str] = frozenset()
         self._in_force = credentials.roster
-        self._listed = frozenset(credentials.roster.identities)  # by the newest roster
+        self._listed = frozenset(credentials.roster.identities)  # in the newest roster
         self._stamp = _stamp(credentials)
         self._announced: dict[str, datetime] = {}
         self._pending: list[str] = []
@@ -49,28 +49,28 @@ class KeyRing:
 
     @property
     def roster(self) -> Roster:
-        """The newest roster that was read."""
+        """The newest roster read."""
         return self.credentials.roster
 
     @property
     def outdated(self) -> bool:
-        """Whether the newest roster differs from the one that this process took into force."""
+        """Whether the newest roster differs from the one that this process applied."""
         return self._listed != frozenset(self._in_force.identities)
 
     def admits(self, identity: Identity) -> bool:
-        """Return whether the newest roster has this identity with these rights, and it was not shut out before."""
+        """Return whether the newest roster has this identity with these rights, and it was never excluded."""
         return identity in self._listed and identity.name not in self.shut_out
 
     def refresh(self) -> None:
-        """Read the roster if its file has changed; messages about that are kept for :meth:`poll`."""
+        """Read the roster if its file has changed; its messages wait for :meth:`poll`."""
         with self._lock:
             self._pending += self._read()
 
     def poll(self, now: datetime | None = None) -> list[str]:
-        """Read the roster if its file has changed, and return what people should know now.
+        """Read the roster if its file has changed, and return messages for people.
 
-        That is what expires within a week, once an hour, and a newer roster. A roster that can't be read is reported
-        and changes nothing.
+        They announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported and
+        changes nothing.
 
         Returns:
             A sentence for each.
@@ -94,7 +94,7 @@ class KeyRing:
         try:
             renewed = self.credentials.renewed()
         except UsageError as error:
-            return [f"{error}; the roster that was read before stays in force"]
+            return [f"{error}; the previous roster stays in force"]
         if renewed is None:
             return []
         before, after = frozenset(self._in_force.identities), frozenset(renewed.roster.identities)
@@ -109,16 +109,16 @@ class KeyRing:
 
 
 def _stamp(credentials: Credentials) -> tuple[int, int, int]:
-    """Return what changes with the roster's file."""
+    """Return values that change with the roster's file."""
     try:
-        found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and it is done every second
+        found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and called every second
     except OSError:
         return 0, 0, 0
     return found.st_mtime_ns, found.st_size, found.st_ino
 
 
 class Proof(msgspec.Struct, frozen=True, array_like=True):
-    """What one end shows to the other."""
+    """One end's proof to the other."""
 
     certificate: bytes  #: DER
     share: bytes  #: X25519, 32 bytes
@@ -130,13 +130,13 @@ class Agreed:
     """The identity at the other end, and the secrets of this connection."""
 
     identity: Identity  #: the other end's
-    expires: datetime  #: when its certificate does
-    up: bytes  #: for what the application sends
-    down: bytes  #: for what the proxy sends
+    expires: datetime  #: expiry of its certificate
+    up: bytes  #: for the application's packets
+    down: bytes  #: for the proxy's packets
 
 
 class Agreement:
-    """One end's part in the exchange, by its keys; ``terms`` are what the connection is about, the same for both."""
+    """One end's part in the exchange, with its keys; ``terms`` describe the connection, the same at both ends."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -155,7 +155,7 @@ class Agreement:
         """Check the application's offer, and make the proxy's answer.
 
         Returns:
-            The answer, a :class:`Proof` as MessagePack, and what is agreed.
+            The answer, a :class:`Proof` as MessagePack, and the agreed secrets.
 
         Raises:
             LinkError: The other end could not prove an identity that the roster admits.
@@ -169,7 +169,7 @@ class Agreement:
         """Check the proxy's answer.
 
         Returns:
-            What is agreed.
+            The agreed secrets.
 
         Raises:
             LinkError: The other end could not prove an identity that the roster admits.
@@ -197,7 +197,7 @@ class Agreement:
         except (DecodeError, UsageError) as error:
             raise LinkError(f"the other end shows no key of this lab: {error}") from None
         if not certificates.signed_by(certificate, claim, proof.signature):
-            raise LinkError(f"the other end shows the certificate of {identity.name}, and does not have its key")
+            raise LinkError(f"the other end shows the certificate of {identity.name} but does not have its key")
         if not self._ring.admits(identity):
             raise LinkError(f"the roster (number {self._ring.roster.number}) does not have {identity}: {_WHY}")
         return identity, certificate.not_valid_after_utc
@@ -216,9 +216,7 @@ def _decode(proof: bytes) -> Proof:
     try:
         return msgspec.msgpack.decode(proof, type=Proof)
     except msgspec.DecodeError:
-        raise LinkError(
-            "the other end shows no key: with keys both ends need them, and a version that shows them"
-        ) from None
+        raise LinkError("the other end shows no key: both ends need keys, and a version that shows them") from None
 
 
 _WHY: Final = "it was revoked, its rights were changed, or a newer roster is needed here"

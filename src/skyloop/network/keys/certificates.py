@@ -1,8 +1,8 @@
-"""Certificates (X.509) of a lab's authority and of its identities: made, read, checked. Times are arguments, in UTC.
+"""Create, read and check X.509 certificates of a lab's authority and identities. Times are arguments, in UTC.
 
-An identity's common name is its name, by which Zenoh's access control knows it. Its role and drones are a URI among its
-alternative names, ``urn:skyloop:ROLE:DRONES``. Only the certificates of proxies and routers may be used to be connected
-to (extended key usage), so that with the key of a pilot or an observer nobody can stand in for a proxy.
+An identity's common name is its name, which Zenoh's access control uses. Its role and drones are a URI among its
+alternative names, ``urn:skyloop:ROLE:DRONES``. Only certificates of proxies and routers may accept connections
+(extended key usage), so that no holder can impersonate a proxy with the key of a pilot or an observer.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ try:
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:  # pragma: no cover  it is installed where tests run
+except ImportError as error:  # installed wherever tests run
     raise MissingExtraError("keys", "network", cause=str(error)) from None
 
 PrivateKey = ec.EllipticCurvePrivateKey
 Certificate = x509.Certificate
 
-#: Certificates count from a day ago, for machines whose clocks are behind.
+#: Certificates are valid from a day ago, for machines whose clocks are slow.
 BACKDATED: Final = timedelta(days=1)
-#: What an authority for pages may certify: private networks (RFC 1918, 4193, 3927, 6598) and this machine …
+#: What a page authority may certify: private networks (RFC 1918, 4193, 3927, 6598) and this machine …
 PAGE_NETWORKS: Final = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
-#: … and names that the Internet does not have (RFC 6762, 8375; .internal is reserved by ICANN).
+#: … and names that do not exist on the Internet (RFC 6762, 8375; .internal is reserved by ICANN).
 PAGE_NAMES: Final = ("localhost", "local", "lan", "internal", "home.arpa")
 _URN: Final = "urn:skyloop:"
 _CURVE: Final = ec.SECP256R1()
@@ -46,7 +46,7 @@ _SIGNED: Final = ec.ECDSA(hashes.SHA256())
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """A lab's authority; ``key`` is there only where identities are issued."""
+    """A lab's authority; ``key`` is set only where identities are issued."""
 
     certificate: x509.Certificate
     key: PrivateKey | None = None
@@ -62,7 +62,7 @@ class Authority:
         return self.certificate.not_valid_after_utc
 
     def sign(self, content: bytes) -> bytes:
-        """Return a signature of content that is no certificate; needs the key."""
+        """Return a signature of content other than a certificate; needs the key."""
         assert self.key is not None
         return self.key.sign(content, _SIGNED)
 
@@ -72,24 +72,24 @@ class Authority:
 
 
 def new_key() -> PrivateKey:
-    """Make a new private key, on the curve P-256."""
+    """Make a new private key on the curve P-256."""
     return ec.generate_private_key(_CURVE)
 
 
 def key_pem(key: PrivateKey) -> bytes:
-    """Encode a private key for a file: PKCS #8 as PEM, not encrypted."""
+    """Encode a private key for a file: unencrypted PKCS #8 in PEM."""
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
 
 
 def certificate_pem(certificate: x509.Certificate) -> bytes:
-    """Encode a certificate for a file, as PEM."""
+    """Encode a certificate for a file, in PEM."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished."""
+    """Make a new lab's authority. Its name ends in random digits to tell labs apart."""
     key = new_key()
     name = _name(f"Skyloop lab {secrets.token_hex(4)}")
     certificate = (
@@ -104,7 +104,7 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Make a certificate for an identity, signed by an authority that has its key, until its end at most."""
+    """Make a certificate for an identity, signed by an authority with its key, valid no longer than the authority."""
     assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
@@ -124,10 +124,10 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Make an authority for pages, not the lab's, that may certify these names and all below them too, and no others.
+    """Make an authority for pages, separate from the lab's, that may certify only these names and all below them.
 
-    What it issues counts for private addresses, names of local networks, and the given ones: a browser that trusts it
-    trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
+    Its certificates are valid for private addresses, names of local networks, and the given names: a browser that
+    trusts it trusts it with no other site (name constraints, RFC 5280, 4.2.1.10).
     """
     key = new_key()
     name = _name(f"Skyloop pages {secrets.token_hex(4)}")
@@ -149,10 +149,10 @@ def issue_page(
     """Make a certificate for a cockpit's page.
 
     Args:
-        authority: For pages; needs its key.
+        authority: An authority for pages, with its key.
         names: IP addresses and host names by which browsers reach it, at least one.
         key: The page's key.
-        until: When it expires, in UTC; no later than the authority's certificate does.
+        until: Expiry in UTC, limited to that of the authority's certificate.
         now: The time in UTC.
     """
     assert authority.key is not None
@@ -170,13 +170,13 @@ def issue_page(
 
 
 def page_names(certificate: x509.Certificate) -> list[str]:
-    """Return the addresses and names that a page's certificate is for."""
+    """Return the addresses and names in a page's certificate."""
     found = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     return [*map(str, found.get_values_for_type(x509.IPAddress)), *found.get_values_for_type(x509.DNSName)]
 
 
 def may_certify(authority: Authority, name: str) -> bool:
-    """Return whether an authority for pages may certify an address or a name."""
+    """Return whether a page authority may certify an address or a name."""
     permitted = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value.permitted_subtrees
     wanted = _general_name(name)
     if isinstance(wanted, x509.DNSName):
@@ -195,11 +195,11 @@ def read_certificate(content: bytes, path: Path) -> x509.Certificate:
     try:
         return x509.load_pem_x509_certificate(content)
     except ValueError:
-        raise FileFormatError(f"{path} is no certificate in PEM form, or it is damaged") from None
+        raise FileFormatError(f"{path} is not a certificate in PEM form, or is damaged") from None
 
 
 def read_der(content: bytes) -> x509.Certificate:
-    """Decode a certificate that came over the network.
+    """Decode a certificate received over the network.
 
     Raises:
         DecodeError: It is not a certificate in DER.
@@ -207,16 +207,16 @@ def read_der(content: bytes) -> x509.Certificate:
     try:
         return x509.load_der_x509_certificate(content)
     except ValueError as error:
-        raise DecodeError(f"{len(content)} bytes that are no certificate: {error}") from None
+        raise DecodeError(f"{len(content)} bytes are not a certificate: {error}") from None
 
 
 def der(certificate: x509.Certificate) -> bytes:
-    """Encode a certificate for the network, as DER."""
+    """Encode a certificate for the network, in DER."""
     return certificate.public_bytes(serialization.Encoding.DER)
 
 
 def sign(key: PrivateKey, content: bytes) -> bytes:
-    """Return a signature by the key of an identity: ECDSA with SHA-256, in DER."""
+    """Return a signature by an identity's key: ECDSA with SHA-256, in DER."""
     return key.sign(content, _SIGNED)
 
 
@@ -236,19 +236,19 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
     """Decode a private key from a file.
 
     Raises:
-        FileFormatError: It is not such a key, or not one on a curve.
+        FileFormatError: It is not a private key, or not on an elliptic curve.
     """
     try:
         key = serialization.load_pem_private_key(content, password=None)
-    except (ValueError, TypeError):  # TypeError: it is encrypted
-        raise FileFormatError(f"{path} is no unencrypted private key in PEM form, or it is damaged") from None
+    except (ValueError, TypeError):  # TypeError: encrypted
+        raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
-        raise FileFormatError(f"{path} holds a key of another kind than skyloop keys makes: it must be one on a curve")
+        raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
     return key
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's, whose key is None where nothing is issued.
+    """Check that a certificate is an authority's; its key is None where nothing is issued.
 
     Raises:
         FileFormatError: It is not an authority's certificate.
@@ -266,7 +266,7 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
-    """Return the identity that a certificate names.
+    """Return the identity in a certificate.
 
     Raises:
         FileFormatError: It names no role and drones.
@@ -283,7 +283,7 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return the name that access control goes by; empty if the certificate has none or several."""
+    """Return the name used by access control; empty if the certificate has none or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
@@ -318,7 +318,7 @@ def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
     if now < certificate.not_valid_before_utc:
         raise UsageError(
             f"{what} is valid from {certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC on, and this machine's clock "
-            f"says {now:%Y-%m-%d %H:%M}: set the clock"
+            f"shows {now:%Y-%m-%d %H:%M}: set the clock"
         )
 
 
@@ -331,7 +331,7 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
 
 def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # seen to by read_authority
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # checked by read_authority
     return public
 
 

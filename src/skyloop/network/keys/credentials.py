@@ -1,15 +1,13 @@
-"""One identity's folder, as a program uses it: read, checked, watched for a newer roster; and the roster.
+"""One identity's folder for use by a program: read, checked, watched for a newer roster; and the roster.
 
-=================  ====================================================================
-``ca.pem``         the certificate of the lab's authority
-``identity.pem``   the identity's certificate
-``identity.key``   its private key: readable by its owner only
-``roster.json``    all identities of the lab, signed; replace it when there is a newer one
+=================  ==================================================================== ``ca.pem``         the
+certificate of the lab's authority ``identity.pem``   the identity's certificate ``identity.key``   its private key:
+readable by its owner only ``roster.json``    all identities of the lab, signed; replace it when there is a newer one
 =================  ====================================================================
 
-Zenoh's access control knows subjects by their common names, so all names must be known where it is enforced. The
-roster is a file of two parts: the list itself, and the signature of exactly those bytes. Its number grows with each
-change, and the highest one is in force.
+Zenoh's access control identifies subjects by common name, so wherever it is enforced all names must be known. The
+roster file has two parts: the list itself, and a signature of exactly those bytes. Its number grows with each change,
+and the highest number is in force.
 """
 
 from __future__ import annotations
@@ -41,12 +39,12 @@ from skyloop.network.keys.certificates import (
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
-_PURPOSE: Final = b"skyloop roster\n"  # what is signed begins with it: no signature of anything else fits
+_PURPOSE: Final = b"skyloop roster\n"  # prefix of all signed content, which no other signature has
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
-NOTICE: Final = timedelta(days=7)  #: how long before its end an expiry is announced
+NOTICE: Final = timedelta(days=7)  #: how early an expiry is announced
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -56,23 +54,23 @@ class Entry(msgspec.Struct, frozen=True):
     role: KeyRole
     drones: tuple[str, ...]
     serial: str  #: of the newest certificate, hexadecimal
-    expires: int  #: when that one does
-    last: int  #: when the last of all certificates under this name does
+    expires: int  #: expiry of that one
+    last: int  #: latest expiry of all certificates under this name
     revoked: bool = False
 
     @property
     def identity(self) -> Identity:
-        """The identity itself."""
+        """The entry's identity."""
         return Identity(self.name, self.role, self.drones)
 
     @property
     def expires_at(self) -> datetime:
-        """When its newest certificate expires, in UTC."""
+        """Expiry of its newest certificate, in UTC."""
         return datetime.fromtimestamp(self.expires, UTC)
 
     @property
     def last_at(self) -> datetime:
-        """When the last of all certificates under this name expires, in UTC."""
+        """Latest expiry of all certificates under this name, in UTC."""
         return datetime.fromtimestamp(self.last, UTC)
 
 
@@ -85,7 +83,7 @@ class Roster(msgspec.Struct, frozen=True):
     format: int = FORMAT
 
     def find(self, name: str) -> Entry | None:
-        """Return the entry of a name, None if there is none."""
+        """Return the entry of a name; None if there is none."""
         return next((entry for entry in self.entries if entry.name == name), None)
 
     @property
@@ -97,7 +95,7 @@ class Roster(msgspec.Struct, frozen=True):
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
-        """Return the next roster, with this entry in the place of the one of its name."""
+        """Return the next roster, with this entry replacing the one of its name."""
         others = [other for other in self.entries if other.name != entry.name]
         entries = tuple(sorted([*others, entry], key=lambda each: each.name))
         return Roster(self.number + 1, self.lab, entries)
@@ -109,14 +107,14 @@ class _File(msgspec.Struct):
 
 
 def encode_roster(roster: Roster, authority: Authority) -> bytes:
-    """Return the roster's file, signed."""
+    """Return the signed roster file."""
     body = msgspec.json.format(msgspec.json.encode(roster), indent=1)
     signature = base64.b64encode(authority.sign(_PURPOSE + body)).decode()
     return msgspec.json.encode(_File(msgspec.Raw(body), signature)) + b"\n"
 
 
 def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
-    """Check the signature of a roster's file, then decode it.
+    """Check a roster file's signature, then decode it.
 
     Raises:
         FileFormatError: It is not a roster, is damaged, or has another format.
@@ -126,7 +124,7 @@ def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
         file = msgspec.json.decode(content, type=_File)
         signature = base64.b64decode(file.signature, validate=True)
     except (msgspec.MsgspecError, UnicodeDecodeError, binascii.Error, RecursionError) as error:
-        raise FileFormatError(f"{path} is no roster, or it is damaged: {error}") from None
+        raise FileFormatError(f"{path} is not a roster, or is damaged: {error}") from None
     body = bytes(file.roster)
     if not authority.signed(_PURPOSE + body, signature):
         raise UsageError(f"the roster {path} was changed, or is not signed by {authority.name}: copy it again")
@@ -141,7 +139,7 @@ def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """A checked identity. The paths are absolute, for Zenoh to read the files itself."""
+    """A checked identity. The paths are absolute, as Zenoh reads the files itself."""
 
     identity: Identity
     expires: datetime
@@ -182,17 +180,17 @@ class Credentials:
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return what expires within a week or has expired: this key, and the lab's authority.
+        """Return what has expired or expires within a week: this key, or the lab's authority.
 
         Returns:
-            A sentence for people for each, by what it is about.
+            A sentence for people for each, by subject.
         """
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster, if the folder has one by now; None if not.
+        """Return these credentials with a newer roster if the folder has one; else None.
 
         Raises:
             UsageError: The roster can't be read, or this lab's authority did not sign it.
@@ -202,11 +200,11 @@ class Credentials:
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and check all that can be checked.
+    """Read an identity's folder and check it completely.
 
     Raises:
         UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` for a file that is
-            damaged or of another kind. The message says what would be right.
+            damaged or of another kind. The message says how to fix it.
     """
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
@@ -227,7 +225,7 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the certificate and roster in the folder of a lab or of an identity, which everybody may know.
+    """Read the public certificate and roster in the folder of a lab or an identity.
 
     Raises:
         UsageError: There is no such folder, or a file in it is missing or not valid.
@@ -239,7 +237,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_warning(what: str, end: datetime, now: datetime) -> str:
-    """Return a sentence for people if the end is less than a week away, or past; empty if not."""
+    """Return a sentence for people if the expiry is past or less than a week away; empty if not."""
     left = end - now
     if left > NOTICE:
         return ""
@@ -263,11 +261,11 @@ def _read_roster(directory: Path, authority: Authority) -> Roster:
 
 def _check_folder(path: Path) -> None:
     if not path.is_dir():
-        raise UsageError(f"there is no folder {path}: give the one of an identity that skyloop keys issue made")
+        raise UsageError(f"there is no folder {path}: give an identity's folder made by skyloop keys issue")
     if (path / "ca.key").exists():
         raise UsageError(
-            f"{path} is the folder of the lab's authority, which no program on the network needs: give that of an "
-            f"identity, such as {path / 'issued' / 'NAME'}"
+            f"{path} is the folder of the lab's authority, which no program on the network needs: give an "
+            f"identity's folder, such as {path / 'issued' / 'NAME'}"
         )
 
 
@@ -280,5 +278,5 @@ def _check_listed(identity: Identity, roster: Roster, path: Path) -> None:
     if entry.identity != identity:
         raise UsageError(
             f"the key {path} is of {identity}, but the roster says {entry.identity}: the key was replaced, "
-            "take the new one"
+            "use the new one"
         )

@@ -1,4 +1,4 @@
-"""Files that hold keys: who may read them, and how they are replaced."""
+"""Files that hold keys: access rights and atomic replacement."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from typing import Final
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.files import read_bytes
 
-MAX_BYTES: Final = 16 << 20  #: of a file; a roster of 10 000 identities takes 3 MB
+MAX_BYTES: Final = 16 << 20  #: of a file; a roster of 10 000 identities has 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory that only its owner can enter, or check that it is one.
+    """Make a directory that only its owner can enter, or check an existing one.
 
     Raises:
         UsageError: It can't be made, or is open to others.
@@ -33,7 +33,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file in one step; a private one can be read by its owner only, from its first byte on.
+    """Replace a file atomically; a private one is readable by its owner only, from its first byte on.
 
     Raises:
         UsageError: It can't be written.
@@ -61,7 +61,7 @@ def read(path: Path, what: str) -> bytes:
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """Read a file that must not be open to others, as somebody else may have the key then.
+    """Read a file that must not be open to others, who might have copied the key.
 
     Raises:
         UsageError: It can't be read, is too large, or is open to others.
@@ -78,7 +78,7 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a directory against other processes that change it, and wait until they have finished.
+    """Lock a directory against changes by other processes, waiting for them to finish.
 
     The kernel releases the lock with the process.
 
@@ -89,7 +89,7 @@ def locked(directory: Path) -> Iterator[None]:
         import fcntl
     except ImportError:
         raise UnsupportedError(
-            f"keys are made and revoked on Linux or macOS, and this is {sys.platform}; copy those that were issued here"
+            f"keys are made and revoked on Linux or macOS, but this is {sys.platform}; copy issued keys to this machine"
         ) from None
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:

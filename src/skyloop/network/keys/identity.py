@@ -1,4 +1,4 @@
-"""Identities on the network: a name, a role, and the drones that it is about."""
+"""Identities on the network: a name, a role, and the drones it applies to."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.errors import UsageError
 
-ANYONE: Final = "anyone"  #: what everybody is called who has no key, so that no key has this name
+ANYONE: Final = "anyone"  #: name of all applications without a key, and so never a key's
 ALL_DRONES: Final = ("*",)
 MAX_PATTERNS: Final = 32
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
@@ -18,24 +18,24 @@ _PATTERN: Final = re.compile(r"[a-z0-9_.*-]{1,48}")
 
 
 class KeyRole(StrEnum):
-    """What a key lets its holder be, with respect to the drones that the identity names."""
+    """A key's role with respect to its identity's drones."""
 
-    PILOT = "pilot"  #: sees every drone, and may fly those that are named
-    OBSERVER = "observer"  #: sees those that are named, and flies nothing
+    PILOT = "pilot"  #: sees every drone, and may fly its own
+    OBSERVER = "observer"  #: sees its drones, and flies none
     PROXY = "proxy"  #: serves drones of these names
-    ROUTER = "router"  #: carries everybody's traffic between networks, which is sealed: it can lose it, not read it
+    ROUTER = "router"  #: carries everybody's sealed traffic between networks: it may lose it, not read it
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A name with what it may do; ``drones`` are patterns in which ``*`` stands for any characters."""
+    """A name and its rights; ``drones`` are patterns where ``*`` matches any characters."""
 
     name: str
     role: KeyRole
     drones: tuple[str, ...] = ALL_DRONES
 
     def covers(self, drone: str) -> bool:
-        """Return whether a drone of this name is among those that this identity is for."""
+        """Return whether a drone of this name is among this identity's drones."""
         return any(fnmatchcase(drone, pattern) for pattern in self.drones)
 
     def may_fly(self, drone: str) -> bool:
@@ -57,7 +57,7 @@ class Identity:
             UsageError: It is not.
         """
         if self.role is not KeyRole.PROXY:
-            raise UsageError(f"these are the keys of {self}: a proxy needs some of --role proxy")
+            raise UsageError(f"these are the keys of {self}: a proxy needs keys of --role proxy")
         if not self.covers(drone):
             raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
 
@@ -68,7 +68,7 @@ class Identity:
             UsageError: It is not.
         """
         if self.role is not KeyRole.ROUTER:
-            raise UsageError(f"these are the keys of {self}: a router needs some of --role router")
+            raise UsageError(f"these are the keys of {self}: a router needs keys of --role router")
 
     def require_application(self) -> None:
         """Check that this is a pilot or an observer.
@@ -84,7 +84,7 @@ class Identity:
 
 
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
-    """Make an identity from what a person typed.
+    """Make an identity from a person's input.
 
     Args:
         name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``; not ``anyone``.
@@ -100,17 +100,17 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
             "the first one a letter or a digit"
         )
     if name == ANYONE:
-        raise UsageError(f"no key can be named {ANYONE!r}: that is what everybody is called who has none")
+        raise UsageError(f"no key can be named {ANYONE!r}: that is the name of all who have no key")
     if role not in list(KeyRole):
         raise UsageError(f"there is no role {role!r}; there are {', '.join(KeyRole)}")
     patterns = parse_drones(drones)
     if role == KeyRole.ROUTER and patterns != ALL_DRONES:
-        raise UsageError("a router carries the traffic of all drones: leave out which")
+        raise UsageError("a router carries the traffic of all drones: leave out the drones")
     return Identity(name, KeyRole(role), patterns)
 
 
 def parse_drones(text: str) -> tuple[str, ...]:
-    """Parse names of drones or patterns of them, separated by commas: ``alpha,bravo*``.
+    """Parse names of drones or patterns, separated by commas: ``alpha,bravo*``.
 
     Raises:
         UsageError: A pattern is not valid, or there are more than :data:`MAX_PATTERNS`.
@@ -124,6 +124,6 @@ def parse_drones(text: str) -> tuple[str, ...]:
             )
     if len(patterns) > MAX_PATTERNS:
         raise UsageError(
-            f"{len(patterns)} patterns of drones are too many: at most {MAX_PATTERNS}, and '*' is any name"
+            f"{len(patterns)} patterns of drones are too many: give at most {MAX_PATTERNS}, or '*' for any name"
         )
     return ALL_DRONES if "*" in patterns else patterns

@@ -1,22 +1,18 @@
-"""A lab's authority: the folder from which identities are issued and revoked; and certificates for cockpits' pages.
+"""A lab's authority: the folder that issues and revokes identities; and certificates for cockpit pages.
 
-=====================  =====================================================================
-``ca.key``             the authority's private key: who has it can make any identity
-``ca.pem``             its certificate
-``roster.json``        all identities, signed
-``issued/NAME/``       one identity's folder, to be copied to its machine
-=====================  =====================================================================
+=====================  ===================================================================== ``ca.key``             the
+authority's private key: its holder can make any identity ``ca.pem``             its certificate ``roster.json``
+all identities, signed ``issued/NAME/``       one identity's folder, to copy to its machine =====================
+=====================================================================
 
-Pages have certificates because browsers decode video, and keep the screen on, over https only.
-They come from an authority of their own, in a folder beside the lab's keys. Browsers are asked to trust it, and may: it
-can certify nothing beyond private networks. Its key gives no access to the lab's network, and the lab's none to pages.
+Pages have certificates because browsers decode video, and keep the screen on, only over https. They come from a
+separate authority, in a folder beside the lab's keys. Browsers are asked to trust it, and safely may: it can certify
+nothing beyond private networks. Its key gives no access to the lab's network, and the lab's none to pages.
 
-=====================  =====================================================================
-``ca.pem``             the certificate that browsers are to trust
-``ca.key``             the authority's key
-``page.pem``           the page's certificate, for the addresses and names of this machine
-``page.key``           its key
-=====================  =====================================================================
+=====================  ===================================================================== ``ca.pem``             the
+certificate for browsers to trust ``ca.key``             the authority's key ``page.pem``           the page's
+certificate, for the addresses and names of this machine ``page.key``           its key =====================
+=====================================================================
 """
 
 from __future__ import annotations
@@ -46,21 +42,21 @@ from skyloop.network.keys.credentials import (
 )
 from skyloop.network.keys.identity import Identity
 
-AUTHORITY_DAYS: Final = 1825  #: how long a lab's authority is valid by default
-IDENTITY_DAYS: Final = 30.0  #: how long an identity is
+AUTHORITY_DAYS: Final = 1825  #: default validity of a lab's authority
+IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
 FOLDER: Final = "pages"  #: in the lab's folder
 
-PAGE_DAYS: Final = 366  #: browsers refuse a certificate that is valid for much longer
-RENEWED_DAYS: Final = 60  #: a certificate with less left is replaced when the cockpit starts
+PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
+RENEWED_DAYS: Final = 60  #: the cockpit replaces a certificate with less left when it starts
 
 
 class Lab:
-    """An authority that can issue identities; :meth:`make` makes one, :meth:`open` opens one.
+    """An authority that can issue identities, created by :meth:`make` or opened by :meth:`open`.
 
-    Each change is made under a lock on the folder, so that two processes don't lose one.
+    Each change holds a lock on the folder, so that two processes lose none.
     """
 
     def __init__(self, directory: Path, authority: Authority) -> None:
@@ -69,22 +65,22 @@ class Lab:
 
     @classmethod
     def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
-        """Make a new authority in a folder of its own.
+        """Make a new authority in a separate folder.
 
         Args:
             directory: The folder, made if it is missing.
-            days: How long the authority is valid, 1 to 36500.
-            now: The time in UTC; by default of this machine.
+            days: Validity of the authority, 1 to 36500.
+            now: The time in UTC; by default this machine's.
 
         Raises:
-            UsageError: The folder has an authority already or can't be used, or ``days`` is out of range.
+            UsageError: The folder already has an authority or can't be used, or ``days`` is out of range.
         """
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
         files.make_directory(directory)
         with files.locked(directory):
             if (directory / _AUTHORITY_KEY).exists():
-                raise UsageError(f"{directory} has an authority already: a new one would make all its keys worthless")
+                raise UsageError(f"{directory} already has an authority: a new one would make all its keys worthless")
             authority = certificates.make_authority(days, _now(now))
             assert authority.key is not None
             lab = cls(directory, authority)
@@ -110,7 +106,7 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster as it is in the folder now.
+        """The roster now in the folder.
 
         Reading it raises :class:`UsageError` if it can't be read or was changed.
         """
@@ -122,13 +118,12 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Make a new key and certificate for an identity, also to renew them.
+        """Make a new key and certificate for an identity, or renew them.
 
         Args:
             identity: The holder.
-            days: How long the key is valid, more than 0 and at most :data:`MAX_IDENTITY_DAYS`; shortened to what is
-                left of the authority's time.
-            now: The time in UTC; by default of this machine.
+            days: Validity of the key, more than 0 and up to :data:`MAX_IDENTITY_DAYS`; shortened to the authority's.
+            now: The time in UTC; by default this machine's.
 
         Raises:
             UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
@@ -163,7 +158,7 @@ class Lab:
 
         Raises:
             UnknownNameError: The roster has no such name.
-            UsageError: It was revoked already.
+            UsageError: It is already revoked.
         """
         with files.locked(self.directory):
             roster = self.roster
@@ -171,7 +166,7 @@ class Lab:
             if entry is None:
                 raise UnknownNameError("key", name, [each.name for each in roster.entries])
             if entry.revoked:
-                raise UsageError(f"{name} was revoked already")
+                raise UsageError(f"{name} is already revoked")
             revoked = msgspec.structs.replace(entry, revoked=True)
             self._write_roster(roster.put(revoked))
             for file in (KEY_FILE, CERTIFICATE_FILE, AUTHORITY_FILE, ROSTER_FILE):
@@ -181,7 +176,7 @@ class Lab:
     def _write_roster(self, roster: Roster) -> None:
         """Write the roster to the lab's folder and to those of all identities.
 
-        So each folder that is copied from now on has the newest.
+        So each folder copied from now on has the newest.
         """
         content = encode_roster(roster, self.authority)
         files.write(self.directory / ROSTER_FILE, content)
@@ -203,24 +198,24 @@ def _now(now: datetime | None) -> datetime:
 
 @dataclass(frozen=True, slots=True)
 class PageFiles:
-    """The files of a page's certificate, PEM."""
+    """The PEM files of a page's certificate."""
 
     certificate: Path
     key: Path
-    authority: Path  #: the certificate that browsers are to trust
-    left_out: tuple[str, ...] = ()  #: own names of the machine that the authority may not certify
+    authority: Path  #: the certificate for browsers to trust
+    left_out: tuple[str, ...] = ()  #: the machine's own names that the authority may not certify
 
 
 def page_certificate(
     directory: Path, own: Sequence[str], wanted: Sequence[str] = (), now: datetime | None = None
 ) -> PageFiles:
-    """Return a certificate for a cockpit's page: the one that is there if it fits, or else a new one.
+    """Return a certificate for a cockpit's page: the present one if it fits, else a new one.
 
     Args:
         directory: The folder, made if it is missing.
         own: Addresses and names of this machine; those that the authority may not certify are left out.
-        wanted: Names that people gave.
-        now: The time in UTC; by default of this machine.
+        wanted: Names given by people.
+        now: The time in UTC; by default this machine's.
 
     Raises:
         UsageError: A name in ``wanted`` may not be certified, no name is left, or a file can't be used.
@@ -235,8 +230,8 @@ def page_certificate(
         for name in wanted:
             if not certificates.may_certify(authority, name):
                 raise UsageError(
-                    f"{name} can't be certified by {made.authority}, which is for private networks and the names of "
-                    f"when it was made: give --tls-cert and --tls-key, or remove {directory} to make it anew, which "
+                    f"{name} can't be certified by {made.authority}, which covers private networks and the names given "
+                    f"at its creation: give --tls-cert and --tls-key, or remove {directory} to make a new one, which "
                     "browsers then have to trust again"
                 )
         names = [name.lower() for name in dict.fromkeys([*own, *wanted]) if certificates.may_certify(authority, name)]

@@ -1,6 +1,6 @@
 """What ArduCopter and PX4 do differently: modes, commands, thrust and safety nets. Pure.
 
-``docs/mavlink.md`` says where each was observed.
+``docs/mavlink.md`` says where each difference was observed.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_GAIN_PER_S: Final = 2.0
-ALTITUDE_GAIN_PER_S2: Final = 0.8
-MOST_ALTITUDE_ERROR_M: Final = 1.5
-LEAST_THRUST: Final = 0.1
-MOST_THRUST: Final = 0.9
+CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per climb rate error
+ALTITUDE_GAIN_PER_S2: Final = 0.8  #: acceleration per altitude error, the integral of that
+MOST_ALTITUDE_ERROR_M: Final = 1.5  #: limit of the integral
+LEAST_THRUST: Final = 0.1  #: lower limit of the thrust field
+MOST_THRUST: Final = 0.9  #: upper limit
 
 
 class ThrustModel(Protocol):
-    """The thrust field of ``SET_ATTITUDE_TARGET`` for a climb rate, in one flight by attitude.
+    """Computes ``SET_ATTITUDE_TARGET``'s thrust field from a climb rate, for one flight by attitude.
 
-    ArduCopter takes it as a climb rate: 0.5 holds the altitude. PX4 takes it as collective thrust, and altitude is ours
-    to hold: a proportional and integral loop on the climb rate, whose integral is an altitude error.
+    ArduCopter takes the field as a climb rate: 0.5 holds the altitude. PX4 takes it as collective thrust and leaves the
+    altitude to us: a proportional-integral loop on the climb rate, whose integral is an altitude error.
     """
 
     def limit_climb(self, climb_m_s: float) -> float:
@@ -39,15 +39,15 @@ class ThrustModel(Protocol):
         """Return the thrust field, 0 to 1.
 
         Args:
-            climb_m_s: The climb rate asked for, positive up.
-            climbing_m_s: The measured one, if known.
-            tilt_rad: The tilt asked for.
-            step_s: The time since the last call.
+            climb_m_s: Requested climb rate, positive up.
+            climbing_m_s: Measured climb rate, if known.
+            tilt_rad: Requested tilt.
+            step_s: Time since the last call.
         """
 
 
 class ClimbRateThrust:
-    """ArduCopter: a share of its fastest climb, or of its fastest descent."""
+    """ArduCopter: a share of its maximum climb or descent rate."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s
@@ -63,10 +63,10 @@ class ClimbRateThrust:
 
 
 class CollectiveThrust:
-    """PX4: collective thrust, with a loop that holds the climb rate.
+    """PX4: collective thrust, from a loop that holds the climb rate.
 
     Args:
-        hover: The thrust that carries the weight (``MPC_THR_HOVER``); 0.5 is taken for one that makes no sense.
+        hover: The hover thrust (``MPC_THR_HOVER``); 0.5 replaces an implausible one.
     """
 
     def __init__(self, hover: float) -> None:
@@ -88,10 +88,10 @@ class CollectiveThrust:
 
 
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-REACHED_M: Final = 0.2  #: a take-off ends so far below its altitude
+REACHED_M: Final = 0.2  #: a take-off ends this far below its altitude
 EKF_PLACE: Final = 0x10  #: absolute horizontal position, of EKF_STATUS_REPORT and ESTIMATOR_STATUS
 EKF_RELATIVE_PLACE: Final = 0x08
-EKF_CONSTANT: Final = 0x80  #: it does not know where it is
+EKF_CONSTANT: Final = 0x80  #: it does not know its position
 EKF_UNINITIALISED: Final = 0x400
 THRUST_AS_THRUST: Final = 8  #: of ArduCopter's GUID_OPTIONS
 
@@ -100,16 +100,16 @@ Values = Mapping[str, float]  #: the autopilot's parameters by its own names
 
 @dataclass(frozen=True, slots=True)
 class _SafetyNet:
-    """What the autopilot does by itself when something fails, by the value of a parameter.
+    """One of the autopilot's failsafes, set by the value of a parameter.
 
-    What a value does was observed on the real autopilots, or stands in their parameter references.
+    The effect of each value was observed on the real autopilots or is in their parameter references.
     """
 
     name: str  #: of the parameter
     what: str
-    good: Callable[[float], bool]  #: whether a value is as it should be
-    otherwise: str  #: what comes of another value
-    advised: float  #: a value that is as it should be
+    good: Callable[[float], bool]  #: whether the value is safe
+    otherwise: str  #: consequence of any other value
+    advised: float  #: a safe value
     unit: str = ""
 
     def diagnostic(self, value: float) -> Diagnostic:
@@ -130,20 +130,20 @@ def _on(value: float) -> bool:
 
 
 class AutopilotProfile(ABC):
-    """What one autopilot does its own way. Stateless."""
+    """One autopilot's specifics. Stateless."""
 
     NAME: ClassVar[str]
     GUIDED: ClassVar[str]  #: the mode that follows set-points
-    HOLD: ClassVar[str]  #: the mode that holds the position by itself
+    HOLD: ClassVar[str]  #: the mode that holds the position without set-points
     LAND: ClassVar[str]
-    ARMING: ClassVar[str]  #: the mode to be in before arming
-    HOLDING: ClassVar[frozenset[str]]  #: modes in which it stays where it is by itself
+    ARMING: ClassVar[str]  #: the mode required for arming
+    HOLDING: ClassVar[frozenset[str]]  #: modes that stay in place without set-points
     LANDING: ClassVar[frozenset[str]]
     TAKING_OFF: ClassVar[frozenset[str]]
-    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that need somebody at a remote control
-    LEAD_S: ClassVar[float]  #: set-points must flow for so long before GUIDED is entered
-    BYTEWISE: ClassVar[bool]  #: how parameters are written, unless its capabilities say otherwise
-    EARTH_RADIUS_M: ClassVar[float]  #: of the sphere by which it converts latitude and longitude
+    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes flown by a remote control
+    LEAD_S: ClassVar[float]  #: how long set-points must flow before GUIDED is entered
+    BYTEWISE: ClassVar[bool]  #: encoding of parameter writes, unless its capabilities say otherwise
+    EARTH_RADIUS_M: ClassVar[float]  #: of the sphere with which it converts latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
     @abstractmethod
@@ -154,34 +154,34 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:
-        """Return the command to take off; None while the altitude for it is not known."""
+        """Return the take-off command; None while the altitude for it is unknown."""
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
         """Return whether a take-off is complete.
 
         Args:
-            vehicle: What is known of it.
-            height_m: Of the take-off.
-            rose: Whether it was seen in the air since the take-off was accepted.
+            vehicle: The vehicle's state.
+            height_m: Height of the take-off.
+            rose: Whether it has been in the air since the take-off was accepted.
         """
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether it may be armed; None if it does not report that."""
+        """Return whether it can be armed; None if it does not report that."""
 
     @abstractmethod
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the messages that are needed, by name, and their rates [1/s]."""
+        """Return the messages needed, by name, and their rates [1/s]."""
 
     @abstractmethod
     def thrust_model(self, values: Values) -> ThrustModel:
-        """Return how a climb rate is asked for beside an attitude."""
+        """Return the model that turns climb rates into thrust."""
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
         """Return a diagnostic for each safety net that this autopilot has a parameter for.
 
-        By default both autopilots only drop the last set-point when this computer or its link dies.
+        By default, both autopilots only drop the last set-point when this computer or its link dies.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 
@@ -202,18 +202,18 @@ class ArduCopterProfile(AutopilotProfile):
     LEAD_S = 0.0
     BYTEWISE = False
     SAFETY_NETS = (
-        _SafetyNet("FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until its battery is empty", 7),
+        _SafetyNet("FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until the battery is empty", 7),
         _SafetyNet(
             "FS_GCS_TIMEOUT",
             "time until its loss counts",
             lambda s: s <= 5,
-            "it takes longer than 5 s",
+            "it takes over 5 s",
             5,
             "s",
         ),
-        _SafetyNet("GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it flies on for long", 1, "s"),
-        _SafetyNet("FS_EKF_ACTION", "loss of its place", _on, "it does nothing about it", 1),
-        _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing about it", 1),
+        _SafetyNet("GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it keeps flying for too long", 1, "s"),
+        _SafetyNet("FS_EKF_ACTION", "loss of position", _on, "it does nothing", 1),
+        _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing", 1),
         _SafetyNet("FENCE_ENABLE", "fence", _on, "it has none of its own", 1),
     )
 
@@ -226,7 +226,7 @@ class ArduCopterProfile(AutopilotProfile):
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(COPTER_NUMBERS[mode])))
 
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:  # noqa: ARG002
-        """Return the command to take off, with a relative altitude."""
+        """Return the take-off command, with a relative altitude."""
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
@@ -234,7 +234,7 @@ class ArduCopterProfile(AutopilotProfile):
         return rose and vehicle.altitude_m is not None and vehicle.altitude_m >= height_m - REACHED_M
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether its pre-arm checks pass and its estimator knows where it is."""
+        """Return whether its pre-arm checks pass and its estimator has a position."""
         good = telemetry.prearm_good(now_ns)
         ekf = telemetry.newest("EKF_STATUS_REPORT", now_ns, SLOW_S)
         if not good or ekf is None:
@@ -243,7 +243,7 @@ class ArduCopterProfile(AutopilotProfile):
         return bool(knows) and not ekf.flags & (EKF_CONSTANT | EKF_UNINITIALISED)
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return every message that is needed: it sends nothing unasked but a heartbeat each second."""
+        """Return every message needed: unasked, it sends only a heartbeat each second."""
         return {
             "HEARTBEAT": 5.0,
             "ATTITUDE": rate_hz,
@@ -258,7 +258,7 @@ class ArduCopterProfile(AutopilotProfile):
         }
 
     def thrust_model(self, values: Values) -> ThrustModel:
-        """Return a thrust that is a climb rate, or real thrust if ``GUID_OPTIONS`` says so."""
+        """Return a climb-rate model, or a thrust model if ``GUID_OPTIONS`` says so."""
         if int(values.get("GUID_OPTIONS", 0)) & THRUST_AS_THRUST:
             return CollectiveThrust(hover=values.get("MOT_THST_HOVER", 0.35))
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
@@ -268,9 +268,7 @@ class ArduCopterProfile(AutopilotProfile):
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
-            detail = (
-                f"it monitors heartbeats of system {listens:g}, this is system {own_system}: it won't detect our loss"
-            )
+            detail = f"it watches system {listens:g}, but this is system {own_system}: it won't notice our loss"
             diagnostics.append(Diagnostic("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
         return diagnostics
 
@@ -296,7 +294,7 @@ class Px4Profile(AutopilotProfile):
             "COM_DL_LOSS_T",
             "time until its loss counts",
             lambda s: s <= 10,
-            "it takes longer than 10 s",
+            "it takes over 10 s",
             5,
             "s",
         ),
@@ -304,7 +302,7 @@ class Px4Profile(AutopilotProfile):
             "COM_OF_LOSS_T",
             "time until set-points are missed",
             lambda s: s <= 1,
-            "it flies on for long",
+            "it keeps flying for too long",
             1,
             "s",
         ),
@@ -315,7 +313,7 @@ class Px4Profile(AutopilotProfile):
             "without a remote control it sinks to the ground",
             5,
         ),
-        _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "there is no more than a warning", 2),
+        _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "it only warns", 2),
         _SafetyNet(
             "GF_MAX_VER_DIST",
             "ceiling",
@@ -336,24 +334,24 @@ class Px4Profile(AutopilotProfile):
         return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(main), float(sub)))
 
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:
-        """Return the command to take off, with an altitude above mean sea level."""
+        """Return the take-off command, with an altitude above mean sea level."""
         if vehicle.amsl_m is None:
             return None
         nan = math.nan
         amsl_m = vehicle.amsl_m - (vehicle.altitude_m or 0.0) + height_m
-        # To the decimetre, so that noise of a resting altitude does not make another command of a repeat.
+        # To the decimetre, so that altitude noise at rest does not turn a repeat into a new command.
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002
-        """It holds its place then."""
+        """Return whether it holds its position: its take-off mode ends in that."""
         return rose and vehicle.mode == self.HOLD and vehicle.landed is not Landed.TAKING_OFF
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether it may be armed; None while it does not report that.
+        """Return whether it can be armed; None while it does not report that.
 
-        It never says that it has this check (the *present* bit), and reports its outcome for the mode that it is in. A
-        mode in which it can't be armed, as the one that a flight left behind, says nothing of the one that a take-off
-        begins in: then what is known is whether it knows where it is.
+        It never sets this check's *present* bit, and reports the outcome for its current mode. A mode that can't be
+        armed, such as one left over from a flight, says nothing about the mode in which a take-off begins. Then only
+        the position estimate counts.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
         custom_mode = telemetry.custom_mode()
@@ -367,7 +365,7 @@ class Px4Profile(AutopilotProfile):
         return None if estimator is None else bool(estimator.flags & (EKF_PLACE | EKF_RELATIVE_PLACE))
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the messages that are needed. The heartbeat's rate can't be changed; the mode has its own message."""
+        """Return the messages needed. The heartbeat's rate is fixed; CURRENT_MODE is separate."""
         return {
             "ATTITUDE": rate_hz,
             "LOCAL_POSITION_NED": rate_hz,
@@ -389,7 +387,7 @@ class Px4Profile(AutopilotProfile):
 def copter_speed(values: Values, which: str, usual_m_s: float) -> float:
     """Return one of ArduCopter's speeds [m/s].
 
-    ``WPNAV_SPEED_UP`` and the like are in cm/s; newer firmware calls them ``WP_SPD_UP``, in m/s.
+    ``WPNAV_SPEED_UP`` and its siblings are in cm/s; newer firmware has ``WP_SPD_UP`` in m/s instead.
     """
     old, new = values.get(f"WPNAV_SPEED_{which}"), values.get(f"WP_SPD_{which}")
     speed = new if new is not None else old / 100.0 if old is not None else usual_m_s
@@ -397,7 +395,7 @@ def copter_speed(values: Values, which: str, usual_m_s: float) -> float:
 
 
 def profile_of(autopilot: int) -> AutopilotProfile | None:
-    """Return the profile for a heartbeat's ``MAV_AUTOPILOT``; None for one that is not known here."""
+    """Return the profile for a heartbeat's ``MAV_AUTOPILOT``; None for an unknown one."""
     if autopilot == Autopilot.ARDUPILOT:
         return ArduCopterProfile()
     if autopilot == Autopilot.PX4:

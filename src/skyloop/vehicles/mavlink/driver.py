@@ -1,4 +1,4 @@
-"""The driver of ``mavlink://``: what the proxy calls."""
+"""The driver for ``mavlink://`` addresses: the proxy's interface to the vehicle."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ ACTIONS: Final = frozenset(
 
 
 class MavlinkDriver(Driver):
-    """An ArduCopter or PX4 multirotor. ``docs/mavlink.md`` has its options, parameters, events and telemetry."""
+    """An ArduCopter or PX4 multirotor. ``docs/mavlink.md`` lists its options, parameters, events and telemetry."""
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
         self.options = options_of(uri)
         if self.options.camera is not None:
-            source(uri, self.options.camera)  # raises if it is none
+            source(uri, self.options.camera)  # raises if the source is invalid
         self._link: MavlinkLink | None = None
         self._camera: LiveCamera | None = None
         self._limits = dict(self.options.limits)
 
     def capabilities(self) -> Capabilities:
-        """Return what both autopilots can do."""
+        """Return the capabilities that both autopilots share."""
         camera = self.options.camera
         return Capabilities(
             vehicle="mavlink",
@@ -92,17 +92,17 @@ class MavlinkDriver(Driver):
         return self._opened().command(action, new=False)
 
     def left_to(self) -> str:
-        """Return the mode that a remote control, a ground station or the autopilot itself chose."""
+        """Return the mode set by a remote control, a ground station or the autopilot itself."""
         link = self._link
         setpoints = link.session.setpoints if link is not None else None
         return "" if setpoints is None else setpoints.ownership.others
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Hold the position, or land, by the autopilot's own mode and without a stream of set-points."""
+        """Hold the position or land in the autopilot's own mode, without streaming set-points."""
         return self._opened().command(action, alone=True)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""
+        """Send the pose as ``ODOMETRY``, or as the message set by ``?pose=``."""
         link, now_ns = self._opened(), monotonic_ns()
         bounded = pose.bounded(now_ns)
         if why := link.session.pose_problem(bounded.captured_ns, now_ns):
@@ -110,14 +110,14 @@ class MavlinkDriver(Driver):
         link.send(pose_message(bounded, self.options.pose))
 
     def checkup(self) -> list[Diagnostic]:
-        """Return which of the autopilot's own safety nets are off, and what to set."""
+        """Return a diagnostic for each of the autopilot's own failsafes, with what to set."""
         link = self._opened()
         with link.lock:
             session = link.session
             autopilot, values = session.autopilot, session.parameters.values
             vehicle = session.vehicle_state(monotonic_ns())
         if autopilot is None or not values:
-            unread = "the vehicle's parameters were not read: its own safety nets are not known"
+            unread = "the vehicle's parameters have not been read: its own safety nets are unknown"
             return [Diagnostic("parameters", False, unread, "wait until its link is up, then check again")]
         name = Diagnostic("autopilot", True, session.description)
         ready = None if vehicle is None else vehicle.ready
@@ -136,11 +136,11 @@ class MavlinkDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the driver's own limits, and the autopilot's parameters once they were read."""
+        """Return the driver's own limits, plus the autopilot's parameters once they have been read."""
         return [*limit_parameters(self._limits), *(each.parameter for each in self._vehicle_parameters().values())]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter, and wait up to 0.9 s for the vehicle to confirm it with the value that is in force."""
+        """Write a parameter and wait up to 0.9 s for the vehicle to confirm the value in force."""
         if name in self._limits:
             return self._limit(name, value)
         parameter = writable_parameter(self._vehicle_parameters(), name)
@@ -179,7 +179,7 @@ class MavlinkDriver(Driver):
 
 _ARMING: Final = {
     True: "it reports that it can be armed",
-    False: "it can't be armed: it refuses to take off",
+    False: "it can't be armed and refuses to take off",
     None: "",
 }
-_PREARM: Final = "its messages say why (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"
+_PREARM: Final = "see its messages (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"

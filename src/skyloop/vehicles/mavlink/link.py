@@ -1,4 +1,4 @@
-"""The connection to one vehicle and the thread that serves it: UDP, TCP or a serial port, reopened for ever."""
+"""The connection to one vehicle over UDP, TCP or a serial port, and the thread that serves and reopens it."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from skyloop.vehicles.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.vehicles.mavlink.protocol import MavlinkSession, Packet
 from skyloop.vehicles.mavlink.wire.codec import Message
 
-MAX_DATAGRAM: Final = 65_536
-BURST: Final = 64  #: datagrams that are read before others get their turn
+MAX_DATAGRAM: Final = 65_536  #: bytes
+BURST: Final = 64  #: maximum datagrams per read, so that other links get their turn
 
 
 class MavlinkConnection(Protocol):
     """An open socket or port."""
 
-    whole: bool  #: each piece is a datagram
-    dropped: int  #: packets that were not sent
+    whole: bool  #: whether each piece is a datagram
+    dropped: int  #: packets dropped instead of sent
 
     def fileno(self) -> int: ...
 
     def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came, each piece with its sender.
+        """Return the received bytes, each piece with its sender.
 
         Raises:
-            OSError: Nothing more will come.
+            OSError: The connection has ended.
         """
 
     def send(self, packet: Packet) -> None:
-        """Send a packet, or drop it where there is no room.
+        """Send a packet, or drop it if the buffer is full.
 
         Raises:
-            OSError: It can't be sent.
+            OSError: The connection can't send.
         """
 
     def close(self) -> None: ...
 
 
 class UdpListener:
-    """Listens on a UDP port, and answers each sender."""
+    """A UDP port that answers each sender."""
 
     whole = True
 
@@ -59,18 +59,18 @@ class UdpListener:
         try:
             self._socket.setblocking(False)
             if self._six:
-                self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # vehicles of IPv4 are heard too
+                self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)  # accept IPv4 vehicles, too
             self._socket.bind(self._to_socket((address.place, address.number)))
         except OSError:
             self._socket.close()
             raise
 
     def fileno(self) -> int:
-        """Return the descriptor."""
+        """Return the file descriptor."""
         return self._socket.fileno()
 
     def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return the datagrams that came, at most :data:`BURST`, each with its sender."""
+        """Return up to :data:`BURST` received datagrams, each with its sender."""
         came: list[tuple[bytes, Peer]] = []
         for _ in range(BURST):
             try:
@@ -78,14 +78,14 @@ class UdpListener:
                 came.append((data, _peer_of(source)))
             except BlockingIOError:
                 break
-            except ConnectionError:  # nobody listens where we sent to: it may come back
+            except ConnectionError:  # ICMP port unreachable: the peer may come back
                 continue
         return came
 
     def send(self, packet: Packet) -> None:
-        """Send a datagram; drop it if there is no peer yet, or no room."""
+        """Send a datagram; drop it while there is no peer or no room."""
         if packet.peer is None:
-            self.dropped += 1  # no vehicle was received yet
+            self.dropped += 1  # no vehicle found yet
             return
         try:
             self._socket.sendto(packet.data, self._to_socket(packet.peer))
@@ -105,11 +105,11 @@ class UdpListener:
         return (host if ":" in host or not host else f"{_OF_IPV4}{host}"), port, 0, number
 
 
-_OF_IPV4: Final = "::ffff:"  #: how a socket of IPv6 shows addresses of IPv4 (RFC 4291, section 2.5.5.2)
+_OF_IPV4: Final = "::ffff:"  #: prefix of IPv4 addresses on an IPv6 socket (RFC 4291, section 2.5.5.2)
 
 
 def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, int]:
-    """Return who sent a datagram as an address would have it: of IPv4 plain, of one link with its interface."""
+    """Return a datagram's sender in address form: IPv4 without the prefix, link-local with its interface."""
     host, port = source[:2]
     if len(source) == 4 and source[3] and "%" not in host:
         host = f"{host}%{source[3]}"
@@ -117,7 +117,7 @@ def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, 
 
 
 class UdpSender(UdpListener):
-    """Speaks first over UDP, from a port of its own."""
+    """A UDP socket that sends first, from an ephemeral port."""
 
     def __init__(self, address: Address) -> None:
         family, *_, found = socket.getaddrinfo(address.place, address.number, 0, socket.SOCK_DGRAM)[0]
@@ -125,17 +125,17 @@ class UdpSender(UdpListener):
         super().__init__(Address(ConnectionKind.UDP_IN, "::" if family == socket.AF_INET6 else "", 0))
 
     def send(self, packet: Packet) -> None:
-        """Send a datagram to the peer, or to the address until something was received."""
+        """Send a datagram to the peer, or to the configured address until something arrives."""
         super().send(packet._replace(peer=packet.peer or self._to))
 
 
 class _Stream(ByteStream):
-    """A connection that carries bytes in order, of one vehicle."""
+    """An ordered byte stream that carries one vehicle."""
 
     whole = False
 
     def receive(self) -> list[tuple[bytes, Peer]]:
-        """Return what came; raises OSError where nothing more will come."""
+        """Return the received bytes; raise OSError once the stream has ended."""
         data = self.read()
         return [(data, None)] if data else []
 
@@ -145,14 +145,14 @@ class _Stream(ByteStream):
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served."""
+    """A client of the autopilot's TCP server, which serves one client at a time: an open connection may still wait."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
 
 
 class SerialPort(_Stream, SerialStream):
-    """A serial port, through pyserial, opened for this process alone."""
+    """A serial port opened exclusively through pyserial."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number, "mavlink://serial:", "mavlink")
@@ -167,16 +167,16 @@ _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] 
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection, to a numeric host. Takes a second at most."""
+    """Open a connection to a numeric host. Takes up to a second."""
     return _KINDS[address.kind](address)
 
 
-WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
-_CLOSE_S: Final = 3.0
+WRITE_S: Final = 0.9  #: a write that is not confirmed within this time has failed
+_CLOSE_S: Final = 3.0  #: time for the thread to end
 
 
 class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
-    """Keeps the connection and serves the session, on a thread of its own."""
+    """The link's thread: keeps the connection open and serves the session."""
 
     RETRY_NS = nanoseconds(1.0)
 
@@ -203,7 +203,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Have the session accept an action, and send it at once. Any thread. See :meth:`MavlinkSession.command`."""
+        """Have the session accept an action and send it at once. Any thread. See :meth:`MavlinkSession.command`."""
         return self._decide(partial(self.session.command, action, alone=alone, new=new))
 
     def send(self, message: Message) -> None:
@@ -213,7 +213,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter; return why it failed, or None. Takes up to 0.9 s. Any thread but the link's."""
+        """Write a parameter; return why it failed, or None. Blocks for up to 0.9 s. Any thread but the link's."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
@@ -232,7 +232,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
                 self.session.receive(data, peer, now_ns, whole=connection.whole)
 
     def _send_due(self, now_ns: int) -> None:
-        """Send what is due. With the lock held, on any thread."""
+        """Send due packets. Call with the lock held, on any thread."""
         packets = self.session.poll(now_ns)
         connection = self._connection
         if connection is None or self._broken:
@@ -257,7 +257,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
         return open_connection(self._address())
 
     def _address(self) -> Address:
-        """Return the address with a numeric host; raises OSError where that is not known, or not yet."""
+        """Return the address with a numeric host; raise OSError while it can't be resolved."""
         address = self.session.options.address
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address

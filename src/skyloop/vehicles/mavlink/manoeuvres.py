@@ -1,4 +1,4 @@
-"""Holding, a velocity, a place, an attitude and a take-off, each as the messages that make the vehicle fly it. Pure."""
+"""Position hold, velocity, position, attitude and take-off as MAVLink messages. Pure."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
 
-# Frames of SET_POSITION_TARGET_LOCAL_NED that both autopilots take.
+# Frames of SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
 WORLD: Final = 1
 BODY: Final = 8  #: levelled
 VELOCITY_AND_YAW_RATE: Final = 0x5C7
@@ -24,22 +24,22 @@ POSITION: Final = 0xDF8
 POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: between repeats of a velocity or position: 25 Hz
-ATTITUDE_PERIOD_NS: Final = 20_000_000  #: the same for an attitude, which turns meanwhile
-MOST_YAW_LEAD_RAD: Final = 0.5  #: the heading that is asked for waits for a vehicle that can't follow
-STOPPED_M_S: Final = 0.25  #: slower than this, the position is held instead of a speed of zero,
-STOPPING_S: Final = 3.0  #: and after this in any case
-MOST_STEP_S: Final = 0.1
-WAY_M_S: Final = 1.0  #: on the way to a place, where no speed is given
-WAY_TURN_RAD_S: Final = 0.8
-WAY_M_S2: Final = 0.8  #: at its beginning and its end
-LEASH_S: Final = 1.5  #: so far ahead of the vehicle, by time at the speed of the way, is the place that it is sent
+ATTITUDE_PERIOD_NS: Final = 20_000_000  #: between attitudes, which turn between repeats: 50 Hz
+MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may lead a vehicle that can't follow
+STOPPED_M_S: Final = 0.25  #: slower than this, hold the position instead of a speed of zero;
+STOPPING_S: Final = 3.0  #: after this, hold it in any case
+MOST_STEP_S: Final = 0.1  #: longest step of a set-point, after a pause of the ticks
+WAY_M_S: Final = 1.0  #: default speed to a position
+WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
+WAY_M_S2: Final = 0.8  #: at the start and the end
+LEASH_S: Final = 1.5  #: how far the sent position may lead the vehicle, as time at the requested speed
 LEASH_M: Final = 0.3  #: and at least this
 
 Target = tuple[int, int]  #: system and component
 
 
 def velocity_message(action: Velocity, target: Target) -> Message:
-    """Return the set-point of a velocity in levelled body axes."""
+    """Return a velocity set-point in levelled body axes."""
     x, y, z = flip(action.forward, action.left, action.up)
     return m.MAVLink_set_position_target_local_ned_message(
         0, *target, BODY, VELOCITY_AND_YAW_RATE, 0, 0, 0, x, y, z, 0, 0, 0, 0, 0.0 - action.yaw_rate
@@ -47,14 +47,14 @@ def velocity_message(action: Velocity, target: Target) -> Message:
 
 
 def position_message(position: Vector, target: Target) -> Message:
-    """Return the set-point of a position: north, east, down from the origin [m]."""
+    """Return a position set-point: north, east, down from the origin [m]."""
     return m.MAVLink_set_position_target_local_ned_message(
         0, *target, WORLD, POSITION, *position, 0, 0, 0, 0, 0, 0, 0, 0
     )
 
 
 class PositionHold:
-    """Stops, then holds the position where it stopped."""
+    """Stops the vehicle, then holds the position where it stopped."""
 
     period_ns = VELOCITY_PERIOD_NS
 
@@ -63,7 +63,7 @@ class PositionHold:
         self._position: Vector | None = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point that is due now."""
+        """Return the set-point if one is due."""
         slow = vehicle.velocity is not None and math.hypot(*vehicle.velocity) < STOPPED_M_S
         late = seconds(now_ns - self._begun_ns) > STOPPING_S
         if self._position is None and vehicle.position is not None and (slow or late):
@@ -82,39 +82,39 @@ class VelocitySetpoint:
         self.action = action
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:  # noqa: ARG002
-        """Return the set-point that is due now."""
+        """Return the set-point if one is due."""
         return velocity_message(self.action, target)
 
 
 class PositionSetpoint:
-    """Flies straight to a place and stays there.
+    """Flies straight to a position and stays there.
 
-    Autopilots fly to a place as fast as their own parameters let them. So the place that is sent moves to the goal, at
-    the speed of the action at most, and stays near the vehicle.
+    Autopilots fly to a position as fast as their own parameters allow. Hence the position sent moves to the goal, no
+    faster than the action's speed, and stays near the vehicle.
     """
 
     period_ns = VELOCITY_PERIOD_NS
 
     def __init__(self, action: Position) -> None:
         self.action = action
-        self._at: Vector | None = None  # what the vehicle is sent: north, east, down
+        self._at: Vector | None = None  # position sent to the vehicle: north, east, down
         self._speed_m_s = 0.0
         self._yaw: float | None = None  # clockwise from north
-        self._keep_yaw: float | None = None  # where none is asked for
+        self._keep_yaw: float | None = None  # heading to keep where the action sets none
         self._before_ns = 0
 
     def replace(self, action: Position) -> None:
-        """Fly elsewhere, from where it is on its way."""
+        """Fly elsewhere, starting from the vehicle's position on the way."""
         if self.action.yaw is not None and action.yaw is None:
-            self._keep_yaw = None  # the heading that it has by now
+            self._keep_yaw = None  # its present heading
         self.action = action
 
     def hold_back(self) -> None:
-        """Begin where the vehicle is, as it does not follow yet."""
+        """Restart from the vehicle's position: it does not follow yet."""
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point that is due now; a velocity of zero while position or heading are not known."""
+        """Return the set-point if one is due; a velocity of zero while position or heading is unknown."""
         if vehicle.position is None or vehicle.yaw is None:
             self.hold_back()
             return velocity_message(Velocity(), target)
@@ -129,7 +129,7 @@ class PositionSetpoint:
         )
 
     def _move(self, at: Vector, vehicle: Vector, step_s: float) -> None:
-        """Move what it is sent towards the place."""
+        """Move the sent position towards the goal."""
         goal, most = swap(*self.action.place), self.action.speed or WAY_M_S
         left = math.dist(at, goal)
         self._speed_m_s = min(most, self._speed_m_s + WAY_M_S2 * step_s, math.sqrt(2.0 * WAY_M_S2 * left))
@@ -154,7 +154,7 @@ def _between(start: Vector, end: Vector, share: float) -> Vector:
 
 
 class AttitudeSetpoint:
-    """Flies an attitude with climb rate and yaw rate; the heading that is asked for turns step by step."""
+    """Flies an attitude with climb rate and yaw rate, turning the requested heading step by step."""
 
     period_ns = ATTITUDE_PERIOD_NS
 
@@ -165,11 +165,11 @@ class AttitudeSetpoint:
         self._before_ns: int | None = None
 
     def within(self, action: Attitude) -> Attitude:
-        """Return the attitude with a climb rate that the autopilot takes."""
+        """Return the attitude with the climb rate limited to what the autopilot accepts."""
         return Attitude(action.roll, action.pitch, self._thrust.limit_climb(action.climb), action.yaw_rate)
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point that is due now."""
+        """Return the set-point if one is due."""
         action = self.action
         step_s = 0.0 if self._before_ns is None else min(MOST_STEP_S, seconds(now_ns - self._before_ns))
         self._before_ns = now_ns
@@ -193,41 +193,40 @@ class AttitudeSetpoint:
 Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
-PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off that nobody asked for in so long is given up if it is not armed
-RISING_NS: Final = nanoseconds(8.0)  #: an armed one that does not leave the ground by then is given up
-ARM_PACE_S: Final = 1.0
-ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledgement of arming counts, until a heartbeat shows it
-LANDED_NS: Final = nanoseconds(2.5)  #: after this a landing has disarmed it, or does not: a PX4 does after 2 s
+PATIENCE_NS: Final = nanoseconds(6.0)  #: give up a take-off not requested for this long if the vehicle is not armed
+RISING_NS: Final = nanoseconds(8.0)  #: give up if an armed vehicle is still on the ground after this
+ARM_PACE_S: Final = 1.0  #: between repeated commands to arm or take off
+ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledged arming counts without a heartbeat that confirms it
+LANDED_NS: Final = nanoseconds(2.5)  #: a landing has disarmed the vehicle by then, or never will: a PX4 does after 2 s
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
-LEFT_GROUND_M: Final = 0.3
-CUT_SHORT: Final = 0.5  #: a take-off that holds its position below this share of its height was stopped by somebody,
-CUT_SHORT_M: Final = 1.05  #: and by so much at least: a PX4's ends NAV_MC_ALT_RAD (0.8 m) below its height by itself
-STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for so long, as messages may overtake one another
-STALLED_NS: Final = nanoseconds(6.0)  #: no higher than before for so long means that something cancelled the climb
+LEFT_GROUND_M: Final = 0.3  #: rise that shows a lift-off, where the vehicle reports none
+CUT_SHORT: Final = 0.5  #: another operator stopped a take-off that holds below this share of its height
+CUT_SHORT_M: Final = 1.05  #: and this far below it: a PX4 ends one NAV_MC_ALT_RAD (0.8 m) below its height
+STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for this long, as messages may overtake one another
+STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long was cancelled
 
 
 class TakeoffSequence:
-    """One take-off, from a vehicle that stands disarmed in whatever mode to one that hovers. Level-triggered.
+    """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
-    Each step asks for what is missing: the mode to arm in, arming, the command. Refusals are reported with the
-    vehicle's own words, and tried again, for as long as somebody asks for the take-off. ``asked_ns``: when that was
-    last.
+    Each step requests what is missing: the mode to arm in, arming, the command. Refusals are reported in the vehicle's
+    own words, and retried for as long as the take-off is requested. ``asked_ns``: the time of the last request.
 
     Args:
-        autopilot: What this autopilot does differently.
-        height_m: Above the start.
-        now_ns: When it begins.
-        disarms: Whether a landing from here is not over: the vehicle, found armed, may disarm by it any time.
+        autopilot: The autopilot's profile.
+        height_m: Height above the start.
+        now_ns: Start of the take-off.
+        disarms: Whether a landing here is not over: it may still disarm the vehicle, which was found armed.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
         self.asked_ns = now_ns
         self.done = False
-        self.given_up = ""  #: why, once it is
-        self.taken_over = False  #: somebody chose another mode in the air
-        self.rose = False  #: it left the ground
-        self.lead_ns: int | None = None  #: since when set-points flow
-        self.reason = ""  #: the vehicle's own, of why it can't be armed
+        self.given_up = ""  #: the reason, once given up
+        self.taken_over = False  #: another operator chose a mode in the air
+        self.rose = False  #: it has left the ground
+        self.lead_ns: int | None = None  #: when set-points began to flow
+        self.reason = ""  #: the vehicle's own reason why it can't be armed
         self._autopilot = autopilot
         self._height_m = height_m
         self._begun_ns = now_ns
@@ -241,19 +240,19 @@ class TakeoffSequence:
         self._ground_m: float | None = None
         self._other_ns: int | None = None
         self._sent_ns = 0
-        self._seen = not autopilot.TAKING_OFF  # its mode for taking off, where it has one
+        self._seen = not autopilot.TAKING_OFF  # its take-off mode was seen, if it has one
         self.refused = ""  #: why it is not armed yet
-        self.arm_asked_ns: int | None = None  #: when arming was asked for last; None: it was armed by others before
-        self._arming_ns: int | None = None  # since when; an answer from before is of the landing's disarming
-        self._ready = False  # it was seen armed in the mode that it takes off in
+        self.arm_asked_ns: int | None = None  #: the last arming request; None: it was already armed
+        self._arming_ns: int | None = None  # the first arming request; earlier answers are to the landing's disarming
+        self._ready = False  # it was seen armed in the mode for taking off
 
     @property
     def started(self) -> bool:
-        """Whether the vehicle is armed for it: from then on it goes on by itself."""
+        """Whether the vehicle is armed for this take-off, which then needs no more requests."""
         return self._armed_ns is not None and (self.rose or not self._disarms)
 
     def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
-        """Ask for what is missing, and return the set-points that are due."""
+        """Request what is missing and return the set-points that are due."""
         self._observe(vehicle, commands, now_ns)
         if self.done or self.given_up or self.taken_over or self._other_ns is not None:
             return []
@@ -274,7 +273,7 @@ class TakeoffSequence:
         return []
 
     def _observe(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> None:
-        """Judge what came of it so far."""
+        """Update the take-off's progress from the vehicle's state."""
         answer = None if self._arming_ns is None else commands.result(ARM.number, self._arming_ns)
         if self._armed_ns is None:
             if vehicle.armed or answer == ACCEPTED:
@@ -294,7 +293,7 @@ class TakeoffSequence:
         self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
-        if not vehicle.armed and not self.started:  # by our own landing before: this flight has not begun
+        if not vehicle.armed and not self.started:  # disarmed by our previous landing, before this flight began
             self._armed_ns, self._climb_command, self._disarms = None, None, False
         elif not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
             self.given_up = "the vehicle disarmed itself"
@@ -303,21 +302,21 @@ class TakeoffSequence:
             refused = f": the take-off was {result_name(result)}" if result not in (None, ACCEPTED) else ""
             self.given_up = f"it does not leave the ground{refused}"
         elif self._other_ns is not None:
-            pass  # nor is it done in a mode of others, however high it swings
+            pass  # a mode chosen by others never completes a take-off, at any height
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
-            self.done = True  # as high as it gets, by the altitude that it reports
+            self.done = True  # as high as it gets, by its reported altitude
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 
     def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
-        """Return whether the landing before can't disarm it any more: one that disarms from here on was killed."""
+        """Return whether the previous landing can no longer disarm it: a later disarming has another cause."""
         accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
         return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS
 
     def _is_off_ground(self, landed: Landed, height_m: float) -> bool:
-        """Return whether the vehicle is off the ground, by its own word, or by its altitude where it has none."""
+        """Return whether the vehicle is off the ground: as it reports, else by its altitude."""
         if landed is not Landed.UNKNOWN:
             return landed is not Landed.ON_GROUND
         if self._ground_m is None:
@@ -325,16 +324,16 @@ class TakeoffSequence:
         return height_m - self._ground_m > LEFT_GROUND_M
 
     def _is_cut_short(self, vehicle: VehicleState) -> bool:
-        """Return whether somebody chose the mode for holding the position on the way up; a take-off ends in it, too."""
+        """Return whether another operator chose position hold during the climb, a mode in which take-offs also end."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
         below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m
         if self._climb_command is not None and vehicle.amsl_m is not None:
-            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # it may move its home on the way
+            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # its home may move on the way
         return below_m is not None and below_m > max(CUT_SHORT * self._height_m, CUT_SHORT_M)
 
     def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:
-        """Notice that somebody chose another mode, on the ground already."""
+        """Detect a mode chosen by another operator, on the ground or in the air."""
         autopilot, mode = self._autopilot, vehicle.mode
         ours = mode in autopilot.TAKING_OFF or (mode in (autopilot.ARMING, autopilot.GUIDED) and not cut_short)
         self._ready = self._ready or (ours and vehicle.armed)
@@ -346,9 +345,9 @@ class TakeoffSequence:
             self.taken_over = True
 
     def _climb(self, vehicle: VehicleState, target: tuple[int, int], now_ns: int) -> list[Message]:
-        """Return set-points where they must flow before the mode that follows them, which goes on from here.
+        """Return set-points where the guided mode needs them flowing before it starts.
 
-        If the climb was cancelled: a position to go to, which is all that helps an ArduCopter.
+        If the climb was cancelled, return a position to fly to: nothing else restarts an ArduCopter's climb.
         """
         stalled = now_ns - self._best_ns > STALLED_NS and vehicle.mode == self._autopilot.GUIDED
         if self._position is None:

@@ -1,4 +1,4 @@
-"""MAVLink's microservices: choice of the vehicle, commands, message intervals, time, poses from outside. Pure."""
+"""MAVLink's microservices: vehicle selection, commands, message intervals, time, external poses. Pure."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Autopilot
 
-MOVED_NS: Final = nanoseconds(0.3)  #: a vehicle that is silent for so long may go on from another port
-MOST_OTHERS: Final = 16  #: other vehicles that are reported; a hostile sender can make up any number
+MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may continue from another port
+MOST_OTHERS: Final = 16  #: cap on other vehicles reported: a hostile sender can make up any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
-#: MAV_TYPE of what holds itself in the air by several rotors.
+#: MAV_TYPE of aircraft that hover on several rotors.
 _MULTIROTORS: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 
 
@@ -38,10 +38,10 @@ class VehicleIdentity:
 
 
 class VehicleSelector:
-    """Chooses the vehicle that is flown among all whose heartbeats arrive.
+    """Chooses one vehicle among all whose heartbeats arrive.
 
     Args:
-        system: Its system id; None: the first one found, and after that only that system.
+        system: Its system id; None: the first one found, and from then on only that system.
         peer: Its address and port; None: any.
         component: Its component id.
     """
@@ -53,11 +53,11 @@ class VehicleSelector:
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
         self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was: it may have moved there
-        self._others: set[VehicleIdentity] = set()  # received beside it: others, with its id
-        self._received_ns = 0  # when the chosen one was
+        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received beside it
+        self._received_ns = 0  # when the chosen one was last received
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
-        """Handle any message; return events about other vehicles, and about a chosen one that moved to another port."""
+        """Handle any message; return events about other vehicles, or about the chosen one moving to another port."""
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
         if self.chosen == found:
             self._received_ns = now_ns
@@ -69,7 +69,7 @@ class VehicleSelector:
             if now_ns - self._received_ns >= MOVED_NS:
                 self.chosen, self._received_ns = found, now_ns
                 self._elsewhere.clear()
-                text = f"the vehicle sends from UDP port {found.peer[1] if found.peer else 0} now"
+                text = f"the vehicle now sends from UDP port {found.peer[1] if found.peer else 0}"
                 return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, data={"reason": "moved"})]
         if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
             return []
@@ -82,7 +82,7 @@ class VehicleSelector:
         return self._report_other(found)
 
     def _may_have_moved(self, found: VehicleIdentity) -> bool:
-        """Return whether this may be the chosen vehicle, with another port: its host may have given it a new one."""
+        """Return whether this may be the chosen vehicle on a new port, which its host may have assigned."""
         chosen = self.chosen
         if chosen is None or chosen.peer is None or found.peer is None or self._wanted_peer is not None:
             return False
@@ -90,7 +90,7 @@ class VehicleSelector:
         return same and found not in self._others and len(self._others | self._elsewhere) < MOST_OTHERS
 
     def is_chosen(self, message: Message, peer: Peer) -> bool:
-        """Return whether the vehicle that is flown sent it."""
+        """Return whether the chosen vehicle sent it."""
         chosen = self.chosen
         return (
             chosen is not None
@@ -100,7 +100,7 @@ class VehicleSelector:
         )
 
     def forget(self) -> None:
-        """Forget the chosen vehicle: it may come back from another peer, as the same system."""
+        """Forget the chosen vehicle: the same system may come back from another peer."""
         self.chosen = None
         self._others.clear()
         self._elsewhere.clear()
@@ -110,7 +110,7 @@ class VehicleSelector:
             return []
         self._reported.add(found)
         where = f" at {found.peer[0]}:{found.peer[1]}" if found.peer is not None else ""
-        text = f"another vehicle answers, system {found.system}{where}: it is ignored"
+        text = f"another vehicle answers, system {found.system}{where}: ignored"
         if self.chosen is not None and found.system == self.chosen.system:
             text += "; ?peer=HOST:PORT distinguishes two with one id"
         else:
@@ -127,7 +127,7 @@ class VehicleSelector:
         self._reported.add(found)
         text = (
             f"an autopilot answers as component {found.component} of system {found.system}, not as component "
-            f"{self._component}: it is ignored; ?component={found.component} chooses it"
+            f"{self._component}: ignored; ?component={found.component} chooses it"
         )
         data: dict[str, Value] = {"reason": "component", "system": found.system, "component": found.component}
         return [VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data)]
@@ -142,9 +142,9 @@ def _is_vehicle(heartbeat: Message) -> bool:
 def unsupported_reason(heartbeat: Message) -> str:
     """Return why this vehicle can't be flown from here; empty if it can."""
     if heartbeat.autopilot not in tuple(Autopilot):
-        return f"its autopilot is number {heartbeat.autopilot} of MAVLink; ArduCopter and PX4 are known here"
+        return f"its MAV_AUTOPILOT is {heartbeat.autopilot}; only ArduCopter and PX4 are supported"
     if heartbeat.type not in _MULTIROTORS:
-        return f"it is of MAVLink's type {heartbeat.type}, which is no multirotor or helicopter"
+        return f"its MAV_TYPE is {heartbeat.type}, not a multirotor or helicopter"
     return ""
 
 
@@ -177,14 +177,14 @@ def result_name(result: int) -> str:
 class CommandSender:
     """Sends commands and keeps their results.
 
-    Level-triggered: a caller that wants an effect calls :meth:`request` again and again until it shows.
+    Level-triggered: a caller that wants an effect keeps calling :meth:`request` until the effect shows.
     """
 
     def __init__(self, target: tuple[int, int] = (1, 1)) -> None:
         self.target = target  #: system and component
         self._out: list[Message] = []
-        self._sent: dict[VehicleCommand, tuple[int, int]] = {}  # when last, and how often
-        self._answers: dict[int, tuple[int, int]] = {}  # command: result, when
+        self._sent: dict[VehicleCommand, tuple[int, int]] = {}  # time of the last request, number of requests
+        self._answers: dict[int, tuple[int, int]] = {}  # command: result, time
 
     def request(self, command: VehicleCommand, now_ns: int, pace_s: float = 0.5) -> None:
         """Send a command, unless it was sent within ``pace_s``."""
@@ -192,7 +192,7 @@ class CommandSender:
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
         if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
-            times = 0  # not a repeat of the same asking
+            times = 0  # a new request, not a repeat
         self._sent[command] = now_ns, times + 1
         arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
         self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
@@ -203,12 +203,12 @@ class CommandSender:
             self._answers[message.command] = message.result, now_ns
 
     def result(self, command: int, since_ns: int) -> int | None:
-        """Return the newest result of a command, if it came since ``since_ns``."""
+        """Return the newest result of a command if it arrived since ``since_ns``."""
         found = self._answers.get(command)
         return found[0] if found is not None and found[1] >= since_ns else None
 
     def reset(self) -> None:
-        """Forget everything: the vehicle was lost."""
+        """Forget everything: the link was lost."""
         self._out.clear()
         self._sent.clear()
         self._answers.clear()
@@ -219,27 +219,27 @@ class CommandSender:
         return out
 
 
-AT_ONCE: Final = 4  #: requests in a tick: a slow link needs room for others
-RETRY_S: Final = 3.0  #: a message that does not flow as often as it was asked for is asked for again
-ENOUGH: Final = 0.5  #: share of the rate that counts as flowing
-PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`, as the vehicle may not have it
-TRIES: Final = 4
+AT_ONCE: Final = 4  #: requests per tick: a slow link needs room for others
+RETRY_S: Final = 3.0  #: then request a message that is slower than requested again
+ENOUGH: Final = 0.5  #: share of the requested rate that is good enough
+PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`: the vehicle may not have the message
+TRIES: Final = 4  #: requests at the faster pace
 
 
-LOOK_NS: Final = nanoseconds(0.2)  #: between two looks at what flows, once all was asked for
+CHECK_NS: Final = nanoseconds(0.2)  #: between checks of the rates, once everything was requested
 
 
 class MessageIntervals:
-    """Asks for messages at the rates that feedback needs, and again while they do not flow."""
+    """Requests messages at the rates that feedback needs, and again while they are missing."""
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int, int]] = {}  # since when it is counted, from what, and how often asked
-        self._look_ns = 0
+        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at the start, number of requests
+        self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
-        """Ask for messages that flow too slowly or not at all, at most :data:`AT_ONCE` of them."""
-        if now_ns < self._look_ns:
+        """Request up to :data:`AT_ONCE` messages that are missing or too slow."""
+        if now_ns < self._check_ns:
             return
         left = AT_ONCE
         for name, rate_hz in self._rates.items():
@@ -258,40 +258,40 @@ class MessageIntervals:
             number = getattr(m, f"MAVLINK_MSG_ID_{name}")
             commands.request(VehicleCommand(m.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / rate_hz)), now_ns, 0.0)
             left -= 1
-        self._look_ns = now_ns + LOOK_NS
+        self._check_ns = now_ns + CHECK_NS
 
 
-ASK_NS: Final = nanoseconds(1.0)
-HURRY_NS: Final = nanoseconds(0.1)  #: between the first few
-FIRST: Final = 5
-KEEP_NS: Final = nanoseconds(10.0)
-PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this when it arrives is of another clock
-BEHIND_MS: Final = 1000  #: stamps that are behind by more may mean that the vehicle was started anew
-_WRAP: Final = 1 << 32  #: of stamps in ms: 49 days
+ASK_NS: Final = nanoseconds(1.0)  #: between TIMESYNC requests
+HURRY_NS: Final = nanoseconds(0.1)  #: between the first few requests
+FIRST: Final = 5  #: number of fast requests
+KEEP_NS: Final = nanoseconds(10.0)  #: how long clock samples count
+PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this on arrival is from another clock
+BEHIND_MS: Final = 1000  #: stamps behind by more than this may mean that the vehicle rebooted
+_WRAP: Final = 1 << 32  #: of stamps in ms: after 49 days
 
 
 class VehicleClock:
-    """Maps a vehicle's stamps to this host's clock: by ``TIMESYNC`` where that fits, else by the smallest delay."""
+    """Maps a vehicle's stamps to this host's clock: by ``TIMESYNC`` where plausible, else by the smallest delay."""
 
     def __init__(self) -> None:
-        self.round_trip_s: float | None = None  #: of the best answer lately
-        self._samples: deque[tuple[int, int, int]] = deque()  # when, round trip, their clock minus ours
-        self._offset_ns: int | None = None  # their clock minus ours, of the best sample
+        self.round_trip_s: float | None = None  #: of the best recent answer
+        self._samples: deque[tuple[int, int, int]] = deque()  # time, round trip, their clock minus ours
+        self._offset_ns: int | None = None  # their clock minus ours, in the best sample
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
-        self._watches: dict[str, RestartWatch] = {}  # by the message's name
+        self._watches: dict[str, RestartWatch] = {}  # by message name
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
-        """Return the ``TIMESYNC`` request that is due now, stamped on our clock."""
+        """Return the ``TIMESYNC`` request if one is due, stamped on our clock."""
         if now_ns - self._asked_ns < (HURRY_NS if self._asked < FIRST else ASK_NS):
             return []
         self._asked_ns, self._asked = now_ns, self._asked + 1
         return [m.MAVLink_timesync_message(0, now_ns)]
 
     def on_timesync(self, message: Message, now_ns: int) -> list[Message]:
-        """Handle a ``TIMESYNC``; return the answer, if it is a request."""
+        """Handle a ``TIMESYNC``; return the answer if it is a request."""
         if message.tc1 == 0:
             return [m.MAVLink_timesync_message(now_ns, message.ts1)]
         round_trip_ns = now_ns - message.ts1
@@ -304,22 +304,22 @@ class VehicleClock:
         return []
 
     def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
-        """Judge a message by its stamp: new, overtaken by others of its kind, or of a vehicle that was started anew."""
+        """Classify a message by its stamp: new, overtaken by others of its kind, or from a vehicle that rebooted."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
-        """Return when a state with this stamp was captured: neither after it arrived nor before the last one."""
+        """Return when the stamped state was captured: not after its arrival, nor before the previous one."""
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns
-            # Stamps are cut to whole milliseconds, so they may be that much too early.
+            # Stamps are truncated to milliseconds, so they may be up to that much too early.
             if 0 <= now_ns - synced_ns <= PLAUSIBLE_NS:
                 live_ns = synced_ns
         self._captured_ns = max(self._captured_ns, min(now_ns, live_ns))
         return self._captured_ns
 
     def now(self, now_ns: int) -> int:
-        """Return the capture time of a state without a stamp."""
+        """Return the capture time of an unstamped state."""
         self._captured_ns = max(self._captured_ns, now_ns)
         return self._captured_ns
 
@@ -330,10 +330,10 @@ _NAN: Final = math.nan
 
 
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
-    """Return a pose from outside as a message.
+    """Return an external pose as a message.
 
-    The message has north, east, down [m] and the angles of a body whose axes are forward, right, down [rad]. Its time
-    is in microseconds of our own clock: ``TIMESYNC`` sends it to the vehicle.
+    The message holds north, east, down [m] and the angles of a body with axes forward, right, down [rad]. Its time is
+    in microseconds of our own clock, which the vehicle learns by ``TIMESYNC``.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)
@@ -350,7 +350,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
 
 
 def _covariance(pose: ExternalPose) -> list[float]:
-    """Return the upper right triangle of x, y, z, roll, pitch, yaw; its first number is NaN where nothing is known."""
+    """Return the upper right triangle of x, y, z, roll, pitch, yaw; the first number is NaN if it is unknown."""
     if pose.position_std_m is None or pose.attitude_std_rad is None:
         return [_NAN] * 21
     variances = [pose.position_std_m**2] * 3 + [pose.attitude_std_rad**2] * 3

@@ -1,4 +1,4 @@
-"""Options of a ``mavlink://`` address, and the camera that one names. Pure. ``docs/mavlink.md`` has them as a table."""
+"""Options of ``mavlink://`` addresses, including the camera's. Pure. ``docs/mavlink.md`` lists them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skyloop.files import expand, read_bytes
 from skyloop.messages import CameraInfo
 from skyloop.messages.frame import H264
 
-Peer = tuple[str, int] | None  #: of UDP; a stream has no other
+Peer = tuple[str, int] | None  #: a UDP sender; None on a stream
 
 TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
 ALTITUDE: Final = "limits.altitude"
@@ -26,11 +26,11 @@ ALTITUDE: Final = "limits.altitude"
 
 @dataclass(frozen=True, slots=True)
 class OwnLimit:
-    """A limit of the driver's own."""
+    """One of the driver's own limits."""
 
     name: str
-    option: str  #: its name in an address
-    usual: float  #: its default
+    option: str  #: name of the option in an address
+    usual: float  #: default value
     low: float
     high: float
     unit: str
@@ -47,8 +47,8 @@ USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
 
 KEY_BYTES: Final = 32
 DEFAULT_BAUD: Final = 57_600
-#: Rotations from a camera's optical axes (right, down, forward) to the body's, row by row; the picture's top is up, or
-#: forward for one that looks down.
+#: Rotations from a camera's optical axes (right, down, forward) to body axes, row by row. The top of the image is up,
+#: or forward for a camera that looks down.
 FACINGS: Final = {
     "forward": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
     "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
@@ -68,14 +68,14 @@ KNOWN: Final = {
 class ConnectionKind(StrEnum):
     """How the bytes travel."""
 
-    UDP_IN = "udpin"  #: listens, and answers each sender
-    UDP_OUT = "udpout"  #: speaks first
+    UDP_IN = "udpin"  #: listens and answers each sender
+    UDP_OUT = "udpout"  #: sends first
     TCP = "tcp"  #: connects
     SERIAL = "serial"
 
 
 class PoseMessage(StrEnum):
-    """The message that poses from outside are sent as."""
+    """The message type for external poses."""
 
     ODOMETRY = "odometry"
     VISION = "vision_position_estimate"
@@ -87,7 +87,7 @@ class Address:
 
     kind: ConnectionKind
     place: str  #: host or device
-    number: int  #: port, or bits a second
+    number: int  #: port, or bits per second
 
     def __str__(self) -> str:
         place = f"[{self.place}]" if ":" in self.place and self.kind is not ConnectionKind.SERIAL else self.place
@@ -96,15 +96,15 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class CameraOptions:
-    """A camera beside the autopilot. Size and rate are what is announced before the first picture comes."""
+    """A camera beside the autopilot. Size and rate are announced before the first frame arrives."""
 
-    source: str = field(repr=False)  # with its secrets
+    source: str = field(repr=False)  # may contain credentials
     name: str
     width: int
     height: int
     fps: float
     facing: str  #: one of :data:`FACINGS`
-    stream: bool = True  #: whether H.264 of a camera on the network is announced, to be handed on as it comes
+    stream: bool = True  #: whether to announce a network camera's H.264 as a stream that is passed on unchanged
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,15 +113,15 @@ class MavlinkOptions:
 
     address: Address
     system: int | None = None  #: of the vehicle; None: the first one found
-    component: int = 1  #: of its autopilot: MAV_COMP_ID_AUTOPILOT1 is what autopilots are
-    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: the address of its first packet
+    component: int = 1  #: of its autopilot: by default MAV_COMP_ID_AUTOPILOT1
+    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: the sender of its first packet
     own_system: int = 255
-    rate_hz: float = 50.0  #: of attitude, position and velocity
-    limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by the names of their parameters
-    parameters: bool = True  #: whether they are read
+    rate_hz: float = 50.0  #: rate of attitude, position and velocity
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by parameter name
+    parameters: bool = True  #: whether to read the autopilot's parameters
     key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
-    world_origin: tuple[float, float, float] | None = None  #: the same
+    world_origin: tuple[float, float, float] | None = None  #: the same units
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 
@@ -166,13 +166,13 @@ def address_of(uri: VehicleUri) -> Address:
     if kind is not ConnectionKind.SERIAL:
         found = host_and_port(rest)
         if found is None:
-            raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+            raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
         return Address(kind, *found)
     place, colon, number = rest.rpartition(":")
     if not colon or not number.isdecimal():
         place, number = rest, str(DEFAULT_BAUD)
     if not place or not 1 <= int(number) <= 10_000_000:
-        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+        raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
     return Address(kind, place, int(number))
 
 
@@ -190,7 +190,7 @@ def _key(uri: VehicleUri) -> bytes | None:
     given = uri.reveal("signing_key")
     if given is None:
         return None
-    if not expand(given).exists():  # perhaps the key itself: it is not repeated
+    if not expand(given).exists():  # don't echo it: the value may be the key itself
         raise FileFormatError(f"{uri}: signing_key can't be read: it must be the path of a file that holds the key")
     held = read_bytes(given, f"{uri}: the signing key's file", 1024)
     if len(held) == KEY_BYTES:
@@ -247,21 +247,21 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
 
 
 def takeoff_height(values: Mapping[str, float]) -> float:
-    """Return the height of the next take-off [m], never above the ceiling."""
+    """Return the height of the next take-off [m], capped at the ceiling."""
     return min(values[TAKEOFF_ALTITUDE], values[ALTITUDE])
 
 
 def limits_text(values: Mapping[str, float]) -> str:
-    """Return a sentence on the limits in force, for people."""
+    """Return a sentence for people about the limits in force."""
     speed, climb, altitude = (values[name] for name in ("limits.speed", "limits.climb", ALTITUDE))
     return (
-        f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them by the parameters "
+        f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them with the parameters "
         "limits.speed, limits.climb and limits.altitude, or in the address (?speed=…&climb=…&altitude=…)"
     )
 
 
 def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
-    """Return the camera as it is announced before the first picture: from the network most send H.264."""
+    """Return the camera as announced before the first frame: network cameras are assumed to send H.264."""
     return CameraInfo(
         options.name,
         options.width,
@@ -274,12 +274,12 @@ def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
 
 
 def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
-    """Return where the camera's video comes from: a stream or a device, nothing else."""
+    """Return where the camera's video comes from: a stream or a device."""
     return source_of(options.source, f"{uri}: camera")
 
 
 def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
-    """Return a receiver of the camera, not started."""
+    """Return a receiver for the camera, not yet started."""
     settings = LiveCameraSettings(
         source(uri, options),
         options.name,

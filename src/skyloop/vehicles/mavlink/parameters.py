@@ -1,4 +1,4 @@
-"""The autopilot's parameters: over MAVLink, and as ours under ``mavlink.``. Pure."""
+"""The autopilot's parameters over MAVLink, and their names and types under ``mavlink.``. Pure."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-QUIET_NS: Final = nanoseconds(0.7)  #: after silence for so long, what is missing is asked for
-AT_ONCE: Final = 20  #: missing ones that are asked for together
-LIST_NS: Final = nanoseconds(3.0)  #: between requests for the list while nothing of it comes
-GIVE_UP_NS: Final = nanoseconds(20.0)  #: reading ends after so long without a new parameter
-WRITE_NS: Final = nanoseconds(0.25)  #: between repeats of a write that is not confirmed
+QUIET_NS: Final = nanoseconds(0.7)  #: after this much silence, request what is missing
+AT_ONCE: Final = 20  #: missing parameters requested at once
+LIST_NS: Final = nanoseconds(3.0)  #: between requests for the list while none of it arrives
+GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
+WRITE_NS: Final = nanoseconds(0.25)  #: between repeats of an unconfirmed write
 NO_INDEX: Final = 0xFFFF
-MOST: Final = 8192  #: parameters of a list; one that announces more is not believed
+MOST: Final = 8192  #: longest plausible list; ignore a count above it
 
 
 @dataclass(frozen=True, slots=True)
 class ReportedParameter:
-    """A parameter as the vehicle reported it."""
+    """A parameter as reported by the vehicle."""
 
     name: str
     value: float
@@ -45,7 +45,7 @@ class _PendingWrite:
 
 
 class ParameterExchange:
-    """Reads and writes one vehicle's parameters. ``bytewise`` says how its integers are encoded."""
+    """Reads and writes one vehicle's parameters. ``bytewise`` says how integers are encoded."""
 
     def __init__(self) -> None:
         self.target = (1, 1)
@@ -56,24 +56,24 @@ class ParameterExchange:
         self.given_up = False
         self._wanted = False
         self._indices: set[int] = set()
-        self._progress_ns = 0  # when something new came
+        self._progress_ns = 0  # when the last new parameter arrived
         self._asked_ns: int | None = None
         self._writes: list[_PendingWrite] = []
 
     def request_all(self, now_ns: int) -> None:
-        """Begin to read all of them again."""
+        """Start reading all parameters again."""
         self._wanted, self.complete, self.given_up = True, False, False
         self._indices.clear()
         self.count, self._asked_ns, self._progress_ns = None, None, now_ns
 
     def fail_writes(self, reason: str) -> None:
-        """Fail the writes under way: the vehicle was lost."""
+        """Fail pending writes: the link was lost."""
         writes, self._writes = self._writes, []
         for write in writes:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter, in the autopilot's unit; by the deadline ``done`` gets why it failed, or None."""
+        """Write a parameter in the autopilot's unit; by the deadline, ``done`` receives why it failed, or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property
@@ -133,13 +133,13 @@ class ParameterExchange:
             if now_ns >= write.deadline_ns:
                 self._writes.remove(write)
                 reported = self.reported[write.name].value
-                write.done(f"the vehicle did not confirm it; the last value that it reported is {reported:g}")
+                write.done(f"the vehicle did not confirm it; it last reported {reported:g}")
             elif write.sent_ns is None or now_ns - write.sent_ns >= WRITE_NS:
                 write.sent_ns = now_ns
                 kind = self.reported[write.name].kind
                 try:
                     field = to_field(write.value, kind, bytewise=self.bytewise)
-                except struct.error as error:  # it has another type since it was asked for
+                except struct.error as error:  # its type changed since the request
                     self._writes.remove(write)
                     write.done(f"{write.value:g} does not fit: {error}")
                     continue
@@ -155,13 +155,13 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the value that was written; unless ``exact``, in single precision."""
+    """Return whether the vehicle reports the written value; unless ``exact``, compare in single precision."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterInfo:
-    """What is known of a parameter, in the autopilot's own unit."""
+    """A known parameter's unit, range and meaning, in the autopilot's own unit."""
 
     unit: str = ""
     low: float | None = None
@@ -169,70 +169,70 @@ class ParameterInfo:
     text: str = ""
 
 
-#: Units and ranges are those of the autopilots' own parameter references (ardupilot.org and docs.px4.io).
+#: Units and ranges from the autopilots' parameter references (ardupilot.org and docs.px4.io).
 PARAMETER_INFO: Final = {
     # ArduCopter
-    "ANGLE_MAX": ParameterInfo("cdeg", 1000, 8000, "greatest lean angle"),
-    "ATC_ANGLE_MAX": ParameterInfo("deg", 10, 80, "greatest lean angle"),
-    "BATT_FS_LOW_ACT": ParameterInfo("", 0, 7, "what happens with a low battery: 0 nothing, 1 land, 2 return"),
-    "BATT_FS_CRT_ACT": ParameterInfo("", 0, 7, "what happens with a critical battery: 0 nothing, 1 land, 2 return"),
-    "BATT_LOW_VOLT": ParameterInfo("V", 0, None, "voltage of a low battery; 0: not watched"),
-    "DISARM_DELAY": ParameterInfo("s", 0, 127, "armed on the ground for so long, it disarms"),
+    "ANGLE_MAX": ParameterInfo("cdeg", 1000, 8000, "maximum lean angle"),
+    "ATC_ANGLE_MAX": ParameterInfo("deg", 10, 80, "maximum lean angle"),
+    "BATT_FS_LOW_ACT": ParameterInfo("", 0, 7, "low battery action: 0 nothing, 1 land, 2 return"),
+    "BATT_FS_CRT_ACT": ParameterInfo("", 0, 7, "critical battery action: 0 nothing, 1 land, 2 return"),
+    "BATT_LOW_VOLT": ParameterInfo("V", 0, None, "low battery voltage; 0: disabled"),
+    "DISARM_DELAY": ParameterInfo("s", 0, 127, "time armed on the ground until it disarms"),
     "FENCE_ALT_MAX": ParameterInfo("m", 10, 1000, "ceiling of the fence"),
-    "FENCE_ENABLE": ParameterInfo("", 0, 1, "whether the fence works"),
-    "FS_EKF_ACTION": ParameterInfo("", 0, 3, "what happens when it does not know where it is"),
+    "FENCE_ENABLE": ParameterInfo("", 0, 1, "whether the fence is enabled"),
+    "FS_EKF_ACTION": ParameterInfo("", 0, 3, "action when the position estimate is lost"),
     "FS_GCS_ENABLE": ParameterInfo("", 0, 8, "on loss of a ground station's heartbeat: 0 nothing, 5 land, 7 brake"),
-    "FS_GCS_TIMEOUT": ParameterInfo("s", 2, 120, "silence of the ground station that is a failure"),
-    "FS_THR_ENABLE": ParameterInfo("", 0, 7, "what happens when the remote control is lost"),
-    "GUID_OPTIONS": ParameterInfo("", 0, None, "bit 3: thrust is thrust, and no climb rate"),
+    "FS_GCS_TIMEOUT": ParameterInfo("s", 2, 120, "ground station silence that triggers the failsafe"),
+    "FS_THR_ENABLE": ParameterInfo("", 0, 7, "action on loss of the remote control"),
+    "GUID_OPTIONS": ParameterInfo("", 0, None, "bit 3: the thrust field is thrust, not climb rate"),
     "GUID_TIMEOUT": ParameterInfo("s", 0.1, 5, "silence after which a set-point is dropped"),
-    "LAND_SPEED": ParameterInfo("cm/s", 30, 200, "speed of the last part of a landing"),
+    "LAND_SPEED": ParameterInfo("cm/s", 30, 200, "final landing speed"),
     "MAV_GCS_SYSID": ParameterInfo("", 1, 255, "the ground station whose heartbeats count"),
-    "RTL_ALT": ParameterInfo("cm", 30, 300_000, "altitude of the way home"),
+    "RTL_ALT": ParameterInfo("cm", 30, 300_000, "return altitude"),
     "WPNAV_SPEED": ParameterInfo("cm/s", 10, 2000, "horizontal speed"),
-    "WPNAV_SPEED_DN": ParameterInfo("cm/s", 10, 500, "speed of descent"),
-    "WPNAV_SPEED_UP": ParameterInfo("cm/s", 10, 1000, "speed of climb, also of the thrust field"),
+    "WPNAV_SPEED_DN": ParameterInfo("cm/s", 10, 500, "descent speed"),
+    "WPNAV_SPEED_UP": ParameterInfo("cm/s", 10, 1000, "climb speed, also scales the thrust field"),
     # PX4
-    "COM_DISARM_LAND": ParameterInfo("s", None, 20, "standing for so long after a landing, it disarms"),
-    "COM_DISARM_PRFLT": ParameterInfo("s", None, 60, "armed on the ground for so long, it disarms"),
-    "COM_DL_LOSS_T": ParameterInfo("s", 5, 300, "silence of the ground station that is a failure"),
-    "COM_LOW_BAT_ACT": ParameterInfo("", 0, 3, "what happens with a low battery: 0 a warning, 2 land, 3 return"),
-    "COM_OBL_RC_ACT": ParameterInfo("", 0, 7, "what happens without set-points: 0 position mode, 5 hold"),
-    "COM_OF_LOSS_T": ParameterInfo("s", 0, 60, "silence after which set-points are missing"),
-    "GF_ACTION": ParameterInfo("", 0, 5, "what happens at the fence"),
+    "COM_DISARM_LAND": ParameterInfo("s", None, 20, "time on the ground after a landing until it disarms"),
+    "COM_DISARM_PRFLT": ParameterInfo("s", None, 60, "time armed on the ground until it disarms"),
+    "COM_DL_LOSS_T": ParameterInfo("s", 5, 300, "ground station silence that triggers the failsafe"),
+    "COM_LOW_BAT_ACT": ParameterInfo("", 0, 3, "low battery action: 0 warning, 2 land, 3 return"),
+    "COM_OBL_RC_ACT": ParameterInfo("", 0, 7, "action on loss of set-points: 0 position mode, 5 hold"),
+    "COM_OF_LOSS_T": ParameterInfo("s", 0, 60, "time without set-points until they count as lost"),
+    "GF_ACTION": ParameterInfo("", 0, 5, "action at the fence"),
     "GF_MAX_VER_DIST": ParameterInfo("m", 0, 10_000, "height of the fence; 0: none"),
-    "MIS_TAKEOFF_ALT": ParameterInfo("m", 0, None, "height of a take-off that names none"),
-    "MPC_MAN_Y_MAX": ParameterInfo("deg/s", 0, 400, "greatest yaw rate"),
-    "MPC_THR_HOVER": ParameterInfo("", 0.1, 0.8, "thrust that carries the weight"),
-    "MPC_TILTMAX_AIR": ParameterInfo("deg", 20, 89, "greatest tilt"),
-    "MPC_XY_VEL_MAX": ParameterInfo("m/s", 0, 20, "greatest horizontal speed"),
-    "MPC_Z_VEL_MAX_DN": ParameterInfo("m/s", 0.5, 4, "greatest speed of descent"),
-    "MPC_Z_VEL_MAX_UP": ParameterInfo("m/s", 0.5, 8, "greatest speed of climb"),
+    "MIS_TAKEOFF_ALT": ParameterInfo("m", 0, None, "default take-off height"),
+    "MPC_MAN_Y_MAX": ParameterInfo("deg/s", 0, 400, "maximum yaw rate"),
+    "MPC_THR_HOVER": ParameterInfo("", 0.1, 0.8, "hover thrust"),
+    "MPC_TILTMAX_AIR": ParameterInfo("deg", 20, 89, "maximum tilt"),
+    "MPC_XY_VEL_MAX": ParameterInfo("m/s", 0, 20, "maximum horizontal speed"),
+    "MPC_Z_VEL_MAX_DN": ParameterInfo("m/s", 0.5, 4, "maximum descent speed"),
+    "MPC_Z_VEL_MAX_UP": ParameterInfo("m/s", 0.5, 8, "maximum climb speed"),
     "NAV_DLL_ACT": ParameterInfo("", 0, 6, "on loss of a ground station's heartbeat: 0 nothing, 1 hold, 3 land"),
-    "NAV_RCL_ACT": ParameterInfo("", 1, 6, "what happens when the remote control is lost"),
+    "NAV_RCL_ACT": ParameterInfo("", 1, 6, "action on loss of the remote control"),
 }
 
 
 PREFIX: Final = "mavlink."
-EXACT: Final = 1 << 24  #: up to here single precision has every whole number
+EXACT: Final = 1 << 24  #: single precision holds every whole number up to here
 _NAME: Final = re.compile(r"[A-Za-z0-9_]{1,16}\Z")
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameter:
-    """A parameter, and the autopilot's name behind it."""
+    """A parameter and the autopilot's name for it."""
 
     parameter: Parameter
     native: str
 
     def to_native(self, value: Value) -> float:
-        """Return a value as the autopilot takes it; raises for one that it would not take."""
+        """Return a value as the autopilot takes it; raise if it does not accept it."""
         value = checked_value(self.parameter, value)
         assert isinstance(value, int | float)
         return value
 
     def from_native(self, number: float) -> Value:
-        """Return a value that the autopilot reported."""
+        """Return a value reported by the autopilot."""
         return int(number) if self.parameter.type is ParameterType.INT else rounded(number)
 
 
@@ -247,19 +247,19 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a parameter that can be written; raises for one that is not known, or read-only."""
+    """Return a writable parameter; raise if it is unknown or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
     if entry.parameter.read_only:
-        raise ParameterError(f"{name} can only be read", code=Refusal.READ_ONLY)
+        raise ParameterError(f"{name} is read-only", code=Refusal.READ_ONLY)
     return entry
 
 
 def check_exact(name: str, number: int, *, bytewise: bool) -> int:
-    """Return a whole number, if the vehicle would receive exactly that; raises if it would not.
+    """Return a whole number if the vehicle would receive exactly it; raise otherwise.
 
-    ArduPilot writes whole numbers as floats of single precision: those beyond 24 bits may come out as others.
+    ArduPilot encodes whole numbers as single-precision floats, which round some beyond 24 bits.
     """
     if bytewise:
         return number
@@ -267,14 +267,14 @@ def check_exact(name: str, number: int, *, bytewise: bool) -> int:
     if received != number:
         raise ParameterError(
             f"{name}: the vehicle carries whole numbers in single precision and would receive {received:.0f} "
-            f"instead of {number}: beyond ±{EXACT} only some can be written; set it in a ground station",
+            f"instead of {number}: beyond ±{EXACT} only some can be written; use a ground station",
             code=Refusal.OUT_OF_RANGE,
         )
     return number
 
 
 def rounded(number: float) -> float:
-    """Return a number without the digits that single precision does not have."""
+    """Return a number rounded to single precision."""
     return float(f"{number:.7g}")
 
 
@@ -282,7 +282,7 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
     meaning = PARAMETER_INFO.get(held.name, ParameterInfo())
     name = PREFIX + held.name.lower()
     if not math.isfinite(held.value):
-        parameter = Parameter(name, ParameterType.TEXT, str(held.value), read_only=True, description="no number")
+        parameter = Parameter(name, ParameterType.TEXT, str(held.value), read_only=True, description="not a number")
         return VehicleParameter(parameter, held.name)
     if is_integer(held.kind):
         least, most = map(float, bounds(held.kind))
@@ -299,9 +299,9 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
             kind,
             value,
             meaning.unit,
-            _bound(min(low, value)),  # a vehicle that has a value beyond shows that its own range is wider
+            _bound(min(low, value)),  # a value outside shows that the vehicle's own range is wider
             _bound(max(high, value)),
-            description=meaning.text or f"{held.name} of the autopilot",
+            description=meaning.text or f"the autopilot's {held.name}",
         ),
         held.name,
     )
@@ -312,7 +312,7 @@ def _bound(value: float) -> float | None:
 
 
 def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
-    """Return the driver's own limits as parameters, with their values in force."""
+    """Return the driver's own limits as parameters with their current values."""
     return [
         Parameter(
             limit.name,
@@ -329,7 +329,7 @@ def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
 
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
-    """Return the driver's own limits after one was written; raises for a number that is not finite, or out of range."""
+    """Return the driver's own limits with one changed; raise for a number that is not finite or out of range."""
     parameter = next(each for each in limit_parameters(values) if each.name == name)
     value = checked_value(parameter, value)
     assert isinstance(value, float)

@@ -39,27 +39,27 @@ from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-TICK_NS: Final = nanoseconds(0.02)
-REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
+TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
+REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session: silence, heartbeats, requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
-UNHEARD_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: the autopilots' own failsafes act after 5 or 10 s without one
-QUIET_NS: Final = nanoseconds(0.5)  #: of silence: set-points may wait where nobody reads, and be followed later
-OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older one tells where the vehicle was
-DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
-LOST_NS: Final = nanoseconds(2.5)
-FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
-PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
-WAKING_MS: Final = 60_000  #: of its own clock: one that can't be armed so soon after its start still wakes up
-IDENTITY_NS: Final = nanoseconds(2.0)  #: a vehicle that is found again says by then that it is the same
-QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
-VERSION_PACE_S: Final = 1.0
-_WAKING: Final = f"{WAKING_UP}: its own checks before arming do not pass yet"
+SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: above the 5 to 10 s after which the autopilots' failsafes act
+QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points wait: the vehicle might follow them late
+OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose says where the vehicle was, not where it is
+DEGRADED_NS: Final = nanoseconds(1.2)  #: silence until the link is degraded
+LOST_NS: Final = nanoseconds(2.5)  #: silence until the link is lost
+FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle that has sent no data by then is reported as lost
+PARAMETERS_NS: Final = nanoseconds(25.0)  #: time for the parameter list; after it, the link is up without the list
+WAKING_MS: Final = 60_000  #: on the vehicle's clock: if it can't be armed this soon after boot, it is still booting
+IDENTITY_NS: Final = nanoseconds(2.0)  #: time for a vehicle found again to prove that it is the same
+QUIET_ATTITUDE_S: Final = 0.5  #: without attitude for this long, other messages trigger feedback
+VERSION_PACE_S: Final = 1.0  #: between requests for the version
+_WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
-_MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that say it
+_MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that carry the mode
 
-#: Commands that the vehicle's safety rests on: sent before all else, whatever is under way.
+#: Safety commands: sent before everything else.
 _URGENT: Final = frozenset(
     {m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_NAV_TAKEOFF, m.MAV_CMD_NAV_LAND}
 )
@@ -68,15 +68,15 @@ _POSES: Final = frozenset({"ODOMETRY", "VISION_POSITION_ESTIMATE"})
 
 
 class Packet(NamedTuple):
-    """One frame to be sent."""
+    """One frame to send."""
 
     data: bytes
-    peer: Peer  #: the receiver of a datagram; None: the one in the address
+    peer: Peer  #: where to send a datagram; None: the address's own
     rank: Rank = Rank.SETPOINT
 
 
 def rank_of(message: Message) -> Rank:
-    """Return how important a message to the vehicle is on a slow line."""
+    """Return a message's priority on a slow link."""
     kind = message.get_type()
     if kind == "COMMAND_LONG" and message.command in _URGENT:
         stops = (message.command, (message.param1, message.param2)) == (CUT.number, CUT.arguments)
@@ -90,7 +90,7 @@ _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK
 
 
 class MavlinkSession(VehicleSession):
-    """The protocol of one opened driver with its vehicle. Not thread-safe."""
+    """One opened driver's protocol with its vehicle. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -104,11 +104,11 @@ class MavlinkSession(VehicleSession):
         self.parameters = ParameterExchange()
         self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
-        self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and for one not known here
-        self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
+        self.autopilot: AutopilotProfile | None = None  #: None until recognised, and for an unknown autopilot
+        self.setpoints: SetpointController | None = None  #: None until then, and for a vehicle that can't be flown
         self.version: Message | None = None  #: its AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own
-        self.dropped = 0  #: packets that the connection did not send, for want of room
+        self.dropped = 0  #: packets that the connection dropped for lack of room
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer, options.component)
@@ -117,32 +117,32 @@ class MavlinkSession(VehicleSession):
         self._out: list[Message] = []
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
-        self._peer = options.peer  # the chosen vehicle's, kept while it is lost
-        self._unheard = False  # lost while it was armed: our heartbeats would keep its own failsafe from acting
+        self._peer = options.peer  # the chosen vehicle's; kept while the link is lost
+        self._slow_heartbeat = False  # lost while armed: our heartbeats would keep its own failsafe from acting
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
-        self._unfit: set[str] = set()  # kinds of messages of which one could not be encoded, as was told
-        self._kind: tuple[int, int] | None = None  # autopilot and type, by its heartbeat
-        self._known_as: Message | None = None  # the version told before the link was lost, until it is told again
-        self._heard_by_it = True  # False: nothing shows yet that it reads what is sent
-        self._said: tuple[int | None, bool, int] | None = None  # mode, whether it is armed, MAV_STATE, when last looked
-        self._waking = False  # it was started just now and can't be armed yet
-        self._prearm = ""  # the last reason that it gave
+        self._unencodable: set[str] = set()  # message types already reported as impossible to encode
+        self._kind: tuple[int, int] | None = None  # autopilot and type, from its heartbeat
+        self._known_as: Message | None = None  # version from before the link was lost, until it arrives again
+        self._receives_us = True  # False until the vehicle shows that it receives us
+        self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed, MAV_STATE at the last check
+        self._waking = False  # it has just booted and can't be armed yet
+        self._prearm = ""  # the latest reason that it gave
         self._unsupported_reason = "no data from it"
-        #: Pressed for whatever answers: it outlives what is known of the vehicle.
+        #: Works on whatever answers: a pressed stop outlives the vehicle's state.
         self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
     @property
     def identity(self) -> VehicleIdentity | None:
-        """The vehicle that was chosen; None while none is found."""
+        """The chosen vehicle; None while none is found."""
         return self._selector.chosen
 
     @property
     def description(self) -> str:
         """Autopilot, version and system, for people."""
         if self.autopilot is None:
-            return "an autopilot that is not known here"
+            return "an unknown autopilot"
         system = self._selector.system
         version = self.version.flight_sw_version if self.version is not None else 0
         number = f" {version >> 24}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}" if version else ""
@@ -152,15 +152,15 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Raises for a vehicle that can't be flown, too."""
-        if isinstance(action, EmergencyStop) and self._kind is None:  # found in flight, maybe, in a moment
+        """Accept an action; see :meth:`SetpointController.apply`. Also raises for a vehicle that can't be flown."""
+        if isinstance(action, EmergencyStop) and self._kind is None:  # one in flight may be found in a moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
             return action
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # nothing comes of it; pilots on the ground send it all the time
+            return action  # no effect, and pilots on the ground send it continuously
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
@@ -171,15 +171,15 @@ class MavlinkSession(VehicleSession):
         return applied
 
     def pose_problem(self, captured_ns: int, now_ns: int) -> str:
-        """Return why a pose from outside is not sent now; empty if it is.
+        """Return why an external pose can't be sent now; empty if it can.
 
-        While nothing is heard it might wait somewhere, and be taken for a new one when somebody reads again: an
-        autopilot may date it by its arrival.
+        While the vehicle is silent, a pose might wait in a buffer and pass for a new one once the vehicle reads again:
+        an autopilot may date it by its arrival.
         """
         if self._received_ns is None:
             return "no data from the vehicle: an external pose can't be sent until the link is up"
         if not self._is_read(now_ns):
-            return "nothing is heard from the vehicle just now: an external pose would come late"
+            return "the vehicle is silent just now: an external pose would arrive late"
         age_ns = now_ns - captured_ns
         return f"an external pose is {seconds(age_ns):.2g} s old, at most 0.5 s" if age_ns > OLD_POSE_NS else ""
 
@@ -195,11 +195,11 @@ class MavlinkSession(VehicleSession):
         return self.setpoints is not None and self.setpoints.forget_landing()
 
     def close(self) -> None:
-        """End the session: parameter writes under way fail."""
+        """End the session: pending parameter writes fail."""
         self.parameters.fail_writes("the driver was closed")
 
     def vehicle_state(self, now_ns: int) -> VehicleState | None:
-        """Return what is known of the vehicle; None while nothing is received."""
+        """Return the vehicle's state; None while nothing is received."""
         custom_mode = self.telemetry.custom_mode()
         if self._received_ns is None or self.autopilot is None or custom_mode is None:
             return None
@@ -209,18 +209,18 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes that came from a peer: a datagram if ``whole``. Never raises, whatever they hold."""
+        """Handle bytes from a peer: a datagram if ``whole``. Never raises, whatever they contain."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
             first, self._signed = not self._signed, self.codec.signed
             if first:
-                text = "the vehicle signs its messages: give its key with ?signing_key=FILE; nothing is taken without"
+                text = "the vehicle signs its messages, which are ignored without its key: give ?signing_key=FILE"
                 self._unreachable = text
                 self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
 
     def connected(self) -> None:
-        """Handle a new connection: nothing is known yet of what it brings."""
+        """Handle a new connection: the vehicle behind it is not known yet."""
         self._unreachable = ""
 
     def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
@@ -242,7 +242,7 @@ class MavlinkSession(VehicleSession):
         if kind in _STAMPED:
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
             if arrival is Arrival.RESTARTED:
-                self.version = None  # it may be another one, and its parameters may be others
+                self.version = None  # another vehicle with other parameters may answer
                 self.telemetry = Telemetry()
                 self._lose("the vehicle rebooted", now_ns)
             if arrival is not Arrival.NEW:
@@ -252,7 +252,7 @@ class MavlinkSession(VehicleSession):
         self._dispatch(kind, message, now_ns)
 
     def _is_another(self, heartbeat: Message, peer: Peer) -> bool:
-        """Return whether the chosen vehicle's place was taken by one with another autopilot."""
+        """Return whether a different autopilot now answers at the chosen vehicle's address."""
         if self._received_ns is None or self._kind is None or not self._selector.is_chosen(heartbeat, peer):
             return False
         return bool(heartbeat.autopilot != self._kind[0])
@@ -263,7 +263,7 @@ class MavlinkSession(VehicleSession):
         elif kind == "COMMAND_ACK":
             if message.target_system in (0, self.options.own_system):
                 self.commands.on_ack(message, now_ns)
-                self._heard_by_it = True
+                self._receives_us = True
                 self.due_ns = 0
         elif kind == "PARAM_VALUE":
             self.parameters.on_value(message, now_ns)
@@ -271,7 +271,7 @@ class MavlinkSession(VehicleSession):
             answers = self.clock.on_timesync(message, now_ns)
             if answers:
                 self._out += answers
-                self.due_ns = 0  # a late answer would be a wrong time, by which the vehicle dates poses from outside
+                self.due_ns = 0  # a late answer shifts the clock by which the vehicle dates external poses
         elif kind == "STATUSTEXT":
             for event in self._health.on_text(message, quiet=self._waking):
                 self._publish_event(event)
@@ -286,10 +286,10 @@ class MavlinkSession(VehicleSession):
             if age_s is None or age_s > QUIET_ATTITUDE_S:
                 self._publish(self.clock.now(now_ns), now_ns)
         if kind in _MODES:
-            said = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
-            if said != self._said:
-                self._said = said
-                self.due_ns = 0  # a caller that waits for a mode can go on
+            report = self.telemetry.custom_mode(), self.telemetry.armed(), self.telemetry.status()
+            if report != self._last_report:
+                self._last_report = report
+                self.due_ns = 0  # wake callers that wait for a mode
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -336,7 +336,7 @@ class MavlinkSession(VehicleSession):
         return packets
 
     def _next_ns(self, now_ns: int) -> int:
-        """Return when to be polled again: with nothing under way seldom, which is what a fleet on the ground costs."""
+        """Return when to poll next. An idle session polls rarely, which keeps a grounded fleet cheap."""
         tick_ns, next_ns = now_ns + TICK_NS, self._silence_seen_ns(now_ns + REST_NS)
         if self.parameters.busy:
             return min(tick_ns, next_ns)
@@ -346,41 +346,41 @@ class MavlinkSession(VehicleSession):
         return min(max(due_ns, tick_ns), next_ns)
 
     def _fly(self, vehicle: VehicleState | None, now_ns: int) -> list[Message]:
-        if self.version is None or not self._heard_by_it:
+        if self.version is None or not self._receives_us:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
         messages: list[Message] = []
         if self.setpoints is not None and vehicle is not None:
             messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
-        if not self._heard_by_it:
-            messages = []  # nothing shows that it can be reached at all
+        if not self._receives_us:
+            messages = []  # nothing shows yet that it receives us
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:
-        """Whether what is sent now is read soon, as far as what is heard shows."""
-        return self._heard_by_it and now_ns - (self._received_ns or 0) < QUIET_NS
+        """Return whether the vehicle seems to read promptly, judging by its messages."""
+        return self._receives_us and now_ns - (self._received_ns or 0) < QUIET_NS
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
         """Return the heartbeat when it is due.
 
-        A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they receive the new one.
+        A vehicle that speaks MAVLink 1 gets both versions: some autopilots switch to MAVLink 2 once they receive it.
         """
-        if now_ns - self._heartbeat_ns < (UNHEARD_HEARTBEAT_NS if self._unheard else HEARTBEAT_NS):
+        if now_ns - self._heartbeat_ns < (SLOW_HEARTBEAT_NS if self._slow_heartbeat else HEARTBEAT_NS):
             return []
         self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
         return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
     def _packet(self, message: Message, peer: Peer) -> Packet | None:
-        """Return a message as it is sent; None for one that can't be: it keeps no other back, such as a stop."""
+        """Encode a message; return None if that fails, so that one bad message holds up no other, such as a stop."""
         if not self._axes.sent(message):
             return None
         try:
             data = self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
         except (struct.error, OverflowError) as error:
-            if (kind := message.get_type()) not in self._unfit:
-                self._unfit.add(kind)
-                text = f"{kind} is not sent: it has a number that MAVLink has no room for ({error})"
+            if (kind := message.get_type()) not in self._unencodable:
+                self._unencodable.add(kind)
+                text = f"{kind} was not sent: a number does not fit its MAVLink field ({error})"
                 self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "encoding"}))
             return None
         return Packet(data, peer, rank_of(message))
@@ -393,17 +393,17 @@ class MavlinkSession(VehicleSession):
         if self._waking is not was_waking and self.link_state is LinkState.UP:
             self._report_link(LinkState.UP, _WAKING if self._waking else "")
         if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
-            self._read_again(now_ns)  # it does not say which one it is
+            self._read_again(now_ns)  # it does not identify itself
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
             return
-        if self._known_as is not None or not self._heard_by_it:
+        if self._known_as is not None or not self._receives_us:
             return
         waited = now_ns - self._found_ns > PARAMETERS_NS
         if not self.options.parameters or exchange.complete or exchange.given_up or waited:
             self._set_link_state(LinkState.UP, _WAKING if self._waking else "")
 
     def _wakes_up(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Return whether it was started just now and has not been ready since."""
+        """Return whether it has just booted and has not been ready since."""
         attitude = self.telemetry.newest("ATTITUDE", now_ns, QUIET_ATTITUDE_S)
         if vehicle is None or attitude is None:
             return self._waking
@@ -420,9 +420,9 @@ class MavlinkSession(VehicleSession):
     def _advice(self) -> str:
         address = self.options.address
         if address.kind is ConnectionKind.UDP_IN:
-            return f"have the vehicle send to UDP port {address.number} of this computer, and its firewall let that in"
+            return f"point the vehicle at UDP port {address.number} of this computer and open the port in the firewall"
         if address.kind is ConnectionKind.SERIAL:
-            return f"check the vehicle's power, cable and speed ({address.number} bits a second are in the address)"
+            return f"check the vehicle's power, cable and speed (the address says {address.number} bits/s)"
         return f"join the vehicle's network, or start it at {address.place}, and check host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -434,9 +434,9 @@ class MavlinkSession(VehicleSession):
     # Losing and finding ------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._received_ns = self._said = None
+        self._received_ns = self._last_report = None
         self._waking, self._prearm = False, ""
-        self._unheard = self.telemetry.armed()
+        self._slow_heartbeat = self.telemetry.armed()
         self._selector.forget()
         self._axes.forget()
         self.parameters.fail_writes(reason)
@@ -445,11 +445,11 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None:
             self.setpoints.on_link_lost()
         self.clock = VehicleClock()
-        self._publish(self.clock.now(now_ns), now_ns)  # what it does now is not known
+        self._publish(self.clock.now(now_ns), now_ns)  # its present state is unknown
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
-        self._found_ns, self._unreachable, self._unheard = now_ns, "", False
+        self._found_ns, self._unreachable, self._slow_heartbeat = now_ns, "", False
         target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
         self.commands.target = self.parameters.target = target
         kind = heartbeat.autopilot, heartbeat.type
@@ -465,15 +465,15 @@ class MavlinkSession(VehicleSession):
             self._out.append(_origin(target[0], self.options.origin))
         if self._known_as is None:
             self._read_again(now_ns)
-        text = "its parameters are being read" if self.parameters.busy else ""
-        if not self._heard_by_it:
-            text = "it has not answered yet, since what was sent did not get through"
+        text = "reading its parameters" if self.parameters.busy else ""
+        if not self._receives_us:
+            text = "it has not answered since sending failed"
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        """Begin with a vehicle of which nothing is known: whatever was known of another one is dropped."""
+        """Set up an unknown vehicle: drop everything known of any other."""
         if self._kind is not None:
-            text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: it is set up anew"
+            text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             data: dict[str, Value] = {"reason": "another", "system": heartbeat.get_srcSystem()}
             self._publish_event(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, data))
         self._kind = heartbeat.autopilot, heartbeat.type
@@ -499,7 +499,7 @@ class MavlinkSession(VehicleSession):
             )
 
     def _on_version(self, version: Message, now_ns: int) -> None:
-        """Handle which vehicle it says it is. A found one is the same as before only where it can say so."""
+        """Handle the vehicle's version. A vehicle found again counts as the same only if it can prove that."""
         before, self._known_as, self.version = self._known_as, None, version
         same = True if before is None else _is_same(before, version)
         heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
@@ -512,15 +512,15 @@ class MavlinkSession(VehicleSession):
         self.parameters.bytewise = bool(version.capabilities & BYTEWISE)
 
     def _read_again(self, now_ns: int) -> None:
-        """Read the parameters of a vehicle that may be another one than before."""
+        """Read the parameters of a vehicle that may not be the one from before."""
         self._known_as = None
         if self.options.parameters:
             self.parameters.request_all(now_ns)
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """See :meth:`VehicleSession.broken`. The link is not up again before the vehicle has answered something."""
+        """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle has answered something."""
         super().broken(error, now_ns)
-        self._heard_by_it = False
+        self._receives_us = False
 
     def limit(self, limits: Mapping[str, float]) -> None:
         """Set the driver's own limits."""
@@ -530,8 +530,8 @@ class MavlinkSession(VehicleSession):
 
 
 def _is_same(one: Message, other: Message) -> bool | None:
-    """Return whether two ``AUTOPILOT_VERSION`` are of one vehicle; None: they have no serial number in common."""
-    if any(one.uid2) and any(other.uid2):  # MAVLink 1 has no room for it
+    """Return whether two ``AUTOPILOT_VERSION`` describe one vehicle; None if they share no serial number."""
+    if any(one.uid2) and any(other.uid2):  # MAVLink 1 does not carry it
         return list(one.uid2) == list(other.uid2)
     return bool(one.uid == other.uid) if one.uid and other.uid else None
 

@@ -1,8 +1,8 @@
-"""Turns the last decided action into the messages that are due at each tick. Pure.
+"""Turn the last action into the messages due at each tick. Pure.
 
-Set-points are streamed while somebody is at the controls, and only in the mode that follows them. A failsafe, a lost
-link and somebody else's change of mode (see :mod:`~skyloop.vehicles.mavlink.ownership`) end the stream: from then on
-only the vehicle's own safety nets fly it.
+Set-points are streamed while a pilot is at the controls, and only in the mode that follows them. A failsafe, a lost
+link or another operator's change of mode (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream: from then
+on only the vehicle's own safety nets fly it.
 """
 
 from __future__ import annotations
@@ -50,23 +50,23 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
 
-FORCE: Final = 21196.0  #: "even in flight", of the command to disarm
+FORCE: Final = 21196.0  #: parameter of the disarm command: "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
-SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
-DISARM_NS: Final = nanoseconds(0.5)  #: an arming that is undone is asked about for so long after it was seen last
-IDLES_NS: Final = nanoseconds(12.0)  #: by then an autopilot that stands armed has disarmed itself
-STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or a landing that only the time asks for
-HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
+SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off at its height counts as done by then, in any mode
+DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after arming was last seen
+IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground has disarmed itself by then
+STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or landing that only wait for time
+HURRY_NS: Final = nanoseconds(0.008)  #: shortest time between a new set-point and the one before
 
 
 class Goal(Enum):
-    """What the vehicle is to do."""
+    """What the vehicle should do."""
 
-    NOTHING = auto()  #: it is left to itself, and to whatever else flies it
+    NOTHING = auto()  #: nothing from us: it is left to itself and to other operators
     TAKE_OFF = auto()
-    FOLLOW = auto()  #: a stream of set-points, hovering included
-    HOLD = auto()  #: it holds its position by itself, without a stream
+    FOLLOW = auto()  #: stream set-points, hovering included
+    HOLD = auto()  #: hold its position without a stream
     LAND = auto()
 
 
@@ -74,11 +74,11 @@ class SetpointController:
     """Remembers the last action and sends what it needs, tick by tick. Not thread-safe.
 
     Args:
-        autopilot: What this autopilot does differently.
-        commands: Where commands to the vehicle go.
+        autopilot: The autopilot's profile.
+        commands: Sender of commands to the vehicle.
         takeoff_m: Height of a take-off above its start.
-        make_thrust: Makes the thrust model for a flight by attitude.
-        stop: One that may be in force already; None: another one.
+        make_thrust: Creates the thrust model of a flight by attitude.
+        stop: A motor stop that may already be pressed; None: a new one.
     """
 
     def __init__(
@@ -98,40 +98,40 @@ class SetpointController:
         self._make_thrust = make_thrust
         self._takeoff: TakeoffSequence | None = None
         self._setpoint: Setpoint | None = None
-        self._lead_ns: int | None = None  # since when the stream flows
+        self._lead_ns: int | None = None  # when the stream started
         self._sent_ns = 0
-        self._followed: Velocity | None = None  # the velocity sent last; None: something else was
-        self._entered = False  # the mode that is wanted was seen since
-        self._strayed_ns: int | None = None  # since when it is another one again
-        self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
-        self._stepped_ns = 0  # when what is wanted now had its last step; 0: it has not had one
-        self._arms_until_ns: int | None = None  # a take-off that a landing broke off may arm it until then
-        self._disarms_until_ns = 0  # until then a take-off that was given up, or cut off, may still arm it
+        self._followed: Velocity | None = None  # the velocity sent last; None: something else was sent
+        self._entered = False  # the wanted mode has been seen
+        self._strayed_ns: int | None = None  # when the vehicle left the wanted mode again
+        self._settling_ns: int | None = None  # when a take-off reached its height and began to wait for the next mode
+        self._stepped_ns = 0  # time of the last step; 0: none yet
+        self._arms_until_ns: int | None = None  # a take-off aborted by a landing may arm the vehicle until then
+        self._disarms_until_ns = 0  # a failed or cut-off take-off may arm the vehicle until then
         self._blind_until_ns = 0
         self._events: list[VehicleEvent] = []
 
-    # What is decided ---------------------------------------------------------------------------------------------
+    # Decisions ---------------------------------------------------------------------------------------------------
 
     def apply(
         self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
     ) -> AnyAction:
         """Accept an action.
 
-        While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`) everything else is
-        ignored, and a take-off refused.
+        While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`), a take-off is refused
+        and every other action ignored.
 
         Args:
-            action: What is asked for.
-            vehicle: What is known of the vehicle; None while nothing is received.
+            action: The requested action.
+            vehicle: The vehicle's state; None while nothing is received.
             now_ns: The present time.
-            alone: Whether nobody is in command: a failsafe.
-            new: Whether an application newly asked for it; False for the library's repeats.
+            alone: Whether a failsafe requested it, without a pilot in command.
+            new: Whether an application newly requested it; False for the library's repeats.
 
         Returns:
-            What is applied; idle where the action is ignored.
+            The action in force; idle where it is ignored.
 
         Raises:
-            DriverError: It can't be done now, or somebody else has the vehicle.
+            DriverError: It can't be done now, or another operator has the vehicle.
         """
         if isinstance(action, Idle):
             return action
@@ -141,7 +141,7 @@ class SetpointController:
             return action
         if isinstance(action, ResetEmergency):
             if vehicle is None:
-                raise DriverError("no data from the vehicle: whether it is at rest is not known")
+                raise DriverError("no data from the vehicle: it may not be at rest")
             self.stop.reset()
             return action
         if self.stop.active:
@@ -155,12 +155,12 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns)
         elif isinstance(action, Land):
-            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # a repeat: others may end it
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats don't undo others' mode
                 self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
         else:
-            assert not isinstance(action, ReturnToStart)  # the proxy makes places of it
+            assert not isinstance(action, ReturnToStart)  # the proxy turns it into positions
             action = self._steer(action, vehicle, now_ns)
         if vehicle is None and new and not alone and isinstance(action, Hover | Land):
             self._blind_until_ns = now_ns + KEPT_NS
@@ -169,7 +169,7 @@ class SetpointController:
         return action
 
     def _others_fly(self, vehicle: VehicleState | None) -> bool:
-        """Return whether somebody else has the vehicle, while nobody is at our controls."""
+        """Return whether another operator flies the vehicle while no pilot is at our controls."""
         if self.ownership.others:
             return True
         if vehicle is None or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
@@ -184,13 +184,13 @@ class SetpointController:
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
             self._takeoff.asked_ns = now_ns
             if self._takeoff.refused and not self._takeoff.started:
-                raise DriverError(f"the vehicle does not start yet, it is tried again: {self._takeoff.refused}")
+                raise DriverError(f"the vehicle does not start yet, retrying: {self._takeoff.refused}")
         elif vehicle.airborne is None:
             raise DriverError("the vehicle is armed and has not reported yet whether it is in the air")
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            if now_ns < self._disarms_until_ns:  # what is armed by now, or late, is so by the take-off before
+            if now_ns < self._disarms_until_ns:  # the previous take-off armed it, or may still do so
                 takeoff.arm_asked_ns = now_ns
             self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
@@ -207,13 +207,13 @@ class SetpointController:
     def _hover(self, vehicle: VehicleState | None, now_ns: int, *, alone: bool) -> None:
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and (alone or not self._takeoff.rose):
             if not alone:
-                self._land(vehicle)  # who asked for the take-off wants it no more: it stays on the ground
+                self._land(vehicle)  # the take-off is no longer wanted: stay on the ground
             return  # a take-off ends in a hover
         if vehicle is not None and vehicle.airborne is False:
-            if self.goal is not Goal.LAND:  # which goes on to disarm what is armed, or may be any moment
+            if self.goal is not Goal.LAND:  # a landing keeps disarming whatever is or may soon be armed
                 self._end()
         elif alone or vehicle is None or (vehicle.airborne is None and self.goal is not Goal.FOLLOW):
-            self._end()  # on the ground some would start by a set-point
+            self._end()  # on the ground, a set-point would start some vehicles
             self.goal = Goal.HOLD
         elif self.goal is not Goal.FOLLOW or not isinstance(self._setpoint, PositionHold):
             self._follow(PositionHold(now_ns))
@@ -224,7 +224,7 @@ class SetpointController:
         if vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
             return Idle()  # a set-point would cancel a take-off
         if vehicle.airborne is None and self.goal is not Goal.FOLLOW:
-            return Idle()  # on the ground some would start by it
+            return Idle()  # on the ground, a set-point would start some vehicles
         if isinstance(action, Velocity):
             if isinstance(self._setpoint, VelocitySetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.action = action
@@ -233,7 +233,7 @@ class SetpointController:
         elif isinstance(action, Position):
             if isinstance(self._setpoint, PositionSetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.replace(action)
-                return action  # what it is sent moves step by step: there is nothing to hurry for
+                return action  # the sent position moves step by step, so there is no hurry
             self._follow(PositionSetpoint(action))
         else:
             if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
@@ -254,16 +254,16 @@ class SetpointController:
         self._sent_ns = 0
 
     def _end(self) -> None:
-        """End whatever was wanted, and the stream."""
+        """Stop pursuing the goal, and end the stream."""
         self.goal, self._takeoff, self._setpoint = Goal.NOTHING, None, None
         self._stepped_ns = 0
         self._arms_until_ns = None
         self._lead_ns, self._entered, self._strayed_ns, self._settling_ns = None, False, None, None
 
-    # What is reported -----------------------------------------------------------------------------------------------
+    # Reports --------------------------------------------------------------------------------------------------------
 
     def on_link_lost(self) -> None:
-        """End the stream, which does not go on by itself when the link is back; the vehicle must hold its position."""
+        """End the stream, which does not resume when the link returns; the vehicle must hold its position."""
         if self.goal is Goal.FOLLOW:
             self._end()
             self.goal = Goal.HOLD
@@ -271,13 +271,13 @@ class SetpointController:
             takeoff = self._takeoff
             self._end()
             self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
-            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may stand there armed
+            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may be armed on the ground
                 self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
-        self._entered, self._strayed_ns = False, None  # what it does by itself meanwhile is nobody's decision
+        self._entered, self._strayed_ns = False, None  # mode changes during the outage are the vehicle's own
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:
-        """Land no longer; return whether it was to."""
+        """Stop landing; return whether a landing was in progress."""
         lands = self.goal is Goal.LAND
         if lands:
             self._end()
@@ -295,7 +295,7 @@ class SetpointController:
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._arms_until_ns is not None and not vehicle.airborne:
-            return FlightState.LANDING  # it is armed, or may be any moment
+            return FlightState.LANDING  # it is armed, or may be at any moment
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and self._takeoff.started:
             return FlightState.TAKING_OFF
         if vehicle.airborne is None:
@@ -318,22 +318,22 @@ class SetpointController:
             else FlightState.HOVERING
         )
 
-    # What is sent ------------------------------------------------------------------------------------------------
+    # Messages ----------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
-        """Return what happened since the last call."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
     def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
-        """Return the set-points that are due now; commands go to the command sender.
+        """Return the set-points that are due; commands go to the command sender.
 
         Args:
             vehicle: The newest state.
             now_ns: The present time.
-            read: Whether the vehicle reads commands soon, judging by its messages. If not, a set-point might wait
-                somewhere and be followed late. Only a stop is sent then, which does no harm late; it replaces a
-                velocity that differs from the last one sent.
+            read: Whether the vehicle seems to read commands promptly, judging by its messages. If not, a set-point
+                might wait in a buffer and be followed late. Then only a stop, harmless when late, is sent in place of a
+                changed velocity.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
@@ -369,13 +369,13 @@ class SetpointController:
 
     @property
     def _holds(self) -> bool:
-        """Whether it is to stay in the air where it is."""
+        """Whether it should stay in the air where it is."""
         setpoint = self._setpoint
         stops = isinstance(setpoint, VelocitySetpoint) and setpoint.action == Velocity()
         return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and (stops or isinstance(setpoint, PositionHold)))
 
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Send an emergency stop that is due, whether or not the vehicle is heard; return whether one is in force."""
+        """Send a due emergency stop, whether or not the vehicle is received; return whether one is in force."""
         if not self.stop.active:
             return False
         shown = None
@@ -386,10 +386,10 @@ class SetpointController:
         return True
 
     def step_blind(self, now_ns: int) -> bool:
-        """Send a new hover or landing while nothing is heard; return whether a command is under way.
+        """Send a new hover or landing while nothing is received; return whether a command is in progress.
 
-        The vehicle may hear it all the same. What a failsafe asks for is not sent so: who flies the vehicle by now
-        can't be seen.
+        The vehicle may receive it all the same. A failsafe's requests are not sent like this: another operator may fly
+        the vehicle by now, unseen.
         """
         modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
         if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
@@ -398,7 +398,7 @@ class SetpointController:
         return True
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when :meth:`messages` has something to do next; None: nothing by the time alone."""
+        """Return when :meth:`messages` next has something to send; None: no time is set."""
         if self.stop.active:
             return None if self.stop.shown else now_ns
         if self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
@@ -408,7 +408,7 @@ class SetpointController:
         return None
 
     def _flight_is_over(self) -> None:
-        """Forget the flight: the next to fly the vehicle starts over."""
+        """Forget the flight: the vehicle's next pilot starts over."""
         self._end()
         self.ownership.on_flight_over()
 
@@ -431,9 +431,9 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm a vehicle after a take-off that was given up, or cut by a lost link.
+        """Disarm the vehicle after a failed take-off or one cut off by a lost link.
 
-        One that rises, or is in another mode, was armed by others.
+        A vehicle that rises, or is in another mode, was armed by others.
         """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
@@ -465,9 +465,9 @@ class SetpointController:
         self._commands.request(self._autopilot.mode_command(mode), now_ns)
 
     def _strayed(self, mode: str, inside: bool, now_ns: int) -> bool:
-        """Return whether the vehicle left the wanted mode for longer than :data:`STRAYED_NS`, after it was in it.
+        """Return whether the vehicle left the wanted mode again for longer than :data:`STRAYED_NS`.
 
-        A mode that is the late effect of a command of ours does not count.
+        A mode that may be the late effect of our own command does not count.
         """
         if inside:
             self._entered, self._strayed_ns = True, None
@@ -478,9 +478,9 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle to a mode that was not chosen here; return whether it is still ours to hold and to land."""
-        why = "its own failsafe" if vehicle.failsafe else "not from here"
-        self._notify(f"the vehicle went to {vehicle.mode} ({why}): set-points are no longer sent", reason="mode")
+        """Leave the vehicle in a mode chosen elsewhere; return whether it is still ours to hold and to land."""
+        why = "its own failsafe" if vehicle.failsafe else "not chosen here"
+        self._notify(f"the vehicle changed to {vehicle.mode} ({why}): no more set-points are sent", reason="mode")
         self._end()
         ours = self.ownership.leave(vehicle)
         if ours:
@@ -501,7 +501,7 @@ class SetpointController:
         inside = vehicle.mode in self._autopilot.LANDING
         arms_until_ns = self._arms_until_ns
         if vehicle.armed and arms_until_ns is not None:
-            self._arms_until_ns = 0  # it has shown: once disarmed it stays so
+            self._arms_until_ns = 0  # a late arming has shown: once disarmed, it stays so
         if not vehicle.armed and (arms_until_ns is None or vehicle.heartbeat_ns >= arms_until_ns):
             self._flight_is_over()
         elif vehicle.airborne is False:

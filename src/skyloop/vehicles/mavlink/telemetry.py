@@ -1,4 +1,4 @@
-"""The newest messages of the vehicle, as feedback and as events of its health. Pure."""
+"""The vehicle's newest messages, converted to feedback and health events. Pure."""
 
 from __future__ import annotations
 
@@ -17,49 +17,49 @@ from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message, Texts
 from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
 
-FLOWING_S: Final = 1.0  #: older than this, attitude, position and velocity are not known
-SLOW_S: Final = 6.0  #: the same for battery, GPS and the like
-LANDED_S: Final = 3.0
+FLOWING_S: Final = 1.0  #: older attitude, position and velocity count as unknown
+SLOW_S: Final = 6.0  #: the same for slow messages such as battery and GPS
+LANDED_S: Final = 3.0  #: the same for the landed state
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-AIRBORNE_M: Final = 0.5  #: higher than this it counts as flying, where it does not report that
+AIRBORNE_M: Final = 0.5  #: above this it counts as flying, where it does not report that
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """What is known of the vehicle. World axes are MAVLink's: north, east, down."""
+    """The vehicle's state. World axes are MAVLink's: north, east, down."""
 
     mode: str
     armed: bool
-    status: int  #: of the heartbeat
+    status: int  #: from the heartbeat
     landed: Landed
-    ready: bool | None  #: whether it may be armed; None: unknown
+    ready: bool | None  #: whether it can be armed; None: unknown
     position: Vector | None  #: [m], from its origin
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
-    altitude_m: float | None  #: above where it stood, or the nearest to that which it reports
+    altitude_m: float | None  #: above its start, or the nearest to that which it reports
     amsl_m: float | None  #: altitude above mean sea level
-    remote: bool = False  #: a remote control is there and received, as far as the vehicle reports it
-    heartbeat_ns: int = 0  #: when its newest heartbeat came, which says whether it is armed
-    tells_landed: bool = False  #: it reports by itself whether it stands, if not at present
+    remote: bool = False  #: it receives a remote control, as far as it reports that
+    heartbeat_ns: int = 0  #: arrival of its newest heartbeat, which says whether it is armed
+    reports_landed: bool = False  #: it has reported whether it is on the ground, if not recently
 
     @property
     def airborne(self) -> bool | None:
-        """Whether it is off the ground under its own power; None while that can't be known.
+        """Whether it is off the ground under its own power; None while unknown.
 
-        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying;
-        so may a low one whose own report is late.
+        An armed vehicle may be flying if it reports neither that nor its height, as when it was just found again, or if
+        it is low and its own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
         if self.landed is Landed.UNKNOWN:
             high = None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
-            return None if self.tells_landed and not high else high
+            return None if self.reports_landed and not high else high
         return True
 
     @property
     def failsafe(self) -> bool:
-        """Whether the autopilot itself says that something is wrong."""
+        """Whether the autopilot itself reports a failure."""
         return self.status in (SystemState.CRITICAL, SystemState.EMERGENCY, SystemState.TERMINATION)
 
 
@@ -68,13 +68,13 @@ class Telemetry:
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._newest: dict[str, tuple[Message, int]] = {}  # of the instance with the lowest number that flows
-        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # of kinds that tell several of a thing apart
+        self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered instance that is current
+        self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # for messages with several instances
         self._ground_down: float | None = None  # "down" of the ground, from the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same on the earth
+        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; its place on earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
-        """Keep a message of the vehicle that is flown."""
+        """Keep a message from the vehicle that is flown."""
         kind = message.get_type()
         self.counts[kind] += 1
         self._newest[kind] = message, now_ns
@@ -95,7 +95,7 @@ class Telemetry:
         return found[0]
 
     def instances(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Iterator[Message]:
-        """Yield the newest message of each instance, such as each of several batteries, the lowest number first."""
+        """Yield the newest message of each instance, such as each battery, lowest number first."""
         return (message for message, _ in self._by_number(kind, now_ns, max_age_s))
 
     def _by_number(self, kind: str, now_ns: int, max_age_s: float) -> Iterator[tuple[Message, int]]:
@@ -104,19 +104,19 @@ class Telemetry:
                 yield found
 
     def age_s(self, kind: str, now_ns: int) -> float | None:
-        """Return the age of the newest message of a kind [s]; None if none came."""
+        """Return the age of the newest message of a kind [s]; None if there is none."""
         found = self._newest.get(kind)
         return None if found is None else seconds(now_ns - found[1])
 
     def ages(self, now_ns: int) -> dict[str, Value]:
-        """Return the age [s] of each kind, for feedback's ``native``."""
+        """Return the age [s] of each kind, for the feedback's ``native``."""
         newest = self._newest
         return {name: round(seconds(now_ns - newest[kind][1]), 3) for kind, name in _AGED.items() if kind in newest}
 
-    # What it means -----------------------------------------------------------------------------------------------
+    # Meaning -----------------------------------------------------------------------------------------------------
 
     def custom_mode(self) -> int | None:
-        """Return the mode's number from the newest message that has it."""
+        """Return the mode number from the newest message that has one."""
         heartbeat, current = self._newest.get("HEARTBEAT"), self._newest.get("CURRENT_MODE")
         if heartbeat is None:
             return None
@@ -130,17 +130,17 @@ class Telemetry:
         return heartbeat is not None and bool(heartbeat[0].base_mode & _ARMED)
 
     def status(self) -> int:
-        """Return ``MAV_STATE`` of the newest heartbeat; 0 if none came."""
+        """Return the newest heartbeat's ``MAV_STATE``; 0 if there is none."""
         heartbeat = self._newest.get("HEARTBEAT")
         return 0 if heartbeat is None else int(heartbeat[0].system_status)
 
     def landed(self, now_ns: int, max_age_s: float = LANDED_S) -> Landed:
-        """Return what it reports of standing on the ground, unless that is too old."""
+        """Return whether it reports to be on the ground; unknown if the report is too old."""
         message = self.newest("EXTENDED_SYS_STATE", now_ns, max_age_s)
         return Landed.UNKNOWN if message is None else _LANDED.get(message.landed_state, Landed.UNKNOWN)
 
     def prearm_good(self, now_ns: int) -> bool | None:
-        """Return whether the pre-arm checks pass; None where the vehicle does not report them."""
+        """Return whether the pre-arm checks pass; None if the vehicle does not report them."""
         status = self.newest("SYS_STATUS", now_ns, SLOW_S)
         if status is None:
             return None
@@ -165,9 +165,9 @@ class Telemetry:
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return where its axes begin on the earth; None without a 3-D fix by satellites, and before both places came.
+        """Return the origin of its axes on the earth; None without a 3-D satellite fix or either position.
 
-        Without a fix an autopilot may have been given an origin that is anywhere, as for motion capture.
+        Without a fix, an autopilot's origin may be arbitrary, as for motion capture.
         """
         gps = self.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is None or gps.fix_type < GOOD_FIX or self._on_earth is None:
@@ -200,7 +200,7 @@ class Telemetry:
         return None if message is None else message.alt / 1000.0
 
     def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
-        """Return all that is known of the vehicle; ``ready``: whether it may be armed, None: unknown."""
+        """Return the vehicle's state; ``ready``: whether it can be armed, None: unknown."""
         attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
@@ -215,14 +215,14 @@ class Telemetry:
             amsl_m=self.amsl_m(now_ns),
             remote=self.remote(now_ns),
             heartbeat_ns=self._newest["HEARTBEAT"][1] if "HEARTBEAT" in self._newest else 0,
-            tells_landed=self.landed(now_ns, math.inf) is not Landed.UNKNOWN,
+            reports_landed=self.landed(now_ns, math.inf) is not Landed.UNKNOWN,
         )
 
 
-_ARMED: Final = int(ModeFlag.ARMED)  # with the flag itself the enumeration's code would run, many times a second
+_ARMED: Final = int(ModeFlag.ARMED)  # a plain int: IntFlag operations cost too much many times a second
 _LANDED: Final = {int(each): each for each in Landed}
 _DOWN: Final = 25  #: MAV_SENSOR_ROTATION_PITCH_270
-_APART_S: Final = 0.5  #: farther apart two places are not taken together
+_APART_S: Final = 0.5  #: positions further apart in time are not paired
 _AGED: Final = {
     kind: f"mavlink.age.{kind.lower()}"
     for kind in (
@@ -238,7 +238,7 @@ _AGED: Final = {
 
 
 def _at_the_same_time(local: Message, world: Message) -> tuple[Vector, Message] | None:
-    """Return a place on the earth with that from the origin [m], moved on by its velocity to the same moment."""
+    """Return a local position [m], moved along its velocity to the time of a place on earth, and that place."""
     later_s = (world.time_boot_ms - local.time_boot_ms) / 1000.0
     if abs(later_s) > _APART_S:
         return None
@@ -257,13 +257,13 @@ def finite(x: float, y: float, z: float) -> Vector | None:
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 _UNKNOWN_16: Final = 0xFFFF
-_OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION: of avionics and of a payload
+_OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION: avionics and payload batteries
 
 
 def feedback_of(
     telemetry: Telemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state in our units and axes. What does not flow, or is not finite, is None."""
+    """Return the vehicle's state in our units and axes. Values that are not current or not finite are None."""
     attitude = telemetry.attitude(now_ns)
     position = telemetry.position(now_ns)
     roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
@@ -319,7 +319,7 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
 
 def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
     status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
-    # Of several the one with the lowest number, and no other while that one is silent: their charges differ.
+    # Of several batteries use the lowest-numbered, and no other while it is silent: their charges differ.
     batteries = telemetry.instances("BATTERY_STATUS", now_ns)
     first = next((each for each in batteries if each.battery_function not in _OTHERS), None)
     if first not in telemetry.instances("BATTERY_STATUS", now_ns, SLOW_S):
@@ -365,7 +365,7 @@ _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: after lift-off no report is from before it: a PX4 sends one a second
+_RISEN_NS: Final = nanoseconds(1.5)  #: after lift-off, time for a report from the air: a PX4 sends one a second
 
 
 class HealthMonitor:
@@ -374,18 +374,18 @@ class HealthMonitor:
     def __init__(self) -> None:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
-        self._reasons: set[str] = set()  # why it can't be armed, as told while it wakes up
-        self._airborne_ns: int | None = None  # since when it is in the air
+        self._reasons: set[str] = set()  # reasons why it can't be armed that were reported while it boots
+        self._airborne_ns: int | None = None  # when it took off
 
     @property
     def was_ready(self) -> bool:
-        """Whether it could be armed once."""
+        """Whether it has ever been ready to arm."""
         return "was_ready" in self._reported
 
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
-        """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed.
+        """Handle a ``STATUSTEXT``; return complete texts, with reasons for not arming marked as such.
 
-        While it wakes up (``quiet``) the vehicle repeats such a reason, which is told once.
+        While the vehicle boots (``quiet``) it repeats such reasons; each is reported once.
         """
         events = []
         for severity, text in self._texts.on_message(message):
@@ -402,11 +402,11 @@ class HealthMonitor:
         return events
 
     def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[VehicleEvent]:
-        """Return what changed since the last call."""
+        """Return the changes since the last call."""
         ready = None if vehicle is None else vehicle.ready
         if ready:
             self._reported["was_ready"] = True
-        events = self._changed("ready", ready, "the vehicle is ready to be armed", "the vehicle can't be armed now")
+        events = self._changed("ready", ready, "the vehicle is ready to arm", "the vehicle can't be armed now")
         gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is not None:
             good = gps.fix_type >= GOOD_FIX
@@ -419,7 +419,7 @@ class HealthMonitor:
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
-                # A PX4 at rest assumes that it stands still, and says so; only in the air does that mean it is lost.
+                # A PX4 on the ground reports that it assumes a constant position; in the air that means it is lost.
                 counts = kind != "ESTIMATOR_STATUS" or risen
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
                 events += self._changed(

@@ -1,4 +1,4 @@
-"""The driver of ``msp://``: what the proxy calls, and the connection to the flight controller, reopened for ever."""
+"""The driver for ``msp://`` addresses, and its connection to the flight controller, reopened after every loss."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ ACTIONS: Final = frozenset({"idle", "attitude", "emergency_stop", "reset_emergen
 
 
 class MspDriver(Driver):
-    """A flight controller with Betaflight or INAV. ``docs/msp.md`` has its options, parameters, events and telemetry.
+    """A flight controller with Betaflight or INAV. ``docs/msp.md`` lists its options, parameters, events and telemetry.
 
-    It takes attitudes with a climb rate; take-off, landing, hovering and velocities come from the proxy's software
+    It accepts attitudes with a climb rate; take-off, landing, hovering and velocities come from the proxy's software
     autopilot.
     """
 
@@ -39,7 +39,7 @@ class MspDriver(Driver):
         self._link: MspLink | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return what it can do."""
+        """Return the driver's capabilities."""
         return Capabilities(vehicle="msp", actions=ACTIONS, description=f"a flight controller on {self.options}")
 
     # Life cycle ------------------------------------------------------------------------------------------------
@@ -47,10 +47,10 @@ class MspDriver(Driver):
     def _open(self, sink: Sink) -> None:
         if self.options.serial:
             try:
-                import serial  # noqa: F401  the link opens it again and again, on its own thread
+                import serial  # noqa: F401  the link's thread imports it again whenever it opens the port
             except ImportError as error:
                 raise MissingExtraError(f"{self.uri}", EXTRA, cause=str(error)) from error
-        known = SetpointController(self.options.override)  # what was set and learnt is kept, and nothing else
+        known = SetpointController(self.options.override)  # keeps settings and learnt values, nothing else
         known.limits, known.gains, known.given_aux = (
             self._setpoints.limits,
             self._setpoints.gains,
@@ -73,23 +73,23 @@ class MspDriver(Driver):
         return self._opened().command(action)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse a take-off for what keeps the flight controller from being armed, else let the next climb begin it."""
+        """Refuse a take-off if the flight controller can't be armed, else let the next climb start it."""
         if isinstance(action, Takeoff):
             why = self._opened().ask_takeoff()
             if why:
                 raise DriverError(why)
 
     def left_to(self) -> str:
-        """Return whether the pilot flies by the receiver."""
+        """Return whether the pilot flies through the receiver."""
         link = self._link
         return "" if link is None else link.session.setpoints.left_to
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Take in where something outside saw it: velocity, height and climb come from that."""
+        """Handle an external pose: velocity, height and climb come from it."""
         self._opened().pose(pose)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return what the flight controller's settings and state say about a flight."""
+        """Return diagnostics of the flight controller's settings and state."""
         link = self._opened()
         with link.lock:
             return link.session.diagnose()
@@ -122,7 +122,7 @@ EXTRA: Final = "msp"
 
 
 class MspLink(ConnectionLink[MspSession, ByteStream]):
-    """Keeps the connection and serves the session, on a thread of its own."""
+    """The link's thread: keeps the connection open and serves the session."""
 
     RETRY_NS = nanoseconds(0.25)
 
@@ -136,7 +136,7 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def pose(self, pose: ExternalPose) -> None:
-        """Take in a pose from outside. Any thread. See :meth:`MspSession.on_pose`."""
+        """Handle an external pose. Any thread. See :meth:`MspSession.on_pose`."""
         with self.lock:
             self.session.on_pose(pose, self._clock())
 
@@ -166,7 +166,7 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
         if self._connection is None or self._broken or not data:
             return
         try:
-            for frame in whole_frames(data):  # what a full port cuts is one frame, and none behind it is sent late
+            for frame in whole_frames(data):  # a full port cuts at most one frame and delays none behind it
                 self._connection.write(frame, Rank.STOP if self.session.urgent else Rank.SETPOINT)
         except OSError as error:
             self._on_broken(error, now_ns)
@@ -174,4 +174,4 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
     def _on_end(self, connection: ByteStream) -> None:
         connection.drain_s = END_S
         with suppress(OSError):
-            connection.write(self.session.last_words(self._clock()), Rank.COMMAND)
+            connection.write(self.session.final_bytes(self._clock()), Rank.COMMAND)

@@ -1,6 +1,6 @@
-"""What a flight controller is set up to do: its switches, its sticks, whether it may be flown by MSP. Pure.
+"""A flight controller's setup: its switches, its sticks, and whether MSP may fly it. Pure.
 
-It is read question by question, by :class:`Identification`.
+:class:`Identification` reads it question by question.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from skyloop.vehicles.msp.wire.messages import (
 )
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
-LEAST_AUX: Final = 4  #: channels beside the sticks that are always sent
-MOST_AUX: Final = 14
-USUAL_AUX_US: Final = 1000
-_ARM_NUMBER: Final = 0  #: of both firmwares
-LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later is warned of
-CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on a stick leans along the curve of its rates
+LEAST_AUX: Final = 4  #: AUX channels that are always sent beside the sticks
+MOST_AUX: Final = 14  #: AUX channels of SET_RAW_RC
+USUAL_AUX_US: Final = 1000  #: an AUX channel that nothing needs
+_ARM_NUMBER: Final = 0  #: in both firmwares
+LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later gets a warning
+CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on, a stick's lean follows the curve of its rates
 _PROCEDURES: Final = {
     BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
     INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
@@ -60,13 +60,13 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What was read of a flight controller. None: it did not tell."""
+    """A flight controller's settings. None: not reported."""
 
     identity: Identity = field(default_factory=Identity)
-    boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status' bits
+    boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
-    sticks: tuple[int, ...] = USUAL_MAP  #: where roll, pitch, yaw and throttle are
-    sticks_told: bool = False  #: else that is a guess
+    sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
+    sticks_known: bool = False  #: whether that was reported; else it is a guess
     rx: RxConfig = field(default_factory=RxConfig)
     failsafe: FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
@@ -76,12 +76,12 @@ class Setup:
     inav_expo: tuple[int, int] = (0, 0)  #: of roll and pitch, and of yaw
     angle_limit_deg: float | None = None
     cells: CellVoltages = field(default_factory=CellVoltages)
-    receiver_is_msp: bool | None = None  #: of INAV
+    receiver_is_msp: bool | None = None  #: INAV only
 
     # Modes -------------------------------------------------------------------------------------------------------
 
     def number(self, name: str) -> int | None:
-        """Return a mode's permanent number; None if this firmware does not have it."""
+        """Return a mode's permanent number; None if the firmware does not have it."""
         return next((number for number, known in self.boxes if known == name), None)
 
     def mode_names(self, active: int) -> list[str]:
@@ -89,7 +89,7 @@ class Setup:
         return [name for bit, (_, name) in enumerate(self.boxes) if active >> bit & 1]
 
     def is_active(self, active: int, *names: str) -> bool:
-        """Return whether one of these modes is active."""
+        """Return whether any of these modes is active."""
         return any(name in names for name in self.mode_names(active))
 
     def ranges_of(self, *names: str) -> list[ModeRange]:
@@ -99,7 +99,7 @@ class Setup:
 
     @property
     def arm_number(self) -> int | None:
-        """The permanent number of the mode that arms: that of every version where the names of modes were not read."""
+        """The permanent number of the mode that arms; without mode names, every version's usual number."""
         return self.number(ARM) if any(name for _, name in self.boxes) else _ARM_NUMBER
 
     @property
@@ -109,14 +109,14 @@ class Setup:
 
     @property
     def aux_channels(self) -> int:
-        """How many AUX channels are sent: one that is not would take a value of the firmware's own choice."""
+        """The number of AUX channels to send. The firmware would choose the value of any missing one itself."""
         used = max((each.aux + 1 for each in self.ranges), default=0)
         return min(MOST_AUX, max(LEAST_AUX, used))
 
     def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
-        """Return the AUX channels [µs] that switch on what is wanted, and as little else as can be.
+        """Return AUX channels [µs] that switch on the wanted modes and as few others as possible.
 
-        ``given`` are those that a person set, by channel from 0; that of the arm switch is left out.
+        ``given``: channels set by a person, counted from 0, except the arm switch's.
         """
         wanted = {self.number(ANGLE)}
         if arm:
@@ -140,7 +140,7 @@ class Setup:
         def cost(width: int) -> tuple[int, int, int, int]:
             on = {each.mode for each in ranges if each.low_us <= width < each.high_us}
             asked = {each.mode for each in ranges} & wanted
-            # The arm switch goes before everything, then what is wanted, then what is not.
+            # The arm switch comes first, then wanted modes, then unwanted ones.
             return (
                 int((arm in on) is not (arm in asked)),
                 len(asked - on),
@@ -154,11 +154,11 @@ class Setup:
 
     @property
     def full_tilt_rad(self) -> float | None:
-        """Return what a full stick leans; None if it is not known."""
+        """Return the lean of a full stick; None if unknown."""
         return None if self.angle_limit_deg is None else math.radians(self.angle_limit_deg)
 
     def tilt_curves(self) -> tuple[Curve, Curve]:
-        """Return the shares of the full tilt that roll and pitch sticks come to."""
+        """Return the share of the full tilt by roll and pitch stick."""
         if self.identity.variant == INAV:
             curve = inav_curve(self.inav_expo[0], 1.0)
             return curve, curve
@@ -168,7 +168,7 @@ class Setup:
         return share_of(rate_curve(kind, self.rates.roll)), share_of(rate_curve(kind, self.rates.pitch))
 
     def yaw_curve(self) -> Curve:
-        """Return how fast a yaw stick turns [rad/s]."""
+        """Return the yaw rate [rad/s] by stick."""
         if self.identity.variant == INAV:
             return inav_curve(self.inav_expo[1], math.radians(self.inav_yaw_rate_deg_s or 200.0))
         if self.rates is None:
@@ -176,10 +176,10 @@ class Setup:
         curve = rate_curve(self.rates.kind, self.rates.yaw)
         return lambda stick: math.radians(curve(stick))
 
-    # Whether it may be flown -------------------------------------------------------------------------------------
+    # Fitness for flight ------------------------------------------------------------------------------------------
 
     def diagnose(self, *, override: bool) -> list[Diagnostic]:
-        """Return what its settings mean for a flight. What is severe keeps it from being armed."""
+        """Return the settings' consequences for a flight. Severe ones prevent arming."""
         name = Diagnostic("firmware", True, str(self.identity))
         return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
 
@@ -196,8 +196,8 @@ class Setup:
         found.append(Diagnostic("ANGLE mode", level, detail, advice, severe=True))
         if override:
             there = bool(self.ranges_of(*MSP_OVERRIDE))
-            detail = "a switch of the receiver gives the sticks away" if there else "no switch gives the sticks away"
-            advice = "" if there else "give the mode MSP OVERRIDE a switch of the receiver"
+            detail = "a receiver switch hands over the sticks" if there else "no switch hands over the sticks"
+            advice = "" if there else "assign the mode MSP OVERRIDE to a receiver switch"
             found.append(Diagnostic("MSP override", there, detail, advice, severe=True))
         return found
 
@@ -208,10 +208,10 @@ class Setup:
         if is_msp is None:
             return []
         if override:
-            detail = "its receiver is MSP: there is no pilot's" if is_msp else "a pilot's receiver is connected"
+            detail = "its receiver is MSP, not a pilot's" if is_msp else "a pilot's receiver is connected"
             advice = "leave override= out of the address, or connect a receiver" if is_msp else ""
             return [Diagnostic("receiver", not is_msp, detail, advice, severe=True)]
-        detail = "sticks come by MSP" if is_msp else "sticks do not come by MSP"
+        detail = "sticks arrive by MSP" if is_msp else "sticks do not arrive by MSP"
         advice = "feature RX_MSP (INAV: set receiver_type = MSP), or override=1 with a pilot's receiver"
         return [Diagnostic("receiver", is_msp, detail, "" if is_msp else advice, severe=True)]
 
@@ -224,7 +224,7 @@ class Setup:
             fine = self.identity.variant == INAV
             return [] if fine else [Diagnostic("silence", False, detail, "keep a thumb on the switch")]
         if self.failsafe is None:
-            return [Diagnostic("failsafe", False, "its failsafe is not known", _DOCS, severe=True)]
+            return [Diagnostic("failsafe", False, "its failsafe is unknown", _DOCS, severe=True)]
         found = []
         config, names = self.failsafe, _PROCEDURES[self.identity.variant]
         what = names[config.procedure] if config.procedure < len(names) else f"procedure {config.procedure}"
@@ -235,14 +235,14 @@ class Setup:
         if config.delay_s > LONG_DELAY_S:
             advice = f"set failsafe_delay = {LONG_DELAY_S * 10:g} or less"
             found.append(
-                Diagnostic("failsafe delay", False, f"failsafe begins after {config.delay_s:g} s only", advice)
+                Diagnostic("failsafe delay", False, f"failsafe begins only after {config.delay_s:g} s", advice)
             )
         return found + self._held()
 
     def _held(self) -> list[Diagnostic]:
-        """Judge what the sticks are set to between the loss of the receiver and the failsafe."""
+        """Judge the stick values in force between the loss of the receiver and the failsafe."""
         if self.identity.variant == BETAFLIGHT and len(self.on_loss) < len(USUAL_MAP):
-            unknown = "what it does without sticks, before its failsafe, is not known"
+            unknown = "its reaction to missing sticks before the failsafe is unknown"
             return [Diagnostic("held sticks", False, unknown, _DOCS, severe=True)]
         held = [
             name
@@ -250,7 +250,7 @@ class Setup:
             if mode == OnLoss.HOLD
         ]
         if held:
-            detail = f"without sticks it holds the last {', '.join(held)}: it would fly on by itself"
+            detail = f"without sticks it holds the last {', '.join(held)}: it would fly on"
             advice = "rxfail 0 a, rxfail 1 a, rxfail 2 a, rxfail 3 a"
             return [Diagnostic("held sticks", False, detail, advice, severe=True)]
         return []
@@ -261,7 +261,7 @@ def _straight(stick: float) -> float:
 
 
 def hindrances(diagnostics: list[Diagnostic]) -> str:
-    """Return why it must not be armed, with what to do; empty if nothing is severe."""
+    """Return why it must not be armed, with advice; empty if nothing is severe."""
     bad = [each for each in diagnostics if each.severe and not each.good]
     return "; ".join(f"{each.detail} ({each.advice})" if each.advice else each.detail for each in bad)
 
@@ -271,16 +271,16 @@ _MSP_RECEIVER: Final = 2  # INAV's receiver_type
 
 
 class Identification:
-    """Asks for everything that :class:`Setup` holds.
+    """Requests everything in :class:`Setup`.
 
     Args:
-        questions: Where it asks.
-        done: Called at the end; the setup's variant is empty if the flight controller did not say who it is.
+        questions: The queue of requests.
+        done: Called at the end; the setup's variant is empty if the flight controller did not identify itself.
     """
 
     def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:
         self.setup = Setup()
-        self.missing: list[str] = []  #: what must be known to send it any sticks, and could not be read
+        self.missing: list[str] = []  #: settings needed to send any sticks that could not be read
         self._questions = questions
         self._done = done
         for function, handler in (
@@ -308,7 +308,7 @@ class Identification:
             self._identify(board=msp.board(payload))
 
     def ask_settings(self) -> None:
-        """Go on with the settings, once it is known who it is."""
+        """Request the settings, once the firmware is known."""
         ask = self._questions.ask
         for what, function, handler in (
             ("numbers of its modes", Function.BOXIDS, self._on_box_numbers),
@@ -343,7 +343,7 @@ class Identification:
         self.setup = replace(self.setup, ranges=tuple(msp.mode_ranges(payload)))
 
     def _on_sticks(self, payload: bytes) -> None:
-        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_told=True)
+        self.setup = replace(self.setup, sticks=msp.rx_map(payload), sticks_known=True)
 
     def _on_rx(self, payload: bytes) -> None:
         self.setup = replace(self.setup, rx=RxConfig.decode(payload))
@@ -384,7 +384,7 @@ class Identification:
 def _reading(
     handler: Callable[[bytes], None], otherwise: Callable[[], None] = lambda: None
 ) -> Callable[[bytes | None], None]:
-    """Return a handler that calls ``otherwise`` for what is not known, or can't be read."""
+    """Return a handler that calls ``otherwise`` for missing or unreadable replies."""
 
     def read(payload: bytes | None) -> None:
         if payload is not None:

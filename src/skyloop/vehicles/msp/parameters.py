@@ -1,4 +1,4 @@
-"""What is set of the driver: options of an ``msp://`` address, and parameters (limits, scales, gains, AUX). Pure.
+"""Options of an ``msp://`` address, and the driver's parameters (limits, scales, gains, AUX). Pure.
 
 ``docs/msp.md`` has both as tables.
 """
@@ -30,7 +30,7 @@ class MspOptions:
     port: int | None = None
     baud: int = DEFAULT_BAUD
     rate_hz: float = DEFAULT_RATE_HZ  #: of the sticks
-    override: bool = False  #: a pilot keeps a real receiver, and lets the sticks be overridden by a switch
+    override: bool = False  #: a pilot keeps a real receiver, whose switch hands over the sticks
 
     @property
     def serial(self) -> bool:
@@ -54,20 +54,20 @@ def options_of(uri: VehicleUri) -> MspOptions:
     word, _, rest = uri.place.partition(":")
     found = host_and_port(rest)
     if word != "tcp" or found is None:
-        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+        raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
     return MspOptions(*found, rate_hz=rate, override=override)
 
 
-AUTOMATIC: Final = 0  #: of an AUX channel: as the modes need it
+AUTOMATIC: Final = 0  #: value of an AUX channel: as the modes need it
 _LIMITS: Final = (
-    ("tilt", 0.02, 1.0, "rad", "greatest roll and pitch together; never more than a full stick"),
-    ("climb", 0.05, 10.0, "m/s", "greatest climb and descent"),
-    ("yaw_rate", 0.05, 10.0, "rad/s", "greatest yaw rate; never more than a full stick"),
-    ("throttle", 0.1, 1.0, "", "greatest throttle, as a share of the full one"),
+    ("tilt", 0.02, 1.0, "rad", "maximum roll and pitch together, up to a full stick"),
+    ("climb", 0.05, 10.0, "m/s", "maximum climb and descent"),
+    ("yaw_rate", 0.05, 10.0, "rad/s", "maximum yaw rate, up to a full stick"),
+    ("throttle", 0.1, 1.0, "", "maximum throttle, as a share of full throttle"),
 )
 _GAINS: Final = (
-    ("climb_p", 0.0, 10.0, "1/s", "acceleration that is asked for per error of the climb"),
-    ("climb_i", 0.0, 10.0, "1/s²", "how fast the throttle that carries the vehicle is learnt"),
+    ("climb_p", 0.0, 10.0, "1/s", "acceleration per climb error"),
+    ("climb_i", 0.0, 10.0, "1/s²", "learning rate of the hover throttle"),
 )
 TILT: Final = "msp.full_stick.tilt"
 HOVER: Final = "msp.hover_throttle"
@@ -84,18 +84,18 @@ class DriverParameters:
     """The driver's own parameters.
 
     Args:
-        setpoints: That they are of. The caller holds the lock that guards them.
+        setpoints: The controller they belong to. The caller holds the lock that guards it.
     """
 
     def __init__(self, setpoints: SetpointController) -> None:
         self._setpoints = setpoints
 
     def parameters(self) -> list[Parameter]:
-        """Return all parameters with their present values."""
+        """Return all parameters with their current values."""
         return [entry.parameter for entry in self._entries().values()]
 
     def write(self, name: str, value: Value) -> Value:
-        """Write a parameter and return the value in force; raises for a name or a value that does not fit."""
+        """Write a parameter and return the value in force; raise for an unknown name or an invalid value."""
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)
@@ -144,14 +144,14 @@ class DriverParameters:
         def write(value: float) -> None:
             self._setpoints.full_tilt_rad = value or None
 
-        text = "what a full stick leans in ANGLE mode; 0: as the flight controller says (angle_limit)"
+        text = "lean of a full stick in ANGLE mode; 0: the flight controller's angle_limit"
         return _Entry(_number(TILT, self._setpoints.full_tilt_rad or 0.0, 0.0, 1.5, "rad", text, 0.0), write)
 
     def _hover(self) -> _Entry:
         def write(value: float) -> None:
             self._setpoints.hover = value or None
 
-        text = "throttle that carries it, as a share of the full one: learnt in flight; 0: not known"
+        text = "hover throttle as a share of full throttle, learnt in flight; 0: unknown"
         return _Entry(_number(HOVER, self._setpoints.hover or 0.0, 0.0, 0.9, "", text, 0.0), write)
 
     def _aux(self) -> list[_Entry]:
@@ -164,7 +164,7 @@ class DriverParameters:
 
             return write
 
-        text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; never the arm switch's"
+        text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; not for the arm switch"
         made = []
         for channel in range(MOST_AUX):
             value = self._setpoints.given_aux.get(channel, AUTOMATIC)

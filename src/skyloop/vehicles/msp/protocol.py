@@ -30,27 +30,27 @@ from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
-DEGRADED_NS: Final = nanoseconds(0.4)
-LOST_NS: Final = nanoseconds(1.0)
-FIRST_WORD_NS: Final = nanoseconds(2.0)
-IDLE_NS: Final = nanoseconds(0.05)  #: the latest next poll
-MOST_STICKS: Final = 4  #: frames of sticks that may be without an acknowledgement
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older one is taken for lost once something newer was heard
-LAST_STICKS: Final = 3  #: frames of sticks, level or disarming, that end what is sent to one that is not heard any more
-COUNT_NS: Final = nanoseconds(1.0)  #: over which acknowledged sticks are counted
-UNTOLD_NS: Final = nanoseconds(0.5)  #: a receiver without sticks for so long wants its arm switch off before it arms
-LEAST_STICKS_HZ: Final = 25.0  #: fewer are warned of
-BUNDLING_API: Final = (1, 42)  #: of Betaflight: it knows MULTIPLE
-_MODES_AT: Final = 6  # of STATUS
-WAKING_NS: Final = nanoseconds(8.0)  #: what passes by itself after its start keeps it from being armed for no longer
-AGAIN_NS: Final = nanoseconds(1.0)  #: between two tries to find out who it is
+DEGRADED_NS: Final = nanoseconds(0.4)  #: silence until the link is degraded
+LOST_NS: Final = nanoseconds(1.0)  #: silence until it is lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller without a reply by then is reported as lost
+IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
+MOST_STICKS: Final = 4  #: stick frames that may be unacknowledged
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older unacknowledged frame counts as lost once a newer reply arrives
+LAST_STICKS: Final = 3  #: final stick frames, level or disarming, to a flight controller that has gone silent
+COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
+UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, the arm switch must be seen off before it arms
+LEAST_STICKS_HZ: Final = 25.0  #: a lower rate gets a warning
+BUNDLING_API: Final = (1, 42)  #: Betaflight's version that introduced MULTIPLE
+_MODES_AT: Final = 6  # offset in STATUS
+WAKING_NS: Final = nanoseconds(8.0)  #: temporary conditions keep it from arming for no longer after it is switched on
+AGAIN_NS: Final = nanoseconds(1.0)  #: between attempts to identify it
 
 ATTITUDE_HZ: Final = 50.0
 ALTITUDE_HZ: Final = 25.0
 STATUS_HZ: Final = 20.0
 GPS_HZ: Final = 10.0
 BATTERY_HZ: Final = 2.0
-PILOT_HZ: Final = 10.0
+PILOT_HZ: Final = 10.0  #: the pilot's sticks, with override
 
 
 class MspSession(VehicleSession):
@@ -63,31 +63,31 @@ class MspSession(VehicleSession):
         self.options = options
         self.setpoints = setpoints or SetpointController(options.override)
         self.motion = MotionEstimate()
-        self.setup: Setup | None = None  #: None until it was read
+        self.setup: Setup | None = None  #: None until read
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: acknowledged
         self.unknown = 0  #: frames that answer nothing
-        self.urgent = False  #: what was due last is an emergency stop
+        self.urgent = False  #: the latest command is an emergency stop
         self._parser = Parser()
         self._questions = Questions()
         self._identification: Identification | None = None
         self._telemetry: Telemetry | None = None
-        self._known = False  # who it is was asked since it was found
+        self._known = False  # it was asked to identify itself since it was found
         self._refused_variant = ""
-        self._unread = ""  # what it did not tell of its settings
-        self._part = Setup()  # what was read of them, for a stop
-        self._armed: bool | None = None  # as it told before them; None: it did not
-        self._stop_waits = False  # for a word whether it is armed
+        self._unread = ""  # settings that it did not report
+        self._part = Setup()  # the settings read so far, for a stop
+        self._armed: bool | None = None  # as reported before the settings; None: not reported
+        self._stop_waits = False  # until it is known whether it is armed
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
-        self._sticks: deque[int] = deque()  # when those without an acknowledgement were sent
-        self._last_sticks = 0  # so many more are sent to one that is not heard
+        self._sticks: deque[int] = deque()  # send times of unacknowledged frames
+        self._last_sticks = 0  # final frames still to send to a silent one
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
-        self._wakes_until_ns: int | None = None  # None: its state is not known yet; 0: it was ready since
-        self._woke = False  # it was still waking up when last looked
-        self._may_steer = False  # its state is known: what is sent does not disarm a flying one
+        self._wakes_until_ns: int | None = None  # None: its state is unknown; 0: it has been ready
+        self._woke = False  # it was still booting at the last check
+        self._may_steer = False  # its state is known: our sticks won't disarm it in flight
         self._armed_throttle: float | None = None
         self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
 
@@ -101,22 +101,22 @@ class MspSession(VehicleSession):
         return applied
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start it; return why a take-off is sure to be refused, empty if it is not."""
+        """Let the next climb start it; return why the take-off would fail, empty if it may succeed."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         return self.setpoints.ask_takeoff(now_ns)
 
     def on_pose(self, pose: ExternalPose, now_ns: int) -> None:
-        """Take in a pose from outside; see :meth:`ExternalPose.bounded`."""
+        """Handle an external pose; see :meth:`ExternalPose.bounded`."""
         self.motion.on_pose(pose.bounded(now_ns))
 
     def close(self) -> None:
         """End the session."""
         self._questions.clear()
 
-    def last_words(self, now_ns: int) -> bytes:
-        """Return what is sent before the connection is closed: one that stands is disarmed.
+    def final_bytes(self, now_ns: int) -> bytes:
+        """Return the final bytes before the connection closes: they disarm a vehicle on the ground.
 
-        One that flies gets nothing: the silence that follows is what its failsafe is set up for.
+        A flying one gets nothing: its failsafe is set up for the silence that follows.
         """
         if not self._may_steer or self.options.override or self.setpoints.phase is Phase.FLYING:
             return b""
@@ -124,16 +124,16 @@ class MspSession(VehicleSession):
         return self._stick_frame(now_ns)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return what its settings and its state say about a flight."""
+        """Return diagnostics of its settings and state."""
         if self.setup is None:
-            unread = "the flight controller's settings were not read: they are not known"
+            unread = "the flight controller's settings have not been read"
             return [Diagnostic("settings", False, unread, "wait until its link is up, then check again", severe=True)]
         found = self.setup.diagnose(override=self.options.override)
         names = self.setpoints.report.hindrances
         if names:
             found.append(Diagnostic("arming", False, f"it can't be armed: {explained(names)}", severe=True))
         elif self.setpoints.report.armed is False:
-            found.append(Diagnostic("arming", True, "it reports nothing that keeps it from being armed"))
+            found.append(Diagnostic("arming", True, "it reports nothing that prevents arming"))
         if self.sticks_hz is not None:
             found.append(_pace(self.sticks_hz, self.setup.identity.variant))
         return found
@@ -141,13 +141,13 @@ class MspSession(VehicleSession):
     # From the connection -------------------------------------------------------------------------------------------
 
     def connected(self) -> None:
-        """Handle that a new connection was opened: nothing of an older one follows."""
+        """Handle a new connection: no reply from an older one follows."""
         self._parser.reset()
         self._sticks.clear()
         self.due_ns = 0
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Handle bytes that came, whatever they hold. Never raises."""
+        """Handle received bytes. Never raises, whatever they contain."""
         for frame in self._parser.feed(data):
             if frame.direction is not Direction.REQUEST:
                 self._on_frame(frame, now_ns)
@@ -173,7 +173,7 @@ class MspSession(VehicleSession):
                 assert self._telemetry is not None
                 self._telemetry.drop(function)
                 continue
-            with suppress(DecodeError):  # damaged in a way that its checksum did not show
+            with suppress(DecodeError):  # damaged despite a matching checksum
                 self._on_state(function, payload, now_ns)
 
     def _on_state(self, function: int, payload: bytes, now_ns: int) -> None:
@@ -209,7 +209,7 @@ class MspSession(VehicleSession):
         overridden = self.setup.is_active(status.modes, *MSP_OVERRIDE)
         if not self._may_steer:
             if armed and not self.options.override and self._armed_throttle is None:
-                return  # what flies must not be sent anything before its throttle is known
+                return  # send a flying vehicle nothing before its throttle is known
             self._may_steer = True
             if armed and self._armed_throttle is not None and not self.options.override:
                 self.setpoints.report = Report(armed, names, overridden)
@@ -228,7 +228,7 @@ class MspSession(VehicleSession):
 
     def _publish(self, now_ns: int) -> None:
         if self.setpoints.report.armed is None or self.reported.altitude is None:
-            return  # what it does is not known yet
+            return  # its state is not known yet
         wakes = self._wakes_up(now_ns)
         if self.link_state is not LinkState.UP or wakes is not self._woke:
             names = ", ".join(self.setpoints.report.hindrances)
@@ -242,7 +242,7 @@ class MspSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def _wakes_up(self, now_ns: int) -> bool:
-        """Return whether it was found just now, and only what passes by itself keeps it from being armed."""
+        """Return whether it was found just now and only temporary conditions prevent arming."""
         report = self.setpoints.report
         if self._wakes_until_ns is None:
             self._wakes_until_ns = now_ns + WAKING_NS
@@ -285,7 +285,7 @@ class MspSession(VehicleSession):
     # Time ----------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
-        """Return the bytes that are due now."""
+        """Return the bytes due now."""
         self._check_silence(now_ns)
         made = self._due_sticks(now_ns)
         if self._telemetry is not None:
@@ -325,21 +325,22 @@ class MspSession(VehicleSession):
         return made
 
     def _may_stop_unread(self, now_ns: int) -> bool:
-        """Return whether a stop can be sent before all settings were read, and can't arm what stands.
+        """Return whether a stop can be sent before all settings are read without arming a vehicle on the ground.
 
-        Where the arm switch was not read its channel is low, by which some are armed.
+        If the arm switch is unknown, its channel is low, and a low channel arms some vehicles.
         """
         if self._refused_variant or self._part.ranges_of(ARM):
             return not self._refused_variant
-        if self._armed is not None or self.options.override:  # a pilot's receiver goes on by itself
+        if self._armed is not None or self.options.override:  # a pilot's receiver continues
             return bool(self._armed)
         return now_ns - self._opened_ns >= UNTOLD_NS
 
     def _holds_back(self, now_ns: int) -> bool:
-        """Return whether sticks that are sent now might wait in a buffer and be obeyed late, or are somebody else's.
+        """Return whether new sticks might wait in a buffer and be obeyed late, or belong to another pilot.
 
-        One that stands still goes on as if no time had passed, and obeys all that came meanwhile: nothing but its
-        answers shows that it reads. Until it is lost a few keep the failsafe of what only can't be heard from acting.
+        A paused flight controller resumes as if no time had passed and obeys everything that arrived meanwhile; only
+        its replies show that it reads. Until the link is lost, a few frames hold off the failsafe of one that is only
+        inaudible.
         """
         heard_ns = self._received_ns
         while self._sticks and self._sticks[0] < (heard_ns or 0) and now_ns - self._sticks[0] >= STICKS_LOST_NS:
@@ -351,11 +352,11 @@ class MspSession(VehicleSession):
         return soon or self._last_sticks < 0
 
     def _step_stop(self, now_ns: int) -> bool:
-        """Go on with an emergency stop; return whether its sticks are due."""
+        """Continue an emergency stop; return whether its sticks are due."""
         setpoints = self.setpoints
         active, urgent = setpoints.stop.active, setpoints.step_stop(now_ns)
         if active and not setpoints.stop.active and not setpoints.receiving:
-            # What flies when it is found again is adopted, and not disarmed by a stop from before.
+            # Adopt a vehicle found flying again: don't disarm it by a stop from before.
             self._may_steer, self._armed_throttle = False, None
             setpoints.report = Report()
         return urgent
@@ -364,7 +365,7 @@ class MspSession(VehicleSession):
         return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
 
     def _count(self, now_ns: int) -> None:
-        """Measure how many sticks a second are taken."""
+        """Measure the rate of acknowledged sticks."""
         since_ns = now_ns - self._counted_ns
         if since_ns < COUNT_NS or self.setup is None:
             return
@@ -377,7 +378,7 @@ class MspSession(VehicleSession):
         self._slow = slow
 
     def _begin(self, now_ns: int) -> None:
-        """Ask who it is, if nothing is asked already."""
+        """Start to identify it, unless requests are already pending."""
         if not self._questions.idle or (self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS):
             return
         self._asked_ns = now_ns
@@ -387,7 +388,7 @@ class MspSession(VehicleSession):
 
     def _on_armed(self, status: bytes | None) -> None:
         if status is not None and len(status) > _MODES_AT:
-            self._armed = bool(status[_MODES_AT] & 1)  # ARM is the first mode of both firmwares
+            self._armed = bool(status[_MODES_AT] & 1)  # ARM is the first mode in both firmwares
 
     def _on_identity(self, status: bytes | None) -> None:
         self._on_armed(status)
@@ -398,18 +399,16 @@ class MspSession(VehicleSession):
         elif identity.variant and identity.variant != self._refused_variant:
             self._refused_variant = identity.variant
             known = "Betaflight (BTFL) and INAV"
-            text = f"the firmware is {identity.variant!r}, of which MSP is not known well enough to fly it: {known} are"
+            text = f"the firmware is {identity.variant!r}, which can't be flown over MSP; supported: {known}"
             self._publish_event(message(text, "firmware", Severity.ERROR))
             self._set_link_state(LinkState.DEGRADED, text)
 
     def _on_setup(self, setup: Setup) -> None:
         assert self._identification is not None
-        if self._identification.missing:  # its throttle or arm switch would be guessed: it is asked again
+        if self._identification.missing:  # without them, throttle or arm switch would be guesses: ask again
             missing = ", ".join(self._identification.missing)
             if missing != self._unread:
-                text = (
-                    f"the flight controller did not tell the {missing}: it is asked again, and not steered by guesses"
-                )
+                text = f"the flight controller did not report the {missing}: asking again before steering it"
                 self._publish_event(message(text, "setup_unread", Severity.WARNING))
             self._unread = missing
             self._keep_part()
@@ -438,23 +437,23 @@ class MspSession(VehicleSession):
         self._telemetry = Telemetry(streams, bundle)
 
     def _keep_part(self) -> None:
-        """Keep what was read of its settings, or in an earlier round: by that at least a stop is sent."""
+        """Keep the settings read so far, or in an earlier round: they allow at least a stop."""
         if self.setup is not None or self._identification is None:
             return
         found, before = self._identification.setup, self._part
-        if found.identity.variant in SUPPORTED and _told(found) >= _told(before):
+        if found.identity.variant in SUPPORTED and _known_settings(found) >= _known_settings(before):
             self._part = found
-            self.setpoints.set_up(found, "its settings were not read")
+            self.setpoints.set_up(found, "its settings have not been read")
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
 
-    # Losing --------------------------------------------------------------------------------------------------------
+    # Loss ----------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Ask who it is anew, and meanwhile for its state as before, so that what flies is soon steered again.
+        """Identify it again, and poll its state meanwhile, so that a flying vehicle is soon steered again.
 
-        It gets :data:`LAST_STICKS` more, and then nothing but questions and stops: its own failsafe acts.
+        It gets :data:`LAST_STICKS` final frames, then only requests and stops, so that its own failsafe acts.
         """
         del now_ns
         self._keep_part()
@@ -479,8 +478,8 @@ class MspSession(VehicleSession):
         if self.options.serial:
             return "connect it, give the baud rate of its MSP port in the address, and close the configurator"
         if self.options.place.startswith("127."):
-            return "start the firmware's simulation, or the emulated one: skyloop sim --firmware betaflight"
-        return "check host and port in the address, and that no other program is connected to that port"
+            return "start Betaflight's SITL or the emulator: skyloop sim --firmware betaflight"
+        return "check host and port in the address, and close other programs connected to that port"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
         if self.options.serial:
@@ -488,8 +487,8 @@ class MspSession(VehicleSession):
         return super()._trouble(error)
 
 
-def _told(setup: Setup) -> tuple[bool, bool]:
-    return bool(setup.arm_ranges), setup.sticks_told
+def _known_settings(setup: Setup) -> tuple[bool, bool]:
+    return bool(setup.arm_ranges), setup.sticks_known
 
 
 def _has_height(status: msp.Status) -> bool:
@@ -497,8 +496,8 @@ def _has_height(status: msp.Status) -> bool:
 
 
 def _pace(sticks_hz: float, variant: str) -> Diagnostic:
-    detail = f"it takes {sticks_hz:.0f} sticks a second"
+    detail = f"it takes {sticks_hz:.0f} stick updates per second"
     if sticks_hz >= LEAST_STICKS_HZ:
         return Diagnostic("pace", True, detail)
     advice = "set serial_update_rate_hz = 1000" if variant == BETAFLIGHT else "use a faster port"
-    return Diagnostic("pace", False, f"{detail} only, so it is steered late", advice)
+    return Diagnostic("pace", False, f"{detail} only: steering lags", advice)

@@ -1,7 +1,7 @@
-"""Set-points to sticks: arming, the throttle that holds a climb rate, touch-down and disarming. Pure.
+"""Turn set-points into sticks: arming, holding a climb rate, touch-down and disarming. Pure.
 
-The throttle that carries the vehicle is learnt: a take-off raises the throttle slowly until the vehicle leaves the
-ground, and a slow integral keeps it right from then on.
+The hover throttle is learnt: a take-off raises the throttle slowly until the vehicle lifts off, and a slow integral
+keeps the value right from then on.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, st
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()
 OFF_US: Final = 1000
-SPOOL_PER_S: Final = 0.15  #: how fast a take-off raises the throttle
-SPOOL_FROM: Final = 0.6  #: of the throttle that carries it, where it is known
-IDLE: Final = 0.05  #: where it is not
-ARM_NS: Final = nanoseconds(6.0)  #: an arming that has not shown by then failed; Betaflight's BOOTGRACE is 5 s
-NAMED_NS: Final = nanoseconds(0.4)  #: so long must a hindrance last while it arms
-REFUSED_NS: Final = nanoseconds(1.0)  #: after a refusal the arm switch stays off for so long
-ASKED_NS: Final = nanoseconds(1.0)  #: a take-off that was asked for begins within this, or it has to be asked for again
-ABORT_NS: Final = nanoseconds(1.0)  #: so long a take-off may be interrupted before it ends
-#: What passes by itself, soon after the connection or a landing: an arming waits for it with the arm switch off.
+SPOOL_PER_S: Final = 0.15  #: rise of the throttle at take-off, share of full per second
+SPOOL_FROM: Final = 0.6  #: share of the hover throttle to start from, if known
+IDLE: Final = 0.05  #: throttle to start from otherwise
+ARM_NS: Final = nanoseconds(6.0)  #: an arming not confirmed by then has failed; Betaflight's BOOTGRACE is 5 s
+NAMED_NS: Final = nanoseconds(0.4)  #: how long an obstacle must last while arming to count as a refusal
+REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
+ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has not started by then
+ABORT_NS: Final = nanoseconds(1.0)  #: how long a take-off may be interrupted before it ends
+#: Temporary conditions after connecting or landing: arming waits for them with the arm switch off.
 PASSING: Final = frozenset(
     {
         "RXLOSS",
@@ -49,57 +49,57 @@ PASSING: Final = frozenset(
 )
 SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: beside them in its first words, before it knows how it stands
 LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
-LATE_S: Final = {True: 0.35, False: 0.15}  #: so long after the throttle carried it a lift-off shows, precise or not
-OTHER: Final = 0.15  #: share by which the throttle that was learnt may differ from the one that lifted it
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: without headway a descent met something
-HEADWAY: Final = 0.4  #: of the descent that is asked for
-STILL: Final = {True: 0.1, False: 0.4}  #: what moves faster up or down [m/s] does not stand, precise or not
-#: Time constant of the climb and height that show a lift-off or a touch-down [s]. It leaves 0.03 m/s of 0.2 m/s of
-#: noise (UWB), which never was STILL for GROUND_NS otherwise, and what sinks at 0.15 m/s is told from what stands.
+LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from a sufficient throttle to a visible lift-off, by precise or not
+OTHER: Final = 0.15  #: share by which the learnt throttle may differ from the one at lift-off
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a stalled descent has met something by then
+HEADWAY: Final = 0.4  #: share of the requested descent
+STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means not on the ground, by precise or not
+#: Time constant of the climb and height behind lift-off and touch-down [s]. It reduces noise of 0.2 m/s (UWB) to
+#: 0.03 m/s; without it, such noise was never STILL for GROUND_NS. It still tells 0.15 m/s of sinking from the ground.
 SMOOTH_S: Final = 0.4
-SINK_PER_S: Final = 0.5  #: how fast the throttle is taken away then
-OFF_BELOW: Final = 0.6  #: of the throttle that carries it: it stands
-BLIND: Final = 0.93  #: of it while the climb is not known: it sinks
-BLIND_NS: Final = nanoseconds(6.0)
-MOST_LEARNT: Final = 0.9
+SINK_PER_S: Final = 0.5  #: throttle reduction once it seems to be on the ground, share per second
+OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
+BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
+BLIND_NS: Final = nanoseconds(6.0)  #: without a measured climb for this long, it is disarmed
+MOST_LEARNT: Final = 0.9  #: limits of the learnt hover throttle
 LEAST_LEARNT: Final = 0.05
-LIFT_M_S2: Final = 4.0  #: the most that the climb loop asks for
-#: Why nothing starts what did not disarm by a stop that was given up.
+LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
+#: Why nothing restarts a vehicle that did not confirm a stop.
 UNSHOWN: Final = "the motors were stopped, and it is still armed: it can fly again once it reports that it is disarmed"
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The most that is asked for."""
+    """Limits of the set-points."""
 
     tilt: float = 0.35  #: [rad]
     climb: float = 1.0  #: [m/s]
     yaw_rate: float = 1.75  #: [rad/s]
-    throttle: float = 0.85  #: share of the full one
+    throttle: float = 0.85  #: share of full throttle
 
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Of the climb loop."""
+    """Gains of the climb loop."""
 
     climb_p: float = 2.5  #: acceleration per climb error [1/s]
-    climb_i: float = 1.2  #: how fast the throttle that carries it is learnt [1/s²]
+    climb_i: float = 1.2  #: learning rate of the hover throttle [1/s²]
 
 
 class Phase(Enum):
-    """How far a flight is."""
+    """Progress of a flight."""
 
-    STANDING = auto()  #: or being flown by a pilot
+    STANDING = auto()  #: or flown by a pilot
     ARMING = auto()
-    SPOOLING = auto()  #: armed, and the throttle rises
+    SPOOLING = auto()  #: armed, with rising throttle
     FLYING = auto()
 
 
 @dataclass(slots=True)
 class Report:
-    """What the flight controller said last."""
+    """The flight controller's latest report."""
 
-    armed: bool | None = None  #: None: not known
+    armed: bool | None = None  #: None: unknown
     hindrances: list[str] = field(default_factory=list)
     overridden: bool = False  #: whether the pilot's switch lets our sticks through
 
@@ -115,37 +115,37 @@ class SetpointController:
         self.limits = Limits()
         self.gains = Gains()
         self.given_aux: dict[int, int] = {}
-        self.full_tilt_rad: float | None = None  #: what a full stick leans, where a person says it
-        self.hover: float | None = None  #: the throttle that carries it, 0 to 1; None: not learnt yet
+        self.full_tilt_rad: float | None = None  #: lean of a full stick, if a person set it
+        self.hover: float | None = None  #: hover throttle, 0 to 1; None: not learnt yet
         self.report = Report()
         self.phase = Phase.STANDING
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
-        self._cut = False  # its motors were stopped, and it has not shown that: nobody knows whether it flies
+        self._cut = False  # its motors were stopped but it has not confirmed that: it may still fly
         self._override = override
         self._setup = Setup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
         self._turn: Curve = self._setup.yaw_curve()
-        self._hindrance = "its settings were not read yet"  # severe ones
+        self._hindrance = "its settings have not been read"  # severe ones
         self._wanted = LEVEL
         self._motion = Motion()
-        self._since_ns = 0  # of the phase
+        self._since_ns = 0  # start of the phase
         self._stepped_ns: int | None = None
-        self._switched = False  # the arm switch is on while it arms
+        self._switched = False  # the arm switch is on while arming
         self._named: tuple[list[str], int] | None = None
         self._refused: tuple[str, int] | None = None
         self._abort_ns: int | None = None
         self._still_ns: int | None = None
-        self._smooth_climb = self._smooth_wanted = 0.0  # measured and asked for, equally late
+        self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested, equally delayed
         self._smooth_height = 0.0
         self._blind_ns: int | None = None
         self._sink = 1.0
-        self._asked_ns: int | None = None  # when a take-off was asked for that has not begun
+        self._asked_ns: int | None = None  # when a pending take-off was requested
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
-        """Take over how the flight controller is set up, and why it must not be armed."""
+        """Set the flight controller's setup and why it must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
 
@@ -159,7 +159,7 @@ class SetpointController:
 
     @property
     def full_tilt(self) -> float:
-        """What a full stick leans [rad]."""
+        """The lean of a full stick [rad]."""
         return self.full_tilt_rad or self._setup.full_tilt_rad or math.radians(45.0)
 
     @property
@@ -167,7 +167,7 @@ class SetpointController:
         """The pilot, while the vehicle flies by the pilot's receiver."""
         return "RECEIVER" if self._override and self.report.armed and not self.report.overridden else ""
 
-    # What is decided -----------------------------------------------------------------------------------------------
+    # Decisions -----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
         """Accept an action.
@@ -177,10 +177,11 @@ class SetpointController:
             now_ns: The present time.
 
         Returns:
-            What is applied, after the limits.
+            The action in force, after the limits.
 
         Raises:
-            DriverError: It stands and can't be armed for this climb, or a reset while the motors still run.
+            DriverError: It is on the ground and can't be armed for this climb, or a reset came while the motors still
+                run.
         """
         if isinstance(action, EmergencyStop):
             self.stop.press(now_ns)
@@ -211,13 +212,13 @@ class SetpointController:
             yaw_rate=clamped(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
-            self._enter(Phase.STANDING, now_ns)  # nobody wants it any more: it must not arm when it can
+            self._enter(Phase.STANDING, now_ns)  # no longer wanted: it must not arm once it can
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
-            self._start(now_ns)  # only after a take-off was asked for: what stands climbs by no other set-point
+            self._start(now_ns)  # only a requested take-off lifts a vehicle off the ground, no other set-point
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing is known to prevent it, or it is at it already."""
+        """Return why it can't take off now; empty if nothing known prevents it, or it is taking off already."""
         if self.phase is not Phase.STANDING:
             return ""
         if self.stop.active:
@@ -230,18 +231,18 @@ class SetpointController:
             return f"it must not be armed: {self._hindrance}"
         if self._motion.climb_m_s is None:
             return (
-                "its climb is not measured, so its throttle can't be controlled: send it poses (motion capture), or "
-                "let it have a barometer"
+                "its climb is not measured, so its throttle can't be controlled: send it poses (motion capture) or "
+                "fit a barometer"
             )
         if self._refused is not None and now_ns - self._refused[1] < REFUSED_NS:
             return self._refused[0]
         if self._override and not (self.report.armed and self.report.overridden):
-            return "arm it and switch MSP override on by the pilot's receiver: then it can take off"
+            return "arm it and switch on MSP override at the pilot's receiver to let it take off"
         names = [name for name in self.report.hindrances if name not in PASSING]
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start it, unless that is sure to fail; return why it would."""
+        """Let the next climb start it, unless that is certain to fail; return why it would."""
         why = self.why_not(now_ns)
         self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
         return why
@@ -249,7 +250,7 @@ class SetpointController:
     def _start(self, now_ns: int) -> None:
         why = self.why_not(now_ns)
         if not why and (self._asked_ns is None or now_ns - self._asked_ns > ASKED_NS):
-            why = "it stands on the ground: take off first"
+            why = "it is on the ground: take off first"
         if why:
             self._wanted = LEVEL
             raise DriverError(why)
@@ -267,15 +268,15 @@ class SetpointController:
         elif phase is not Phase.FLYING:
             self.throttle = 0.0
 
-    # What is received ----------------------------------------------------------------------------------------------
+    # Reports -------------------------------------------------------------------------------------------------------
 
     def on_report(self, report: Report, now_ns: int) -> None:
-        """Handle what the flight controller reports of itself."""
+        """Handle the flight controller's report of its state."""
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         self._cut = self._cut and report.armed is not False
         if self.phase is Phase.ARMING:
-            self._look_at_arming(now_ns)
+            self._check_arming(now_ns)
         elif self.phase in (Phase.SPOOLING, Phase.FLYING) and report.armed is False:
             flew = self.phase is Phase.FLYING
             self._enter(Phase.STANDING, now_ns)
@@ -284,33 +285,33 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                if heard:  # whoever did it: a take-off that goes on must not arm it again; after a loss none goes on
+                if heard:  # a take-off in progress must not arm it again; a loss ended any
                     self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
             self._enter(Phase.STANDING, now_ns)
-            self._events.append(message("the pilot took the sticks", "override", Severity.WARNING, active=False))
+            self._events.append(message("the pilot took over the sticks", "override", Severity.WARNING, active=False))
         elif self._override and report.overridden and not before.overridden:
-            self._events.append(message("the pilot gave the sticks away", "override", active=True))
+            self._events.append(message("the pilot handed over the sticks", "override", active=True))
             if report.armed and self.throttle > IDLE and not self.stop.active:
                 self._wanted = LEVEL
                 self._enter(Phase.FLYING, now_ns)
 
     def adopt(self, throttle: float, now_ns: int) -> None:
-        """Go on with a vehicle that was found armed, from the throttle that it was sent last, 0 to 1."""
+        """Continue a vehicle that was found armed, from the last throttle sent, 0 to 1."""
         if throttle > IDLE and not self.stop.active:
             self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
             self._enter(Phase.FLYING, now_ns)
 
     def on_pilot_throttle(self, throttle: float) -> None:
-        """Learn from what a pilot flies, so that nothing jumps when the sticks are given away."""
+        """Learn from the pilot's flight, so that nothing jumps when the pilot hands over the sticks."""
         self.throttle = throttle
         climb = self._motion.climb_m_s
         if throttle > IDLE and climb is not None and abs(climb) < 0.3:
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
 
     def on_motion(self, motion: Motion) -> None:
-        """Take in how it moves."""
+        """Handle a new motion estimate."""
         self._motion = motion
 
     def lost(self) -> None:
@@ -321,7 +322,7 @@ class SetpointController:
         if self.phase is Phase.ARMING:
             self.phase = Phase.STANDING
 
-    def _look_at_arming(self, now_ns: int) -> None:
+    def _check_arming(self, now_ns: int) -> None:
         report = self.report
         if report.armed:
             self._enter(Phase.SPOOLING, now_ns)
@@ -347,7 +348,7 @@ class SetpointController:
         self._enter(Phase.STANDING, now_ns)
         self._events.append(message(text, "arming_refused", Severity.WARNING, flags=", ".join(names)))
 
-    # What is sent --------------------------------------------------------------------------------------------------
+    # Sticks --------------------------------------------------------------------------------------------------------
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
@@ -355,7 +356,7 @@ class SetpointController:
         return events
 
     def step_stop(self, now_ns: int) -> bool:
-        """Go on with an emergency stop; return whether its sticks are due, whatever the pace of others."""
+        """Continue an emergency stop; return whether its sticks are due, whatever the pace of others."""
         return self.stop.step(self._motors_are_off(), now_ns)
 
     def _motors_are_off(self) -> bool | None:
@@ -364,10 +365,10 @@ class SetpointController:
             return None
         if not (self._override and report.armed):
             return not report.armed
-        return True if report.overridden else None  # only the pilot disarms: without throttle, or not by our sticks
+        return True if report.overridden else None  # only the pilot disarms: our sticks just cut the throttle
 
     def channels(self, now_ns: int) -> list[int]:
-        """Return the receiver's channels [µs] now, in the order of the flight controller. Called at a steady rate."""
+        """Return the receiver's channels [µs], in the flight controller's order. Call at a steady rate."""
         step_s = 0.0 if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self.phase is Phase.SPOOLING:
@@ -384,8 +385,8 @@ class SetpointController:
         centred = (round(1500 + 500 * stick) for stick in (roll, pitch, yaw))
         for place, width in zip(self._setup.sticks, (*centred, throttle), strict=True):
             sticks[place] = width
-        if self.stop.active and not self._setup.sticks_told:
-            sticks = [OFF_US] * len(sticks)  # wherever the throttle is, it is off
+        if self.stop.active and not self._setup.sticks_known:
+            sticks = [OFF_US] * len(sticks)  # throttle off, whichever channel it is
         given: Mapping[int, int] = self.given_aux
         return [*sticks, *self._setup.aux_us(arm=on, given=given)]
 
@@ -402,12 +403,12 @@ class SetpointController:
             return
         motion = self._motion
         if motion.climb_m_s is None or not self.receiving:
-            lacking = "nothing is received from it" if motion.precise else "its climb is no longer measured"
+            lacking = "it sends no data" if motion.precise else "its climb is no longer measured"
             self._give_up(lacking, now_ns)
             return
         if self._lifted(motion.climb_m_s, motion.height_m or 0.0, step_s):
             carried = max(SPOOL_FROM * self.throttle, self.throttle - SPOOL_PER_S * LATE_S[motion.precise])
-            if self.hover is not None:  # of an earlier flight
+            if self.hover is not None:  # from an earlier flight
                 carried = max((1 - OTHER) * carried, min((1 + OTHER) * carried, self.hover))
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, carried))
             self._enter(Phase.FLYING, now_ns)
@@ -417,7 +418,7 @@ class SetpointController:
             self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
 
     def _lifted(self, climb: float, height: float, step_s: float) -> bool:
-        """Return whether it has left the ground: by poses once noise can't be what shows it."""
+        """Return whether it has left the ground. Smooth precise motion first: noise must not pass for a lift-off."""
         if self._motion.precise:
             self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
             self._smooth_height = height = _smoothed(self._smooth_height, height, step_s)
@@ -438,7 +439,7 @@ class SetpointController:
             return
         if self._blind_ns is not None:
             self._blind_ns = None
-            self._events.append(message("no longer: its climb is not measured", "blind", active=False))
+            self._events.append(message("its climb is measured again", "blind", active=False))
         error = self._wanted.climb - climb
         lift = clamped(self.gains.climb_p * error, LIFT_M_S2)
         stands = self._stands(climb, step_s, now_ns)
@@ -453,7 +454,7 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
 
     def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
-        """Return whether a descent meets the ground; takes the throttle away while it seems to."""
+        """Return whether a descent has met the ground; reduce the throttle while it seems so."""
         still = STILL[self._motion.precise]
         self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
         self._smooth_wanted = _smoothed(self._smooth_wanted, self._wanted.climb, step_s)

@@ -1,7 +1,7 @@
-"""What a flight controller is asked, what it reports, in SI units and our axes, and how it moves. Pure.
+"""Requests to the flight controller, its state in SI units and our axes, and its motion. Pure.
 
-First it is asked who it is, then for its state, as fast as it answers. MSP has no velocity of its own but the
-barometer's climb, so poses from outside are differentiated.
+It is first asked to identify itself, then for its state as fast as it answers. MSP reports no velocity except the
+barometer's climb, so external poses are differentiated.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from skyloop.vehicles.msp.wire.messages import (
     multiple,
 )
 
-PATIENCE_NS: Final = nanoseconds(0.5)  #: an answer that has not come by then is lost
-TRIES: Final = 3
+PATIENCE_NS: Final = nanoseconds(0.5)  #: an answer that has not arrived by then is lost
+TRIES: Final = 3  #: per question
 
-#: Takes the answer's payload; None: it does not know the function, or did not answer.
+#: Receives the answer's payload; None: the function is unknown, or there was no answer.
 Handler = Callable[[bytes | None], None]
 
 
 @dataclass(slots=True)
 class Asked:
-    """A request whose answer is waited for."""
+    """A pending request."""
 
     function: int
     sent_ns: int
 
 
 class Questions:
-    """Asks one thing after the other, each until it is answered, at most :data:`TRIES` times."""
+    """Asks one question at a time, each until it is answered, up to :data:`TRIES` times."""
 
     def __init__(self) -> None:
         self._queue: deque[tuple[Frame, Handler]] = deque()
@@ -54,15 +54,15 @@ class Questions:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is left to ask."""
+        """Whether no question is left."""
         return not self._queue
 
     def ask(self, function: int, handler: Handler, payload: bytes = b"") -> None:
-        """Ask something after what waits already."""
+        """Append a question."""
         self._queue.append((Frame(function, payload), handler))
 
     def clear(self) -> None:
-        """Give up everything, without a word to the handlers."""
+        """Drop all questions without calling their handlers."""
         self._queue.clear()
         self._sent_ns = None
 
@@ -78,7 +78,7 @@ class Questions:
         return self._queue[0][0]
 
     def on_frame(self, frame: Frame) -> bool:
-        """Handle a frame; returns whether it is the answer that is waited for."""
+        """Handle a frame; return whether it is the expected answer."""
         if not self._queue or self._sent_ns is None or frame.function != self._queue[0][0].function:
             return False
         self._answer(None if frame.direction is Direction.ERROR else frame.payload)
@@ -92,7 +92,7 @@ class Questions:
 
 @dataclass(slots=True)
 class Stream:
-    """States that are asked for again and again, in one frame."""
+    """States requested repeatedly, in one frame."""
 
     functions: tuple[int, ...]
     period_ns: int
@@ -107,16 +107,16 @@ class Stream:
 
 
 class Telemetry:
-    """Asks for states at their rates, few at a time.
+    """Requests states at their rates, few at a time.
 
-    A flight controller answers some tens of requests a second, whatever the line could carry: more would wait in its
-    buffers, and so would the sticks behind them. The answer to ``MULTIPLE`` does not say what it holds, so there is one
-    bundle only: an answer that was lost makes no other one be mistaken.
+    A flight controller answers some tens of requests a second, however fast the line. More would wait in its buffers,
+    and so would the sticks behind them. An answer to ``MULTIPLE`` does not say what it holds, so there is only one
+    bundle: after a lost answer, the next can't be mistaken for it.
 
     Args:
         streams: Rates in hertz, by function.
-        bundle: Functions that are asked for together, for firmware that knows ``MULTIPLE``; at the rate of the first.
-        most: Requests that may be without an answer.
+        bundle: Functions requested together from firmware that knows ``MULTIPLE``, at the rate of the first.
+        most: Requests that may be unanswered.
     """
 
     def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:
@@ -132,19 +132,19 @@ class Telemetry:
         self.unanswered = 0
 
     def drop(self, function: int) -> None:
-        """No longer ask for a state: the firmware does not know it."""
+        """Stop requesting a state that the firmware does not know."""
         self._streams = [stream for stream in self._streams if stream.functions != (function,)]
 
     def forget(self) -> None:
-        """Wait for no answer any more: they were lost with the connection."""
+        """Expect no pending answers: they were lost with the connection."""
         self._asked.clear()
 
     def due_ns(self) -> int | None:
-        """Return when something is to be asked for next; None: never."""
+        """Return when the next request is due; None: never."""
         return min((stream.due_ns for stream in self._streams), default=None)
 
     def requests(self, now_ns: int) -> list[Frame]:
-        """Return what is to be sent now: what waits longest first."""
+        """Return the requests to send now, longest overdue first."""
         while self._asked and now_ns - self._asked[0].sent_ns >= PATIENCE_NS:
             self._asked.popleft()
             self.unanswered += 1
@@ -159,7 +159,7 @@ class Telemetry:
         return made
 
     def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
-        """Handle a frame; returns the states that it answers, None in the place of one that is not known."""
+        """Handle a frame; return the states that it answers, with None for an unknown one."""
         for number, asked in enumerate(self._asked):
             if frame.function != asked.function:
                 continue
@@ -174,13 +174,13 @@ class Telemetry:
 
 Vector = tuple[float, float, float]
 
-POSE_NS: Final = nanoseconds(0.25)  #: an older pose counts no more
-ALTITUDE_NS: Final = nanoseconds(0.5)
-GPS_NS: Final = nanoseconds(1.0)
-GAP_NS: Final = nanoseconds(0.4)  #: after a longer one the velocity begins anew
+POSE_NS: Final = nanoseconds(0.25)  #: an older pose no longer counts
+ALTITUDE_NS: Final = nanoseconds(0.5)  #: an older barometer altitude no longer counts
+GPS_NS: Final = nanoseconds(1.0)  #: an older fix no longer counts
+GAP_NS: Final = nanoseconds(0.4)  #: a longer gap restarts the velocity
 SMOOTH_S: Final = 0.05  #: time constant of the velocity from poses
-LEAST_SATELLITES: Final = 5
-GROUND_SAMPLES: Final = 10  #: the height of the ground is averaged over about so many
+LEAST_SATELLITES: Final = 5  #: fewer make no usable fix
+GROUND_SAMPLES: Final = 10  #: samples over which the ground's height is averaged, roughly
 EARTH_RADIUS_M: Final = 6_371_000.0
 
 
@@ -193,7 +193,7 @@ class VelocityFilter:
         self._at_ns: int | None = None
 
     def update(self, place: Vector, at_ns: int) -> None:
-        """Take in a position [m], measured at a time [ns]; one that is not newer is left out."""
+        """Add a position [m] measured at a time [ns]; ignore one that is not newer."""
         gap_ns = None if self._at_ns is None else at_ns - self._at_ns
         if gap_ns is not None and gap_ns <= 0:
             return
@@ -212,18 +212,18 @@ class VelocityFilter:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What is known now; None is not known. World axes east, north, up."""
+    """The present motion; None for unknown values. World axes east, north, up."""
 
     climb_m_s: float | None = None
-    height_m: float | None = None  #: above where it stood last
+    height_m: float | None = None  #: above its last place on the ground
     velocity_m_s: Vector | None = None  #: in world axes
     position_m: Vector | None = None
     yaw_rad: float | None = None
-    precise: bool = False  #: whether height and climb come from poses and not from a barometer
+    precise: bool = False  #: whether height and climb come from poses rather than a barometer
 
 
 class MotionEstimate:
-    """Keeps the newest of each source. Poses from outside go before GPS and barometer."""
+    """Keeps the newest value of each source. External poses take precedence over GPS and barometer."""
 
     def __init__(self) -> None:
         self._pose: ExternalPose | None = None
@@ -232,21 +232,21 @@ class MotionEstimate:
         self._gps: tuple[Gps, int] | None = None
         self._origin: Gps | None = None
         self._heading_rad: float | None = None  # as yaw, counter-clockwise from east
-        self._turned_rad: float | None = None  # what poses' yaw differs from it
-        self._ground: dict[str, float] = {}  # height of each source where the vehicle stood last
-        self._stood = 0  # samples of it
+        self._turned_rad: float | None = None  # difference of the poses' yaw from it
+        self._ground: dict[str, float] = {}  # height of each source at the last place on the ground
+        self._stood = 0  # samples of the ground's height
         self.satellites: int | None = None
 
     @property
     def origin(self) -> EarthOrigin | None:
-        """Where the world axes begin on the earth; None without GPS, or where poses define them."""
+        """The origin of the world axes on the earth; None without GPS, or where poses define the axes."""
         if self._origin is None or self._pose is not None:
             return None
         first = self._origin
         return EarthOrigin(first.latitude_deg, first.longitude_deg, first.altitude_m, EARTH_RADIUS_M)
 
     def on_pose(self, pose: ExternalPose) -> None:
-        """Take in a pose from outside."""
+        """Handle an external pose."""
         self._filter.update(pose.position_m, pose.captured_ns)
         if self._pose is None or pose.captured_ns > self._pose.captured_ns:
             self._pose = pose
@@ -254,15 +254,15 @@ class MotionEstimate:
                 self._turned_rad = wrap_angle(_yaw(pose) - self._heading_rad)
 
     def on_attitude(self, attitude: Attitude) -> None:
-        """Take in the flight controller's attitude."""
+        """Handle the flight controller's attitude."""
         self._heading_rad = wrap_angle(math.pi / 2 - math.radians(attitude.heading_deg))
 
     def on_altitude(self, altitude: Altitude, now_ns: int) -> None:
-        """Take in the flight controller's altitude."""
+        """Handle the flight controller's altitude."""
         self._altitude = altitude, now_ns
 
     def on_gps(self, gps: Gps, now_ns: int) -> None:
-        """Take in a fix of GPS, or that there is none."""
+        """Handle a GPS fix, or its absence."""
         self.satellites = gps.satellites
         if gps.fix and gps.satellites >= LEAST_SATELLITES:
             self._gps = gps, now_ns
@@ -270,11 +270,11 @@ class MotionEstimate:
                 self._origin = gps
 
     def lost(self) -> None:
-        """Forget what the flight controller reported: it is no longer received."""
+        """Forget the flight controller's reports: the link is lost."""
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the height of the ground while it stands: one sample may be wrong by more than shows a lift-off."""
+        """Learn the ground's height while at rest: a single sample may be wrong by more than a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])
@@ -286,7 +286,7 @@ class MotionEstimate:
         self._ground[source] = before_m + (height_m - before_m) / self._stood
 
     def at(self, now_ns: int) -> Motion:
-        """Return what is known now."""
+        """Return the present motion."""
         yaw = self._heading_rad
         if yaw is not None and self._turned_rad is not None:
             yaw = wrap_angle(yaw + self._turned_rad)
@@ -338,7 +338,7 @@ def _scaled(vector: Vector, by: float) -> Vector:
 
 @dataclass(slots=True)
 class Reported:
-    """The newest of each reply; None: it has not come."""
+    """The newest reply of each kind; None: not received."""
 
     attitude: Attitude | None = None
     altitude: Altitude | None = None
@@ -349,7 +349,7 @@ class Reported:
 
 
 def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
-    """Return the charge that is left, 0 to 1, where it is told, or by the voltage of a cell; None: not known."""
+    """Return the remaining charge, 0 to 1, as reported or by cell voltage; None: unknown."""
     if battery.left is not None:
         return battery.left
     if battery.cells <= 0 or battery.voltage_v <= 0 or cells.full_v <= cells.empty_v:
@@ -361,7 +361,7 @@ def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
 def feedback_of(
     reported: Reported, motion: Motion, flight: FlightState, captured_ns: int, native: dict[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state. What is not known is None."""
+    """Return the vehicle's state. Unknown values are None."""
     attitude, battery = reported.attitude, reported.battery
     velocity = None
     if motion.velocity_m_s is not None and motion.yaw_rad is not None:

@@ -1,1 +1,1 @@
-"""``replay://FLIGHT.mcap``: a vehicle that does again what was recorded."""
+"""``replay://FLIGHT.mcap``: a vehicle that replays a recording."""

@@ -1,4 +1,4 @@
-"""The driver of ``replay://FLIGHT.mcap``: life cycle, the thread that plays, and options (``docs/replay.md``)."""
+"""The driver for ``replay://FLIGHT.mcap``: life cycle, the playing thread, and options (``docs/replay.md``)."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from skyloop.vehicles.replay.player import PREFIX, Player, ReplayPublisher, Step
 from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
-_CLOSE_S: Final = 2.0
+_CLOSE_S: Final = 2.0  #: time for the thread to end
 
 
 class ReplayDriver(Driver):
-    """A vehicle that does what was recorded: it accepts every command and follows none.
+    """A vehicle that repeats a recording: it accepts every command and follows none.
 
-    With ``speed=max`` nothing plays by itself. Its consumer sets :attr:`clock` before :meth:`open`, and then moves the
+    With ``speed=max`` nothing plays automatically. The consumer sets :attr:`clock` before :meth:`open`, then moves the
     replay by :attr:`steps`.
     """
 
     shared = False
-    parameters_without_authority = NAMES  # they move the replay, and nothing that flies
+    parameters_without_authority = NAMES  # they move the replay, nothing that flies
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -56,7 +56,7 @@ class ReplayDriver(Driver):
         self._publisher: ReplayPublisher | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the recording's cameras; the file is read once. One that can't be read is refused by :meth:`open`."""
+        """Return the recording's cameras, reading the file once. :meth:`open` refuses an unreadable file."""
         if self._capabilities is None:
             try:
                 recording, drone = self._read()
@@ -66,7 +66,7 @@ class ReplayDriver(Driver):
         return self._capabilities
 
     def parameters(self) -> list[Parameter]:
-        """Return those that move the replay, and the recorded ones so far, read-only, prefixed with ``recorded.``."""
+        """Return the replay's own parameters and, read-only with the prefix ``recorded.``, the recorded ones so far."""
         playback, publisher = self._playback, self._publisher
         if playback is None or publisher is None:
             return []
@@ -74,7 +74,7 @@ class ReplayDriver(Driver):
         return [*recorded, *playback.parameters()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Move, hold or slow down the replay; see :class:`skyloop.vehicles.replay.playback.Playback`."""
+        """Move, pause or slow down the replay; see :class:`skyloop.vehicles.replay.playback.Playback`."""
         if self._playback is None or name.startswith(PREFIX):
             return super().set_parameter(name, value)
         return self._playback.set(name, value)
@@ -84,13 +84,13 @@ class ReplayDriver(Driver):
         return True
 
     def source(self) -> ReplaySource:
-        """Open the recording; raises for one that is not there, can't be read, or ends before ``start``."""
+        """Open the recording; raise if it is missing, unreadable, or ends before ``start``."""
         recording, drone = self._read()
         source = ReplaySource(recording, drone, self.options.start_s)
         if source.empty:
             raise UsageError(
                 f"{self.uri}: the recording lasts {recording.seconds:.1f} s"
-                + (f", and start is {self.options.start_s:g} s" if self.options.start_s else ": it is empty")
+                + (f", but start is {self.options.start_s:g} s" if self.options.start_s else ": it is empty")
             )
         return source
 
@@ -112,7 +112,7 @@ class ReplayDriver(Driver):
         if self.clock is None:
             raise UsageError(
                 f'{self.uri}: speed=max is in step with one application: call skyloop.connect("{self.uri}") there, '
-                "or give a number, such as speed=10, to serve everybody"
+                "or give a number, such as speed=10, to serve any client"
             )
         self._playback = Playback(source.seconds, in_step=True)
         self.steps = StepPlayer(source, sink, self.clock, self._playback)
@@ -129,15 +129,15 @@ class ReplayDriver(Driver):
         self._thread = None
 
     def _apply(self, action: AnyAction) -> AnyAction:
-        """Accept the action; it has no effect on what was recorded."""
+        """Accept the action, without effect on the replay."""
         return action
 
     def _run(self, player: Player, sink: Sink, cameras: tuple[str, ...]) -> None:
         try:
             player.run(cameras)
         except Exception as error:  # noqa: BLE001  a damaged file's surprise must not end in silence
-            _log.exception("%s can't be played on", self.uri)
-            why = str(error) if isinstance(error, SkyloopError) else "an error in Skyloop, which the proxy's output has"
+            _log.exception("%s can't be played further", self.uri)
+            why = str(error) if isinstance(error, SkyloopError) else "an error in Skyloop (see the proxy's output)"
             at_s = self._playback.position_s if self._playback is not None else 0.0
             text = f"this recording can't be played beyond {at_s:.1f} s: {why}"
             sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="replaying")
@@ -157,12 +157,12 @@ class ReplayOptions:
     """A parsed address."""
 
     path: Path
-    drone: str | None  #: its name in the recording; None: the first
-    start_s: float  #: where to begin, after the recording's own begin
-    speed: float  #: seconds of the recording in a second
+    drone: str | None  #: name in the recording; None: the first drone
+    start_s: float  #: start, after the recording's own
+    speed: float  #: recorded seconds per second
     stepped: bool  #: ``speed=max``: in step with one application, see :mod:`skyloop.stepping.replay`
     loop: bool  #: start over at the end
-    wait: bool  #: begin when somebody wants a camera's frames
+    wait: bool  #: start once a client wants a camera's frames
 
 
 def options_of(uri: VehicleUri) -> ReplayOptions:
@@ -181,5 +181,5 @@ def options_of(uri: VehicleUri) -> ReplayOptions:
         wait=uri.flag("wait"),
     )
     if stepped and (options.loop or options.wait):
-        raise UsageError(f"{uri}: speed=max goes neither with loop nor with wait: it is through when it is through")
+        raise UsageError(f"{uri}: speed=max can't be combined with loop or wait")
     return options

@@ -1,4 +1,4 @@
-"""Where a replay is and how fast it goes: set through parameters by whoever watches it, followed by its player."""
+"""A replay's position, speed and pause: set by its viewers through parameters, followed by its player."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from skyloop.messages import Parameter, ParameterType, Refusal, Value
 POSITION: Final = "replay.position_s"
 SPEED: Final = "replay.speed"
 PAUSED: Final = "replay.paused"
-SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in seconds of the recording in a second
+SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in recorded seconds per second
 NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
 
 _IN_STEP: Final = (
     "with speed=max the replay is in step with its application, which must not miss anything: give a number, such as "
-    "speed=1, for one that can be paused, moved and slowed down"
+    "speed=1, to pause it, move it or slow it down"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the player is to follow next."""
+    """What the player should do next."""
 
     paused: bool
     speed: float
-    position_s: float | None = None  #: where to go; None: on from where it is
+    position_s: float | None = None  #: where to seek; None: continue from the present position
 
 
 class Playback:
     """Position, speed and pause of a replay. Thread-safe.
 
     Args:
-        duration_s: How long the recording is.
-        speed: Seconds of the recording in a second.
+        duration_s: Length of the recording.
+        speed: Recorded seconds per second.
         in_step: Whether its application moves it (``speed=max``): then nothing can be written.
     """
 
@@ -43,7 +43,7 @@ class Playback:
         self.duration_s = duration_s
         self.position_s = 0.0  #: in the recording; set by the player
         self.over = False  #: it has reached the end; set by the player
-        self.jumps = 0  #: how often the position was changed other than by playing; set by the player
+        self.jumps = 0  #: number of position changes other than by playing; set by the player
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -53,23 +53,23 @@ class Playback:
 
     @property
     def paused(self) -> bool:
-        """Whether it is to stand still."""
+        """Whether it should pause."""
         return self._wanted.paused
 
     @property
     def speed(self) -> float:
-        """Seconds of the recording in a second."""
+        """Recorded seconds per second."""
         return self._wanted.speed
 
-    # Those who watch -------------------------------------------------------------------------------------------
+    # Viewers ---------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters with their present values."""
+        """Return the parameters with their current values."""
         with self._lock:
             wanted = self._wanted
         position_s = self.position_s if wanted.position_s is None else wanted.position_s
         return [
-            Parameter(PAUSED, ParameterType.BOOL, wanted.paused, default=False, description="holds the replay"),
+            Parameter(PAUSED, ParameterType.BOOL, wanted.paused, default=False, description="pauses the replay"),
             Parameter(
                 POSITION,
                 ParameterType.FLOAT,
@@ -77,7 +77,7 @@ class Playback:
                 "s",
                 0.0,
                 self.duration_s,
-                description="position in the recording; written, the replay goes there",
+                description="position in the recording; write it to seek",
                 momentary=True,
             ),
             Parameter(
@@ -87,14 +87,14 @@ class Playback:
                 "",
                 *SPEEDS,
                 self._default_speed,
-                description="seconds of the recording in a second",
+                description="recorded seconds per second",
             ),
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter, which the player follows at once; return what is in force.
+        """Write a parameter, which the player follows at once; return the value in force.
 
-        To go on from the end is to start over.
+        Resuming at the end starts over.
         """
         if name not in NAMES:
             raise UnknownNameError("parameter of a replay", name, NAMES)
@@ -124,18 +124,18 @@ class Playback:
 
     @property
     def changed(self) -> bool:
-        """Whether something was written since :meth:`take`, or the player is to end."""
+        """Whether something was written since :meth:`take`, or the player should end."""
         return self._changed.is_set()
 
     def wait(self, timeout_s: float | None) -> None:
-        """Wait for that long [s], or until something is written."""
+        """Wait for this long [s], or until something is written."""
         self._changed.wait(timeout_s)
 
     def take(self) -> Wanted:
-        """Return what is wanted now; a position is given once."""
+        """Return what the player should do now; a position is returned once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
-            if wanted.position_s is not None:  # who wrote it reads it, also before its moment is shown
+            if wanted.position_s is not None:  # the writer reads it back even before its moment is shown
                 self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()

@@ -1,1 +1,1 @@
-"""``video://PATH``: a vehicle whose camera is a recorded file or a video device."""
+"""``video://PATH``: a vehicle whose camera is a video file or a video device."""

@@ -1,4 +1,4 @@
-"""The driver of ``video://``: life cycle, the thread that plays a recording or reports about a camera, and options.
+"""The driver for ``video://``: life cycle, the thread that plays a file or reports on a camera, and options.
 
 ``docs/drivers.md`` has the options as a table.
 """
@@ -43,7 +43,7 @@ _CLOSE_S = 2.0
 
 
 class VideoDriver(Driver):
-    """A vehicle that can't fly, whose one camera shows a recorded file, a device of this machine or a stream."""
+    """A vehicle that can't fly, whose one camera shows a video file, a local device or a stream."""
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -55,12 +55,12 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. The head of a file is read once, for the size of its images; a camera is not touched."""
+        """Return the camera. A file's head is read once for the size of its images; a camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
             description=f"frames of {self.options.place}",
-            why_not=f"{self.uri} is a recording or a camera, not a vehicle: there is nothing to fly",
+            why_not=f"{self.uri} is a recording or a camera, not a vehicle that can fly",
         )
 
     def failsafe(self, action: Hover | Land) -> bool:  # noqa: ARG002
@@ -83,7 +83,7 @@ class VideoDriver(Driver):
                 absent=lambda: f"there is no such device; {described(cameras())}",
                 on_event=partial(self._publish_event, sink),
             )
-            sink.link(LinkState.CONNECTING, f"waiting for the video of {options.place}")
+            sink.link(LinkState.CONNECTING, f"waiting for video from {options.place}")
             self._live.start()
             run = partial(self._report_live, sink, self._live)
         self._thread = threading.Thread(target=run, name="skyloop-video", daemon=True)
@@ -97,7 +97,7 @@ class VideoDriver(Driver):
             self._thread.join(_CLOSE_S)
         self._thread = self._live = None
 
-    # A recording -----------------------------------------------------------------------------------------------------
+    # A file ----------------------------------------------------------------------------------------------------------
 
     def _run(self, sink: Sink, source: Source) -> None:
         options = self.options
@@ -107,7 +107,7 @@ class VideoDriver(Driver):
             player.run(source, wait=options.wait)
         except Exception as error:  # noqa: BLE001  a codec's surprise must not end in silence
             sink.event(EventKind.DRIVER_ERROR, f"{self.uri}: {error!r}", Severity.ERROR, where="playing")
-            sink.link(LinkState.LOST, f"playing failed: {error!r}")
+            sink.link(LinkState.LOST, f"playback failed: {error!r}")
 
     # A camera --------------------------------------------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ class VideoDriver(Driver):
         )
 
     def _publish_event(self, sink: Sink, event: VideoEvent, text: str) -> None:
-        """Publish an event of the camera, as the link's state where it is one. On either of its threads."""
+        """Publish a camera's event, as the link's state where it changes that. On either of its threads."""
         if event is VideoEvent.STREAMING:
             self._streams = True
             sink.link(LinkState.UP)
@@ -137,7 +137,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams: its counters, and nothing else, as nothing flies."""
+        """Publish feedback while the camera streams: only its counters, as nothing flies."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))
@@ -148,7 +148,7 @@ class VideoDriver(Driver):
             try:
                 source = open_file(options.path)
             except SkyloopError:
-                pass  # open() raises it; until then nothing better than the nominal size is known
+                pass  # open() raises it; until then only the nominal size is known
             else:
                 source.close()
                 self._info = self._describe(source)
@@ -171,7 +171,7 @@ class VideoDriver(Driver):
         )
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the intrinsics that the options give; None unless they have a focal length."""
+        """Return the intrinsics from the options; None without a focal length."""
         return intrinsics_of(self.uri, width, height)
 
 
@@ -183,14 +183,14 @@ _AUTO: Final = "auto"
 
 @dataclass(frozen=True, slots=True)
 class DeviceOptions:
-    """What is set on a camera of this machine; a field that was not given leaves it as it is."""
+    """Settings of a local camera; a field that is not given leaves it unchanged."""
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
     gain: int | str = ""  #: in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
-        """Set exposure and gain. Return what could not be set, in words."""
+        """Set exposure and gain. Return the failures, in words."""
         if self.exposure == "" and self.gain == "":
             return []
         try:
@@ -214,17 +214,17 @@ class DeviceOptions:
 class VideoOptions:
     """A parsed address."""
 
-    place: str  #: path or address, as it may be shown
+    place: str  #: path or address, safe to show
     path: Path  #: of a file
     source: CameraSource | None  #: of live video; None: a file
     camera: str  #: its name
     loop: bool  #: start over at the end
-    speed: float  #: of a recording: seconds of it in a second
-    wait: bool  #: a recording starts when somebody wants its frames
-    width: int  #: to ask of a device, and announced of a stream [px]
+    speed: float  #: of a file: recorded seconds per second
+    wait: bool  #: whether a file starts only when a client wants its frames
+    width: int  #: to request from a device, and to announce for a stream [px]
     height: int
     fps: float
-    stream: bool  #: whether H.264 is announced, to be handed on as it comes
+    stream: bool  #: whether to announce H.264 that is passed on unchanged
     device: DeviceOptions
 
 
@@ -268,9 +268,9 @@ def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
 
 
 def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
-    """Check that options fit what the address names; raises if they don't."""
+    """Check that the options fit the source; raise if they don't."""
     if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
-        raise UsageError(f"{uri}: a live camera has no loop and no speed")
+        raise UsageError(f"{uri}: loop and speed are for files, not live cameras")
     unfit = {
         "only a device or a stream has": _LIVE if source is None else (),
         "only a device has": _DEVICE if source is None or source.scheme else (),
@@ -281,7 +281,7 @@ def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
 
 
 def _streams(uri: VehicleUri, source: CameraSource | None) -> bool:
-    """Return whether a camera is likely to send H.264: one on the network, or a device that is asked for it."""
+    """Return whether a camera probably sends H.264: a network camera, or a device set to it."""
     return source is not None and (bool(source.scheme) or uri.options.get("format") == H264)
 
 

@@ -1,4 +1,4 @@
-"""Plays a recording, a file that PyAV opens or one of a PaVE stream, into a sink, by its own stamps."""
+"""Play a video file, any that PyAV opens or a PaVE stream, into a sink, by its own time stamps."""
 
 from __future__ import annotations
 
@@ -31,41 +31,41 @@ if TYPE_CHECKING:
 
 FFmpegError = av.error.FFmpegError
 
-CHUNK: Final = 1 << 16
-SNIFF: Final = 1 << 18  #: a PaVE stream that was torn open somewhere shows its next header well within this
-DEFAULT_FPS: Final = 30.0
-_TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can say that a picture is to be turned
+CHUNK: Final = 1 << 16  #: bytes per read
+SNIFF: Final = 1 << 18  #: a PaVE stream cut at any point shows a header within this many bytes
+DEFAULT_FPS: Final = 30.0  #: if the file does not say
+_TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedImage:
-    """A decoded image and its stamp on the stream's own clock [s]; not yet converted to BGR."""
+    """A decoded image and its stamp on the stream's own clock [s], not yet converted to BGR."""
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: Unit | None = None  #: what it was decoded from, if that is handed on as it came
-    number: int = 0  #: of what it was decoded from, in the stream
-    reason: str = ""  #: why what it was decoded from is not handed on, of a stream that is
-    turns: int = 0  #: quarter turns counter-clockwise that make it upright
+    coded: Unit | None = None  #: its encoded form, if that is passed on unchanged
+    number: int = 0  #: its number in the stream
+    reason: str = ""  #: why its encoded form is not passed on, in a stream that is
+    turns: int = 0  #: counter-clockwise quarter turns that make it upright
 
 
 class Source(Protocol):
-    """One pass over a recording."""
+    """One pass over a file."""
 
     width: int
     height: int
     fps: float
     damaged: int  #: pieces that could not be decoded so far
-    stream: str  #: codec in which pictures can be had as they come, ``h264``, or empty
+    stream: str  #: codec of images that can be passed on unchanged, ``h264``, or empty
 
     def images(self) -> Iterator[DecodedImage]:
-        """Yield the pictures in order, until the recording ends."""
+        """Yield the images in order until the file ends."""
 
     def close(self) -> None: ...
 
 
 def is_device(path: Path) -> bool:
-    """Return whether the path names a device, there or not, rather than a file."""
+    """Return whether the path names a device, even an absent one, rather than a file."""
     if path.is_relative_to("/dev"):
         return True
     try:
@@ -75,12 +75,12 @@ def is_device(path: Path) -> bool:
 
 
 def open_file(path: Path) -> Source:
-    """Open a recording, whatever its format."""
+    """Open a video file of any supported format."""
     try:
         with path.open("rb") as file:
             head = file.read(SNIFF)
     except OSError as error:
-        if "%" in path.name:  # a numbered sequence of pictures: PyAV understands the pattern
+        if "%" in path.name:  # a numbered image sequence: PyAV understands the pattern
             return ContainerSource(str(path))
         raise UsageError(f"video://{path}: {error.strerror}") from error
     if path.suffix == ".pave" or PaveParser().feed(head):
@@ -89,7 +89,7 @@ def open_file(path: Path) -> Source:
 
 
 class ContainerSource:
-    """A file, or files, that PyAV opens."""
+    """A file, or an image sequence, that PyAV opens."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -121,13 +121,13 @@ class ContainerSource:
     def images(self) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`."""
         stamp_s = -1.0 / self.fps
-        coded: dict[int | None, tuple[int, Unit | None]] = {}  # by the stamp: decoders hold pictures back
+        coded: dict[int | None, tuple[int, Unit | None]] = {}  # by stamp, because decoders delay images
         for number, packet in enumerate(self._packets()):
             if self.stream and packet.size:
                 coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
-            except (FFmpegError, ValueError):  # a damaged packet; the decoder goes on with the next one
+            except (FFmpegError, ValueError):  # a damaged packet: the decoder continues with the next
                 self.damaged += 1
                 continue
             for image in images:
@@ -143,7 +143,7 @@ class ContainerSource:
         try:
             yield from self._container.demux(self._stream)
         except (FFmpegError, OSError, ValueError):
-            self.damaged += 1  # a file that was cut off: what came so far was good
+            self.damaged += 1  # a truncated file: everything before the cut is good
 
     def close(self) -> None:
         """Close the file."""
@@ -155,10 +155,9 @@ class ContainerSource:
 
 
 def _quarter_turns(name: str) -> int:
-    """Return how often a file's pictures are turned counter-clockwise to be upright.
+    """Return the counter-clockwise quarter turns that make a file's images upright.
 
-    A phone held upright films as if it lay on its side, and says so in the container, by a matrix that comes with the
-    pictures.
+    A phone held upright films sideways, and stores a rotation matrix in the container, which arrives with the images.
     """
     with suppress(FFmpegError, OSError, ValueError), av.open(name) as container:
         for image in itertools.islice(container.decode(container.streams.video[0]), 1):
@@ -167,10 +166,10 @@ def _quarter_turns(name: str) -> int:
 
 
 class PaveSource:
-    """A file of the raw bytes of an AR.Drone 2's video port.
+    """A file with the raw bytes of an AR.Drone 2's video port.
 
-    Pictures before the first key frame (a stream torn open, or the drone's stale first frame) and after damage up to
-    the next key frame are left out: they would be smeared.
+    Images before the first key frame (a truncated stream, or the drone's stale first frame) and between damage and the
+    next key frame are dropped: they would be smeared.
     """
 
     def __init__(self, path: Path) -> None:
@@ -187,7 +186,7 @@ class PaveSource:
         self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
     def images(self) -> Iterator[DecodedImage]:
-        """See :meth:`Source.images`. Every picture is decoded: each needs the one before."""
+        """See :meth:`Source.images`. Every image is decoded, as each needs the previous one."""
         decoder = PaveDecoder()
         for frame in self._parser_frames():
             image = decoder.decode(frame)
@@ -208,16 +207,16 @@ class PaveSource:
         self._parser.end()
 
 
-FEEDBACK_NS: Final = 50_000_000
-POLL_S: Final = 0.02
-BEHIND_NS: Final = 250_000_000  #: further behind than this, a schedule restarts instead of rushing to catch up
-GAP_S: Final = 2.0  #: a longer step between two stamps, or one backwards, is a cut in the recording
+FEEDBACK_NS: Final = 50_000_000  #: between feedback samples
+POLL_S: Final = 0.02  #: between checks for a viewer
+BEHIND_NS: Final = 250_000_000  #: when further behind, restart the schedule instead of rushing to catch up
+GAP_S: Final = 2.0  #: a longer step between stamps, or a step back, is a cut in the recording
 
 
 class FilePacer:
-    """Maps a recording's own time stamps to the times at which its pictures are shown.
+    """Maps a file's own time stamps to the times at which its images are shown.
 
-    Times never go backwards. A stamp that jumps (a cut, a clock that was set) counts as one usual period.
+    Times never go backwards. A stamp that jumps (a cut, a reset clock) counts as one usual period.
     """
 
     def __init__(self, speed: float, period_s: float) -> None:
@@ -227,7 +226,7 @@ class FilePacer:
         self._due_ns = 0
 
     def due_ns(self, stamp_s: float, now_ns: int) -> int:
-        """Return when to show the image of this stamp; ``now_ns`` is when it was ready."""
+        """Return when to show this stamp's image, which was ready at ``now_ns``."""
         if self._stamp_s is None:
             self._due_ns = now_ns
         else:
@@ -242,7 +241,7 @@ class FilePacer:
 
 
 class CameraPublisher:
-    """Publishes images and feedback of one camera to a sink, and waits between them."""
+    """Publishes one camera's images and feedback to a sink, and waits between them."""
 
     def __init__(
         self, sink: Sink, camera: str, intrinsics: Callable[[int, int], Intrinsics | None], stop: threading.Event
@@ -261,16 +260,16 @@ class CameraPublisher:
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody wants the decoded images."""
+        """Whether any client wants decoded images."""
         return self.sink.wants(self._camera)
 
     @property
     def wanted_encoded(self) -> bool:
-        """Whether somebody wants the images as they were encoded."""
+        """Whether any client wants encoded images."""
         return self._relay.wanted
 
     def wait_until(self, due_ns: int) -> bool:
-        """Wait, and publish feedback meanwhile. Return False if the driver is being closed."""
+        """Wait while publishing feedback. Return False if the driver is closing."""
         while not self.stop.is_set():
             now_ns = monotonic_ns()
             self.publish_state(now_ns)
@@ -280,7 +279,7 @@ class CameraPublisher:
         return False
 
     def publish_state(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Publish feedback, if it is due: where the recording is, and nothing else, as nothing flies."""
+        """Publish feedback if it is due: only the position in the file, as nothing flies."""
         if now_ns < self._feedback_ns and not at_once:
             return
         self._feedback_ns = now_ns + FEEDBACK_NS
@@ -293,7 +292,7 @@ class CameraPublisher:
         self.sink.feedback(Feedback(captured_ns=now_ns, native=native))
 
     def show(self, image: DecodedImage, due_ns: int) -> bool:
-        """Convert an image now and publish it when it is due, as captured then. False: the driver is being closed."""
+        """Convert an image now and publish it when due, as captured then. Return False if the driver is closing."""
         pixels = _bgr(image) if self.wanted else None
         if not self.wait_until(due_ns):
             return False
@@ -315,7 +314,7 @@ class CameraPublisher:
 
 
 class FilePlayer:
-    """Plays a recording once, or with ``loop`` again and again."""
+    """Plays a file once, or repeatedly with ``loop``."""
 
     def __init__(
         self, publisher: CameraPublisher, open_source: Callable[[], Source], *, loop: bool, speed: float
@@ -326,7 +325,7 @@ class FilePlayer:
         self._speed = speed
 
     def run(self, source: Source, *, wait: bool) -> None:
-        """Play until the end, or until the driver is closed; with ``wait``, begin once somebody wants the images."""
+        """Play until the end, or until the driver closes; with ``wait``, start once a client wants the images."""
         publisher = self._publisher
         publisher.sink.link(LinkState.UP)
         while wait and not (publisher.wanted or publisher.wanted_encoded):
@@ -347,7 +346,7 @@ class FilePlayer:
                 return
 
     def _pass(self, source: Source) -> bool:
-        """Play once through. Return whether to play again."""
+        """Play through once. Return whether to play again."""
         publisher = self._publisher
         pacer = FilePacer(self._speed, 1.0 / source.fps)
         before = publisher.shown
@@ -359,11 +358,11 @@ class FilePlayer:
             return False
         if source.damaged:
             publisher.damaged += source.damaged
-            text = f"{source.damaged} pieces of the recording are damaged and were left out"
+            text = f"{source.damaged} pieces of the recording are damaged and were skipped"
             publisher.sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, damaged=source.damaged)
         publisher.publish_state(monotonic_ns(), at_once=True)
         if publisher.shown == before:
-            publisher.sink.link(LinkState.LOST, "no picture of the recording can be decoded")
+            publisher.sink.link(LinkState.LOST, "no image of the recording can be decoded")
             return False
         if not self._loop:
             publisher.sink.link(LinkState.CLOSED, f"end of the recording after {publisher.shown} frames")
@@ -371,5 +370,5 @@ class FilePlayer:
 
 
 def _bgr(image: DecodedImage) -> NDArray[np.uint8]:
-    """Shape (h, w, 3), C-contiguous."""
+    """Return an image as BGR, shape (h, w, 3), C-contiguous."""
     return np.ascontiguousarray(np.rot90(image.frame.to_ndarray(format="bgr24"), image.turns), dtype=np.uint8)

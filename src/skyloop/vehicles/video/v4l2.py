@@ -1,9 +1,8 @@
-"""The cameras of this machine, as Video4Linux lists them: what they offer, and their exposure and gain.
+"""Local cameras listed by Video4Linux: their formats, exposure and gain.
 
-It uses the kernel's own calls.
-
-Layouts and numbers are those of ``linux/videodev2.h`` (``Documentation/userspace-api/media/v4l``), which are the same
-on all architectures with integers of 32 bits. FFmpeg streams from the device meanwhile: settings need no stream.
+It calls the kernel directly. Layouts and numbers are those of ``linux/videodev2.h``
+(``Documentation/userspace-api/media/v4l``), the same on all architectures with 32-bit integers. FFmpeg may stream from
+the device at the same time: settings need no stream.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-#: Descriptor, request and buffer, which is changed; raises OSError.
+#: Takes a descriptor, a request and a buffer, which it changes; raises OSError.
 Ioctl = Callable[[int, int, bytearray], object]
 
 _READ, _WRITE = 2, 1  # _IOC_READ, _IOC_WRITE
 _CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE
 _DEVICE_CAPS: Final = 1 << 31
 _DISCRETE: Final = 1
-_MOST: Final = 256  # formats, sizes and rates of a device that answers for ever
+_MOST: Final = 256  # cap on formats, sizes and rates, for a device that never ends its list
 
 CAPABILITY: Final = struct.Struct("=16s32s32sIII12x")
 FORMAT: Final = struct.Struct("=III32sI16x")
@@ -35,7 +34,7 @@ CONTROL: Final = struct.Struct("=Ii")
 
 
 def _request(direction: int, number: int, layout: struct.Struct) -> int:
-    """The kernel's ``_IOC('V', …)``."""
+    """Return the kernel's ``_IOC('V', …)``."""
     return direction << 30 | layout.size << 16 | ord("V") << 8 | number
 
 
@@ -51,22 +50,22 @@ AUTO_GAIN: Final = 0x00980912
 GAIN: Final = 0x00980913
 AUTO_EXPOSURE: Final = 0x009A0901
 EXPOSURE: Final = 0x009A0902  #: in units of 100 µs
-_AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # of AUTO_EXPOSURE; UVC cameras have the last one for "auto"
+_AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # of AUTO_EXPOSURE; UVC cameras use the last one for "auto"
 _EXPOSURE_MS: Final = 0.1
 _DISABLED: Final = 1
 
-#: FFmpeg's names of formats, by ours and by the kernel's.
+#: FFmpeg's format names, by our names and the kernel's.
 FORMATS: Final = {"mjpeg": "mjpeg", "yuyv": "yuyv422", "h264": "h264", "nv12": "nv12", "grey": "gray"}
 _NAMES: Final = {"MJPG": "mjpeg", "JPEG": "mjpeg", "YUYV": "yuyv", "H264": "h264", "NV12": "nv12", "GREY": "grey"}
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSize:
-    """A size of pictures, or the range of sizes, with its rates."""
+    """An image size, or a range of sizes, with its rates."""
 
-    width: int  #: [px]; of a range the largest
+    width: int  #: [px]; the largest in a range
     height: int
-    fps: tuple[float, ...]  #: [1/s], the highest first; of a range its ends
+    fps: tuple[float, ...]  #: [1/s], highest first; of a range, its ends
     smallest: tuple[int, int] | None = None  #: of a range
 
     def __str__(self) -> str:
@@ -78,20 +77,20 @@ class FrameSize:
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
-    """How pictures come."""
+    """A format of images."""
 
-    code: str  #: the kernel's, such as ``MJPG``
+    code: str  #: the kernel's code, such as ``MJPG``
     description: str
     sizes: tuple[FrameSize, ...]
 
     @property
     def option(self) -> str:
-        """The value of ``format=`` that asks for it; empty if it can't be asked for."""
+        """The value of ``format=`` that selects it; empty if none does."""
         return _NAMES.get(self.code, "")
 
     def __str__(self) -> str:
         name = f"format={self.option}" if self.option else f"{self.code} ({self.description})"
-        return f"{name}: {'; '.join(map(str, self.sizes)) or 'sizes not known'}"
+        return f"{name}: {'; '.join(map(str, self.sizes)) or 'unknown sizes'}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,19 +112,19 @@ class V4l2Device:
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         """Store the arguments. No I/O."""
         if ioctl is None:
-            from fcntl import ioctl as kernels  # not there on Windows
+            from fcntl import ioctl as kernels  # missing on Windows
 
             ioctl = kernels
         self._descriptor = descriptor
         self._ioctl = ioctl
 
     def captures(self) -> bool:
-        """Return whether it gives pictures; raises OSError if it is no device of Video4Linux."""
+        """Return whether it captures images; raise OSError if it is not a Video4Linux device."""
         *_, everything, own = CAPABILITY.unpack(self._call(QUERYCAP, bytearray(CAPABILITY.size)))
         return bool((own if everything & _DEVICE_CAPS else everything) & _CAPTURE)
 
     def formats(self) -> list[PixelFormat]:
-        """Return the formats with their sizes and rates, as far as the device tells them."""
+        """Return the formats with their sizes and rates, as far as the device reports them."""
         found = []
         for index in range(_MOST):
             answer = self._try(ENUM_FMT, FORMAT, index, _CAPTURE, 0, b"", 0)
@@ -136,7 +135,7 @@ class V4l2Device:
         return found
 
     def control(self, number: int) -> Control | None:
-        """Return a setting; None if the device has none of the kind."""
+        """Return a setting; None if the device does not have it."""
         answer = self._try(QUERYCTRL, QUERY, number, 0, b"", 0, 0, 0, 0, 0)
         value = self._try(G_CTRL, CONTROL, number, 0)
         if answer is None or value is None:
@@ -147,7 +146,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure [ms]; None: the camera chooses. Return why it could not be set, in words."""
+        """Set the exposure [ms]; None: automatic. Return why that failed, in words."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -157,11 +156,11 @@ class V4l2Device:
         lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
         if not lowest <= exposure_ms <= highest:
             return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
-        self._set(AUTO_EXPOSURE, _MANUAL)  # one that has no automatic has no such control
+        self._set(AUTO_EXPOSURE, _MANUAL)  # a device without automatic exposure lacks this control
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:
-        """Set the gain, in the device's own unit; None: the camera chooses. Returns what :meth:`set_exposure` does."""
+        """Set the gain in the device's own unit; None: automatic. Return why that failed, in words."""
         if gain is None:
             problem = self._set(AUTO_GAIN, 1)
             return f"the camera has no automatic gain: {problem}" if problem else ""
@@ -174,7 +173,7 @@ class V4l2Device:
         return self._set(GAIN, gain)
 
     def settings(self) -> list[str]:
-        """Return exposure and gain in words: their ranges, and what they are now."""
+        """Return exposure and gain in words: range and present value."""
         found = []
         exposure, mode = self.control(EXPOSURE), self.control(AUTO_EXPOSURE)
         if exposure is not None:
@@ -221,7 +220,7 @@ class V4l2Device:
         return ""
 
     def _try(self, request: int, layout: struct.Struct, *numbers: object) -> tuple[int, ...] | None:
-        """Return the device's answer, None if it has none."""
+        """Return the device's answer, or None."""
         try:
             return layout.unpack(self._call(request, bytearray(layout.pack(*numbers))))
         except OSError:
@@ -252,7 +251,7 @@ def _text(field: object) -> str:
 
 def _reason(error: OSError) -> str:
     if error.errno in (errno.EINVAL, errno.ENOTTY):
-        return "the camera has no such setting, or not that value"
+        return "the camera does not support this setting or value"
     return error.strerror or str(error)
 
 
@@ -262,10 +261,10 @@ _DEVICES: Final = Path("/dev")
 
 @dataclass(frozen=True, slots=True)
 class CameraDevice:
-    """A camera of this machine."""
+    """A local camera."""
 
     path: Path  #: such as ``/dev/video0``
-    name: str  #: as its driver calls it
+    name: str  #: as reported by its driver
     allowed: bool  #: whether this user may open it
 
     def __str__(self) -> str:
@@ -274,9 +273,9 @@ class CameraDevice:
 
 
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
-    """Return the cameras of this machine, by number; none where the system has no Video4Linux.
+    """Return the local cameras, by number; none if the system has no Video4Linux.
 
-    A camera may have several nodes: only the first, which gives pictures, is listed.
+    Only a camera's first node, the one that captures images, is listed.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))
@@ -292,18 +291,18 @@ def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevic
 
 
 def described(found: list[CameraDevice]) -> str:
-    """Return which cameras there are, in words."""
+    """Return the list of cameras, in words."""
     if not found:
         return "no camera is connected to this machine"
     return f"cameras of this machine: {', '.join(map(str, found))}"
 
 
 def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
-    """Return what a camera offers, in lines for people: its address, then formats, sizes, rates, exposure and gain."""
+    """Return a camera's description, as lines for people: address, formats, sizes, rates, exposure and gain."""
     try:
         with opened(str(camera.path), ioctl) as device:
             told = [*map(str, device.formats()), *device.settings()]
-            lines = told if device.captures() else ["gives no pictures"]
+            lines = told if device.captures() else ["captures no images"]
     except OSError as error:
         lines = [f"can't be opened: {error.strerror or error}"]
     return [str(camera), *(f"  {line}" for line in lines)]

@@ -1,4 +1,4 @@
-"""An emulated autopilot without threads and sockets: a program's messages in, its messages out, time step by step."""
+"""An emulated autopilot without threads or sockets: messages in, messages out, time step by step."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HOME_M = 488.0
 
 
 class Wire:
-    """A link that keeps what was sent on it."""
+    """A link that records sent messages."""
 
     def __init__(self, streams: Streams) -> None:
         self.streams = streams
@@ -38,7 +38,7 @@ class Wire:
 
 
 class Rig:
-    """One autopilot, and a program with the usual ids of a ground station."""
+    """One autopilot, and a program with a ground station's default ids."""
 
     def __init__(self, kind: Kind, *, boot_s: float = 1.0, gps: bool = True) -> None:
         vehicle = with_ideal_sensors(VehicleParameters())
@@ -56,7 +56,7 @@ class Rig:
         self._beaten_s = -1.0
 
     def go_on(self, seconds: float, *set_points: Message, rate_hz: float = 20.0) -> None:
-        """Time passes, with a heartbeat a second, and with set-points if there are any."""
+        """Advance the time, with a heartbeat per second and any given set-points."""
         due_s = 0.0
         for _ in range(round(seconds / (TICK_STEPS * STEP_S))):
             self.simulation.step(TICK_STEPS)
@@ -73,7 +73,7 @@ class Rig:
                     self.say(each)
 
     def until(self, done: Callable[[], bool], within_s: float) -> float:
-        """Time passes until then, or fails. The greatest height meanwhile."""
+        """Advance the time until ``done``, or fail. Return the maximum height on the way."""
         highest, end_s = self.height, self.simulation.time_s + within_s
         while not done():
             assert self.simulation.time_s < end_s
@@ -86,7 +86,7 @@ class Rig:
         self.autopilot.on_message(self.wire, came, self._now_ns)
 
     def command(self, number: int, *arguments: float) -> int | None:
-        """The result; None without an acknowledgement."""
+        """Return the command's result; None without an acknowledgement."""
         self.wire.sent.clear()
         padded = (*arguments, *[0.0] * (7 - len(arguments)))
         self.say(m.MAVLink_command_long_message(1, 1, number, 0, *padded))
@@ -96,14 +96,14 @@ class Rig:
     def command_at(
         self, number: int, frame: int, first: tuple[float, ...], east: float, north: float, altitude: float
     ) -> int | None:
-        """The result of a command with a place, in COMMAND_INT."""
+        """Return the result of a command with a position in COMMAND_INT."""
         self.wire.sent.clear()
         latitude, longitude, _ = geodetic((east, north, 0.0))
         self.say(m.MAVLink_command_int_message(1, 1, frame, number, 0, 0, *first, latitude, longitude, altitude))
         return int(self.of("COMMAND_ACK")[0].result)
 
     def place_at(self, east: float, north: float, altitude: float, *, frame: int = 6) -> Message:
-        """A set-point that is a place on the Earth."""
+        """Return a set-point with a position on the Earth."""
         latitude, longitude, _ = geodetic((east, north, 0.0))
         return m.MAVLink_set_position_target_global_int_message(
             0, 1, 1, frame, 0xDF8, latitude, longitude, altitude, *[0.0] * 8
@@ -121,7 +121,7 @@ class Rig:
         )
 
     def up(self, height_m: float = 3.0) -> None:
-        """Ready, armed, taken off."""
+        """Get it ready, armed and flying."""
         self.go_on(1.5)
         if self.kind is Kind.ARDUCOPTER:
             assert (self.mode(4), self.arm()) == (0, 0)
@@ -152,7 +152,7 @@ class Rig:
         return self.simulation.truth(0).velocity_m_s
 
     def texts(self) -> list[str]:
-        """What it said since the last look."""
+        """Return its texts since the last call."""
         said = [text for each in self.of("STATUSTEXT") for _, text in self._texts.on_message(each)]
         self.wire.sent.clear()
         return said

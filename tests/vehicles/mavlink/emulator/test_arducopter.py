@@ -1,4 +1,4 @@
-"""The emulated ArduCopter does what was observed on the real one."""
+"""The emulated ArduCopter behaves as the real one was observed to."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def attitude(roll: float = 0.0, pitch: float = 0.0, thrust: float = 0.5, scale: 
     return m.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
 
 
-def test_a_fresh_link_gets_a_heartbeat_a_second_and_what_is_asked_for() -> None:
+def test_a_new_link_gets_heartbeats_and_requested_messages() -> None:
     it = rig()
     it.go_on(4.0)
     assert {each.get_type() for each in it.wire.sent} <= {"HEARTBEAT", "TIMESYNC", "STATUSTEXT"}
@@ -37,8 +37,8 @@ def test_a_fresh_link_gets_a_heartbeat_a_second_and_what_is_asked_for() -> None:
     assert 9 <= len(it.of("HEARTBEAT")) <= 11
 
 
-def test_a_crash_is_told_as_far_as_the_message_has_room() -> None:
-    """The autopilot fell silent for a moment when it hit the ground at more than 32 g."""
+def test_a_crash_report_is_cut_to_the_message_size() -> None:
+    """The autopilot fell silent when it hit the ground at more than 32 g."""
     it = rig()
     it.go_on(0.1)
     believed = replace(it.autopilot.report.believed, acceleration_m_s2=(-20.0, 0.0, 900.0))
@@ -48,7 +48,7 @@ def test_a_crash_is_told_as_far_as_the_message_has_room() -> None:
     assert (heard.xacc, heard.zacc) == (-2039, -32768)
 
 
-def test_accepted_is_not_flowing_before_it_knows_where_it_is() -> None:
+def test_accepted_messages_do_not_flow_before_a_position_is_known() -> None:
     it = Rig(Kind.ARDUCOPTER, boot_s=4.0)
     it.go_on(0.1)
     assert it.command(m.MAV_CMD_SET_MESSAGE_INTERVAL, m.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 100_000) == 0
@@ -58,7 +58,7 @@ def test_accepted_is_not_flowing_before_it_knows_where_it_is() -> None:
     assert it.of("LOCAL_POSITION_NED")
 
 
-def test_arming_is_refused_until_it_is_ready_and_in_modes_that_can_not_be_armed_in() -> None:
+def test_arming_is_refused_until_ready_and_in_unarmable_modes() -> None:
     it = rig()
     it.go_on(0.2)
     assert it.arm() == 4
@@ -69,11 +69,11 @@ def test_arming_is_refused_until_it_is_ready_and_in_modes_that_can_not_be_armed_
     assert it.texts() == ["Arm: BRAKE mode not armable"]
     assert it.mode(4) == 0
     assert it.arm() == 0
-    assert it.arm() == 0, "again"
-    assert it.of("HEARTBEAT") == [], "arming tells no heartbeat of its own"
+    assert it.arm() == 0, "arming again succeeds"
+    assert it.of("HEARTBEAT") == [], "arming sends no extra heartbeat"
 
 
-def test_modes_are_told_at_once_and_bad_ones_refused() -> None:
+def test_mode_changes_are_reported_at_once_and_bad_ones_refused() -> None:
     it = rig()
     it.go_on(1.5)
     it.wire.sent.clear()
@@ -85,7 +85,7 @@ def test_modes_are_told_at_once_and_bad_ones_refused() -> None:
     assert it.texts() == ["Mode change to AUTO failed: init failed"]
 
 
-def test_it_disarms_itself_ten_seconds_after_arming_and_two_after_landing() -> None:
+def test_it_disarms_ten_seconds_after_arming_and_two_after_landing() -> None:
     it = rig()
     it.go_on(1.5)
     assert (it.mode(4), it.arm()) == (0, 0)
@@ -101,7 +101,7 @@ def test_it_disarms_itself_ten_seconds_after_arming_and_two_after_landing() -> N
     assert it.autopilot.mode == "LAND"
 
 
-def test_take_off_needs_guided_and_armed_and_the_ground() -> None:
+def test_take_off_requires_guided_armed_and_on_the_ground() -> None:
     it = rig()
     it.go_on(1.5)
     assert it.command(m.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == 4
@@ -110,7 +110,7 @@ def test_take_off_needs_guided_and_armed_and_the_ground() -> None:
     assert it.command(m.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == 4
 
 
-def test_a_velocity_cancels_the_climb_and_a_place_mends_it() -> None:
+def test_a_velocity_cancels_the_climb_and_a_position_restarts_it() -> None:
     it = rig()
     it.go_on(1.5)
     assert (it.mode(4), it.arm()) == (0, 0)
@@ -134,7 +134,7 @@ def test_a_climb_rate_on_the_ground_does_nothing() -> None:
 
 
 @pytest.mark.parametrize("frame", [1, 7])
-def test_velocities_of_the_world(frame: int) -> None:
+def test_velocities_in_world_frames(frame: int) -> None:
     it = rig()
     it.up()
     it.go_on(3.0, it.velocity(1, 0.5, 0, frame=frame))
@@ -142,7 +142,7 @@ def test_velocities_of_the_world(frame: int) -> None:
 
 
 @pytest.mark.parametrize("frame", [8, 9])
-def test_velocities_of_the_body_turn_with_it(frame: int) -> None:
+def test_velocities_in_body_frames_turn_with_it(frame: int) -> None:
     it = rig()
     it.up()
     yaw = it.simulation.truth(0).yaw_rad
@@ -155,7 +155,7 @@ def test_velocities_of_the_body_turn_with_it(frame: int) -> None:
 
 
 @pytest.mark.parametrize("bad", ["frame", "nan"])
-def test_what_it_does_not_take_is_a_silent_stop(bad: str) -> None:
+def test_an_unsupported_set_point_is_a_silent_stop(bad: str) -> None:
     it = rig()
     it.up()
     it.go_on(2.0, it.velocity(1, 0, 0))
@@ -165,7 +165,7 @@ def test_what_it_does_not_take_is_a_silent_stop(bad: str) -> None:
     assert it.texts() == []
 
 
-def test_silence_brakes_after_three_seconds_without_a_word() -> None:
+def test_silence_brakes_after_three_seconds_without_a_text() -> None:
     it = rig()
     it.up()
     it.go_on(2.0, it.velocity(1, 0, 0))
@@ -177,7 +177,7 @@ def test_silence_brakes_after_three_seconds_without_a_word() -> None:
     assert "failsafe" not in " ".join(it.texts()).lower()
 
 
-def test_silence_after_an_attitude_levels_and_drifts_on() -> None:
+def test_silence_after_an_attitude_levels_and_drifts() -> None:
     it = rig()
     it.up()
     it.go_on(3.0, attitude(pitch=-0.2))
@@ -228,7 +228,7 @@ def test_loiter_without_sticks_dives_and_with_them_holds() -> None:
     assert math.hypot(*it.speed[:2]) == pytest.approx(1.8, abs=0.3)
 
 
-def test_disarming_in_flight_needs_force_and_then_it_falls() -> None:
+def test_disarming_in_flight_needs_force_and_makes_it_fall() -> None:
     it = rig()
     it.up(6.0)
     assert it.command(m.MAV_CMD_COMPONENT_ARM_DISARM, 0) == 4
@@ -240,7 +240,7 @@ def test_disarming_in_flight_needs_force_and_then_it_falls() -> None:
     assert it.height < 0.1
 
 
-def test_the_ground_stations_silence_brakes_where_that_is_set() -> None:
+def test_ground_station_silence_brakes_if_configured() -> None:
     it = rig()
     it.autopilot.parameters["FS_GCS_ENABLE"] = 7
     it.up()
@@ -256,7 +256,7 @@ def test_the_ground_stations_silence_brakes_where_that_is_set() -> None:
     assert it.autopilot.mode == "BRAKE"
 
 
-def test_by_default_and_for_other_systems_heartbeats_it_is_not() -> None:
+def test_by_default_and_for_other_systems_silence_has_no_effect() -> None:
     it = rig()
     it.up()
     it.heartbeats = False
@@ -268,10 +268,10 @@ def test_by_default_and_for_other_systems_heartbeats_it_is_not() -> None:
         it.say(m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), other)
         it.say(it.velocity(0.5, 0, 0), other)
         it.go_on(0.5)
-    assert it.autopilot.mode == "BRAKE", "only the one that MAV_GCS_SYSID names counts"
+    assert it.autopilot.mode == "BRAKE", "only the one in MAV_GCS_SYSID counts"
 
 
-def test_integers_are_cast_and_its_capabilities_say_so() -> None:
+def test_integers_are_cast_and_the_capabilities_say_so() -> None:
     it = rig()
     it.go_on(0.1)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
@@ -282,7 +282,7 @@ def test_integers_are_cast_and_its_capabilities_say_so() -> None:
     assert (value.param_value, value.param_type) == (3000.0, 4)
 
 
-def test_without_gps_it_is_ready_once_poses_come_from_outside() -> None:
+def test_without_gps_external_poses_make_it_ready() -> None:
     it = Rig(Kind.ARDUCOPTER, gps=False)
     it.go_on(3.0)
     assert it.mode(4) == 4
@@ -294,7 +294,7 @@ def test_without_gps_it_is_ready_once_poses_come_from_outside() -> None:
 
 
 @pytest.mark.parametrize(("frame", "altitude"), [(6, 4.0), (3, 4.0), (5, HOME_M + 4.0), (0, HOME_M + 4.0)])
-def test_a_place_on_the_earth_is_flown_to(frame: int, altitude: float) -> None:
+def test_it_flies_to_a_position_on_the_earth(frame: int, altitude: float) -> None:
     it = rig()
     it.up()
     it.say(it.place_at(3.0, -2.0, altitude, frame=frame))
@@ -302,7 +302,7 @@ def test_a_place_on_the_earth_is_flown_to(frame: int, altitude: float) -> None:
     assert (*it.place, it.height) == pytest.approx((3.0, -2.0, 4.0), abs=0.4)
 
 
-def test_a_place_of_an_unknown_frame_or_none_is_a_silent_stop() -> None:
+def test_a_position_in_an_unknown_frame_or_none_is_a_silent_stop() -> None:
     it = rig()
     it.up()
     it.go_on(2.0, it.velocity(1, 0, 0))
@@ -315,7 +315,7 @@ def test_a_place_of_an_unknown_frame_or_none_is_a_silent_stop() -> None:
 
 
 @pytest.mark.parametrize("frame", [7, 8])
-def test_a_place_of_other_frames_is_counted_from_where_it_is(frame: int) -> None:
+def test_a_position_in_other_frames_is_relative_to_the_vehicle(frame: int) -> None:
     it = rig()
     it.up()
     it.say(it.place_at(2.0, 2.0, 3.0))
@@ -327,7 +327,7 @@ def test_a_place_of_other_frames_is_counted_from_where_it_is(frame: int) -> None
     assert (*it.place, it.height) == pytest.approx(there, abs=0.4)
 
 
-def test_an_item_of_a_mission_that_is_marked_as_guided_is_flown_to() -> None:
+def test_it_flies_to_a_guided_mission_item() -> None:
     it = rig()
     it.go_on(1.5)
 
@@ -338,10 +338,10 @@ def test_an_item_of_a_mission_that_is_marked_as_guided_is_flown_to() -> None:
         it.say(m.MAVLink_mission_item_message(1, 1, 0, frame, command, current, 0, 0, 0, 0, 0, x, longitude / 1e7, z))
         return int(it.of("MISSION_ACK")[0].type)
 
-    assert go() == 1, "in STABILIZE"
+    assert go() == 1, "refused in STABILIZE"
     it.up()
     assert (go(command=22), go(z=math.nan), go(x=91.0), go(frame=10)) == (1, 12, 10, 3)
-    assert go(3, z=9.0) == 0, "of a new altitude nothing comes"
+    assert go(3, z=9.0) == 0, "a new altitude has no effect"
     it.go_on(0.5)
     assert math.hypot(*it.place) < 0.5
     assert go() == 0
@@ -349,20 +349,20 @@ def test_an_item_of_a_mission_that_is_marked_as_guided_is_flown_to() -> None:
     assert (*it.place, it.height) == pytest.approx((-2.0, 3.0, 4.0), abs=0.5)
 
 
-def test_reposition_needs_guided_or_leave_to_change_the_mode() -> None:
+def test_reposition_needs_guided_or_permission_to_change_the_mode() -> None:
     it = rig()
     it.up()
     reposition = m.MAV_CMD_DO_REPOSITION
     assert it.mode(17) == 0
     assert it.command_at(reposition, 6, (-1, 0, 0, 0), 3.0, 0.0, 3.0) == 2
-    assert it.command_at(reposition, 10, (-1, 1, 0, 0), 3.0, 0.0, 3.0) == 2, "a frame that it has not"
+    assert it.command_at(reposition, 10, (-1, 1, 0, 0), 3.0, 0.0, 3.0) == 2, "unsupported frame"
     assert it.command_at(reposition, 6, (-1, 1, 0, 0), 3.0, 0.0, 3.0) == 0
     assert it.autopilot.mode == "GUIDED"
     it.go_on(5.0)
     assert it.place == pytest.approx((3.0, 0.0), abs=0.4)
 
 
-def test_it_turns_by_command_and_the_long_way_round_if_told() -> None:
+def test_it_turns_by_command_the_long_way_if_requested() -> None:
     it = rig()
     it.up()
     heading = -math.degrees(it.simulation.truth(0).yaw_rad)
@@ -376,10 +376,10 @@ def test_it_turns_by_command_and_the_long_way_round_if_told() -> None:
         it.go_on(0.1)
         turned += wrap_angle(it.simulation.truth(0).yaw_rad - before)
         before = it.simulation.truth(0).yaw_rad
-    assert math.degrees(turned) == pytest.approx(-330, abs=8), "clockwise, though 30 degrees the other way are less"
+    assert math.degrees(turned) == pytest.approx(-330, abs=8), "clockwise, though 30 degrees the other way are shorter"
 
 
-def test_speeds_on_the_way_to_a_place_change_by_command_and_parameter() -> None:
+def test_speeds_to_a_position_change_by_command_and_parameter() -> None:
     it = rig()
     it.up()
     assert it.command(m.MAV_CMD_DO_CHANGE_SPEED, 1, 0.6, -1) == 0
@@ -400,7 +400,7 @@ def test_speeds_on_the_way_to_a_place_change_by_command_and_parameter() -> None:
     assert it.speed[0] == pytest.approx(0.8, abs=0.1)
 
 
-def test_guided_pauses_and_goes_on() -> None:
+def test_guided_pauses_and_resumes() -> None:
     it = rig()
     it.up()
     assert it.command(m.MAV_CMD_DO_PAUSE_CONTINUE, 2) == 2
@@ -417,7 +417,7 @@ def test_guided_pauses_and_goes_on() -> None:
     assert it.texts() == ["Failed to pause"]
 
 
-def test_it_comes_home_at_the_altitude_that_is_set_waits_and_lands() -> None:
+def test_it_returns_at_the_configured_altitude_waits_and_lands() -> None:
     it = rig()
     it.autopilot.parameters["RTL_ALT"] = 600
     it.up()
@@ -451,7 +451,7 @@ def test_near_home_it_climbs_less_unless_the_cone_is_off(
     assert it.height == pytest.approx(2.0, abs=0.3), "RTL_ALT_FINAL: it stays up"
 
 
-def test_a_return_altitude_above_the_ceiling_does_not_keep_it_there() -> None:
+def test_a_return_altitude_above_the_ceiling_does_not_stall_it() -> None:
     it = rig()
     it.up()
     it.say(it.place_at(4.0, 0.0, 3.0))

@@ -1,4 +1,4 @@
-"""Making, starting and stopping emulated autopilots; and what comes over their ports."""
+"""Creating, starting and stopping emulated autopilots, and the traffic on their ports."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def heard(sock: socket.socket, kind: str) -> Message:
 
 
 @KINDS
-def test_it_sends_to_its_remote_port_and_then_to_who_speaks(kind: Kind) -> None:
+def test_it_sends_to_its_remote_port_then_to_the_sender(kind: Kind) -> None:
     ports = Ports.free(kind)
     with listening(ports.remote) as first, MavlinkFirmware(host(), kind=kind, ports=ports) as firmware:
         assert heard(first, "HEARTBEAT").autopilot == firmware.autopilot.AUTOPILOT
@@ -57,7 +57,7 @@ def test_it_sends_to_its_remote_port_and_then_to_who_speaks(kind: Kind) -> None:
             assert heard(other, "HEARTBEAT").get_srcSystem() == 1
 
 
-def test_a_fleet_shares_a_world_and_a_thread_and_is_rarer_at_work() -> None:
+def test_a_fleet_shares_a_world_and_a_thread_at_a_lower_rate() -> None:
     options = with_multirotors(SimOptions(world="empty", seed=1, speed=3.0), rate_hz=20.0)
     assert options.rate_hz == 20.0
     world, loop = SimHost(options, 2), Loop("fleet")
@@ -71,7 +71,7 @@ def test_a_fleet_shares_a_world_and_a_thread_and_is_rarer_at_work() -> None:
         assert [heard(sock, "HEARTBEAT").get_srcSystem() for sock in socks] == [1, 2]
 
 
-def test_ports_that_are_taken_and_settings_that_can_not_be() -> None:
+def test_ports_in_use_and_invalid_settings_are_refused() -> None:
     with listening(0) as taken:
         ports = Ports(taken.getsockname()[1], 1)
         with pytest.raises(LinkError, match="MAVLink port"):
@@ -89,7 +89,7 @@ def test_ports_that_are_taken_and_settings_that_can_not_be() -> None:
         _ = firmware.tcp_address
 
 
-def test_rates_are_kept_and_given_back() -> None:
+def test_rates_are_kept_and_reported() -> None:
     streams = Streams({1: 10.0})
     assert [streams.due(at / 100) for at in (0, 5, 10, 11, 20)] == [[1], [], [1], [], [1]]
     streams.set_interval(1, -1)
@@ -110,10 +110,10 @@ NUMBERS = st.floats(width=32)
     st.sampled_from([16, 20, 21, 22, 176, 400, 510, 511, 512, 520, 192, 31000]),
     st.lists(NUMBERS, min_size=7, max_size=7),
 )
-@example(Kind.PX4, 510, [65536.0] + 6 * [0.0])  # a message whose number its answer has no room for
-@example(Kind.PX4, 511, [1.0, 1e30] + 5 * [0.0])  # an interval that another answer has no room for
+@example(Kind.PX4, 510, [65536.0] + 6 * [0.0])  # a message number too large for its answer
+@example(Kind.PX4, 511, [1.0, 1e30] + 5 * [0.0])  # an interval too large for its answer
 @example(Kind.PX4, 511, [1.0, math.nan] + 5 * [0.0])
-def test_commands_of_any_numbers_are_answered(kind: Kind, number: int, arguments: list[float]) -> None:
+def test_commands_with_any_numbers_are_answered(kind: Kind, number: int, arguments: list[float]) -> None:
     it = Rig(kind)
     it.go_on(0.1)
     assert it.command(number, *arguments) in range(6)
@@ -122,8 +122,8 @@ def test_commands_of_any_numbers_are_answered(kind: Kind, number: int, arguments
 
 @settings(max_examples=20, deadline=None)
 @given(st.sampled_from(list(Kind)), st.lists(NUMBERS, min_size=11, max_size=11), st.integers(0, 0xFFFF))
-@example(Kind.ARDUCOPTER, 10 * [0.0] + [math.inf], 1024)  # a yaw rate without end
-def test_set_points_of_any_numbers_harm_nothing(kind: Kind, numbers: list[float], mask: int) -> None:
+@example(Kind.ARDUCOPTER, 10 * [0.0] + [math.inf], 1024)  # an infinite yaw rate
+def test_set_points_with_any_numbers_do_no_harm(kind: Kind, numbers: list[float], mask: int) -> None:
     it = Rig(kind)
     it.up(1.0)
     if kind is Kind.PX4:
@@ -140,7 +140,7 @@ def test_drones_on_free_ports_share_none(kind: Kind, monkeypatch: pytest.MonkeyP
     bound: list[socket.socket] = []
 
     class Reused(socket.socket):
-        """Gets the lowest port again that no open socket has, as a busy system does sooner or later."""
+        """Gets the lowest port without an open socket, as a busy system sooner or later does."""
 
         def bind(self, address: object) -> None:
             taken = {sock.number for sock in bound if sock.fileno() >= 0}  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Both emulated autopilots: places on the Earth, home, and what they answer about what they don't have."""
+"""Both emulated autopilots: positions on the Earth, home, and answers about missing services."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def answered(it: Rig, message: Message, kind: str) -> Message:
     return answer
 
 
-def test_a_place_on_the_earth_and_back() -> None:
+def test_a_position_on_the_earth_and_back() -> None:
     latitude, longitude, altitude = geodetic((120.0, -45.0, 7.5))
     assert place_of(latitude / 1e7, longitude / 1e7, altitude / 1000 - HOME_M) == pytest.approx(
         (120, -45, 7.5), abs=0.02
@@ -41,14 +41,14 @@ def test_a_place_on_the_earth_and_back() -> None:
 
 
 @BOTH
-def test_an_estimator_that_knows_its_place_predicts_that_it_will_in_the_air(kind: Kind) -> None:
+def test_an_estimator_with_a_position_predicts_one_in_the_air(kind: Kind) -> None:
     name, number = "EKF_STATUS_REPORT", m.MAVLINK_MSG_ID_EKF_STATUS_REPORT
     if kind is Kind.PX4:
         name, number = "ESTIMATOR_STATUS", m.MAVLINK_MSG_ID_ESTIMATOR_STATUS
     it = Rig(kind, boot_s=1.0)
     it.go_on(0.8)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, number) == 0
-    assert not it.of(name)[0].flags & 0x318, "neither place nor prediction: whoever sees them may arm"
+    assert not it.of(name)[0].flags & 0x318, "neither position nor prediction: programs that see them may arm"
     assert it.arm() != 0
     it.go_on(0.4)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, number) == 0
@@ -56,7 +56,7 @@ def test_an_estimator_that_knows_its_place_predicts_that_it_will_in_the_air(kind
 
 
 @BOTH
-def test_home_is_told_to_who_asks_once_it_is_known(kind: Kind) -> None:
+def test_home_is_reported_on_request_once_known(kind: Kind) -> None:
     it = Rig(kind, boot_s=4.0)
     it.go_on(0.1)
     assert it.command(m.MAV_CMD_GET_HOME_POSITION) == (4 if kind is Kind.ARDUCOPTER else 2)
@@ -67,24 +67,24 @@ def test_home_is_told_to_who_asks_once_it_is_known(kind: Kind) -> None:
 
 
 @BOTH
-def test_home_is_where_somebody_puts_it_and_heights_are_above_it(kind: Kind) -> None:
+def test_home_can_be_set_and_heights_are_above_it(kind: Kind) -> None:
     it = ready(kind)
     frame = 0 if kind is Kind.ARDUCOPTER else 5
     assert it.command_at(m.MAV_CMD_DO_SET_HOME, frame, (0, 0, 0, 0), 5.0, -3.0, HOME_M - 2.0) == 0
     assert it.arm() in (0, 4)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_HOME_POSITION) == 0
     (home,) = it.of("HOME_POSITION")
-    assert (home.latitude, home.longitude, home.altitude) == geodetic((5.0, -3.0, -2.0)), "arming leaves it there"
+    assert (home.latitude, home.longitude, home.altitude) == geodetic((5.0, -3.0, -2.0)), "arming does not move it"
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT) == 0
     assert it.of("GLOBAL_POSITION_INT")[0].relative_alt == pytest.approx(2000, abs=100)
     nowhere = it.command(m.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, math.nan, math.nan, HOME_M)
     assert nowhere == (0 if kind is Kind.ARDUCOPTER else 2)
-    assert it.command(m.MAV_CMD_DO_SET_HOME, 1) == 0, "here"
+    assert it.command(m.MAV_CMD_DO_SET_HOME, 1) == 0, "set home here"
     assert it.autopilot.home == pytest.approx((0, 0, 0), abs=0.1)
 
 
-def test_an_arducopter_keeps_a_mission_whose_first_item_is_home() -> None:
-    """DroneKit's documented ``cmds.download(); cmds.wait_ready()`` waited for item 0 in vain."""
+def test_an_arducopter_stores_a_mission_whose_first_item_is_home() -> None:
+    """DroneKit's documented ``cmds.download(); cmds.wait_ready()`` waited for item 0 forever."""
     it = ready(Kind.ARDUCOPTER)
     assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 1
     home = answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM")
@@ -108,7 +108,7 @@ def test_an_arducopter_keeps_a_mission_whose_first_item_is_home() -> None:
     assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 3
     last = answered(it, m.MAVLink_mission_request_int_message(1, 1, 2), "MISSION_ITEM_INT")
     assert (last.x, last.z, last.param1, last.frame) == (470000002, 20.0, 2.0, 3)
-    assert answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM").x == -35.0, "home is home"
+    assert answered(it, m.MAVLink_mission_request_message(1, 1, 0), "MISSION_ITEM").x == -35.0, "home is unchanged"
     assert answered(it, m.MAVLink_mission_set_current_message(1, 1, 2), "MISSION_CURRENT").seq == 2
     assert answered(it, m.MAVLink_mission_request_message(1, 1, 3), "MISSION_ACK").type == 13
     assert answered(it, m.MAVLink_mission_count_message(1, 1, 10_000), "MISSION_ACK").type == 4, "no space"
@@ -117,14 +117,14 @@ def test_an_arducopter_keeps_a_mission_whose_first_item_is_home() -> None:
     fence = m.MAVLink_mission_count_message(1, 1, 4, mission_type=1)
     assert (answered(it, fence, "MISSION_ACK").type, it.of("MISSION_ACK")[0].mission_type) == (3, 1)
     item = m.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 5)
-    assert answered(it, item, "MISSION_ACK").type == 1, "nobody asked for it"
+    assert answered(it, item, "MISSION_ACK").type == 1, "the item was not requested"
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
     told = it.of("AUTOPILOT_VERSION")[0].capabilities
-    assert told & 0x25 == 0x25, "missions, also in whole numbers, and files"
+    assert told & 0x25 == 0x25, "missions, also as integers, and files"
     assert not told & (0x4000 | 0x8000), "fences, rally points"
 
 
-def test_an_arducopter_has_channels_a_banner_and_can_be_rebooted() -> None:
+def test_an_arducopter_has_channels_a_banner_and_can_reboot() -> None:
     it = ready(Kind.ARDUCOPTER)
     it.go_on(3.5)
 
@@ -138,9 +138,9 @@ def test_an_arducopter_has_channels_a_banner_and_can_be_rebooted() -> None:
     it.say(m.MAVLink_rc_channels_override_message(1, 1, 0xFFFF, 1010, 1200, *[0xFFFF] * 5))
     assert channels()[:4] == [1500, 1010, 1200, 1500]
     it.say(m.MAVLink_rc_channels_override_message(1, 1, 0xFFFF, 0, *[0xFFFF] * 6))
-    assert channels()[:4] == [1500, 1500, 1200, 1500], "0 gives one back"
+    assert channels()[:4] == [1500, 1500, 1200, 1500], "0 releases a channel"
     it.go_on(3.5)
-    assert channels()[2] == 1000, "it was silent since"
+    assert channels()[2] == 1000, "the override expired"
     it.texts()
     assert it.command(m.MAV_CMD_DO_SEND_BANNER) == 0
     assert it.texts()[0].startswith("ArduCopter V4.7.0-dev")
@@ -151,12 +151,12 @@ def test_an_arducopter_has_channels_a_banner_and_can_be_rebooted() -> None:
     assert it.command(m.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1) == 0
     it.go_on(0.5)
     assert it.autopilot.time_s < 0.6
-    assert not it.autopilot.ready, "it boots"
+    assert not it.autopilot.ready, "it is booting"
     it.go_on(1.5)
     assert (it.mode(4), it.arm()) == (0, 0)
 
 
-def test_a_px4_takes_no_mission_and_has_none() -> None:
+def test_a_px4_accepts_no_mission_and_has_none() -> None:
     kind = Kind.PX4
     it = ready(kind)
     assert answered(it, m.MAVLink_mission_request_list_message(1, 1), "MISSION_COUNT").count == 0
@@ -165,7 +165,7 @@ def test_a_px4_takes_no_mission_and_has_none() -> None:
     assert answered(it, m.MAVLink_mission_clear_all_message(1, 1), "MISSION_ACK").type == 0
     assert answered(it, m.MAVLink_mission_request_int_message(1, 1, 0), "MISSION_ACK").type == 1
     item = m.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, 0, 0, 0, 0, 0, 0, 5)
-    assert answered(it, item, "MISSION_ACK").type == 1, "nobody asked for it"
+    assert answered(it, item, "MISSION_ACK").type == 1, "the item was not requested"
     fence = m.MAVLink_mission_count_message(1, 1, 4, mission_type=1)
     assert (answered(it, fence, "MISSION_ACK").type, it.of("MISSION_ACK")[0].mission_type) == (3, 1)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 0
@@ -211,7 +211,7 @@ def test_the_root_is_an_empty_folder(kind: Kind) -> None:
 
 
 @BOTH
-def test_what_it_can_not_tell_or_do_is_said(kind: Kind) -> None:
+def test_unsupported_requests_and_commands_are_refused(kind: Kind) -> None:
     it = ready(kind)
     assert it.command(m.MAV_CMD_REQUEST_MESSAGE, m.MAVLINK_MSG_ID_DISTANCE_SENSOR) == (
         4 if kind is Kind.ARDUCOPTER else 2
@@ -230,4 +230,4 @@ def test_a_px4_answers_a_ping() -> None:
     assert (answer.time_usec, answer.seq, answer.target_system, answer.target_component) == (12345, 7, 255, 190)
     it.wire.sent.clear()
     it.say(m.MAVLink_ping_message(12345, 8, 1, 1))
-    assert it.of("PING") == [], "an answer is not answered"
+    assert it.of("PING") == [], "an answer gets no answer"

@@ -53,7 +53,7 @@ def test_a_stream_may_be_cut_anywhere(cuts: list[int]) -> None:
     assert [each.time_boot_ms for each in found] == list(range(6))
 
 
-def test_a_torn_datagram_spoils_no_other() -> None:
+def test_a_cut_datagram_spoils_no_other() -> None:
     sender, receiver = Codec(1, 1), Codec(255, 190)
     assert receiver.decode(sender.encode(attitude())[:20], whole=True) == []
     assert len(receiver.decode(sender.encode(attitude()), whole=True)) == 1
@@ -69,18 +69,18 @@ def test_noise_never_raises(noise: bytes) -> None:
 
 
 @given(st.integers(0, 40 * 8 - 1), st.booleans())
-def test_a_flipped_bit_is_found(bit: int, whole: bool) -> None:
+def test_a_flipped_bit_is_detected(bit: int, whole: bool) -> None:
     sender, receiver = Codec(1, 1), Codec(255, 190)
     frame = bytearray(sender.encode(attitude()))
     frame[bit // 8 % len(frame)] ^= 1 << bit % 8
     assert receiver.decode(bytes(frame), whole=whole) == []
-    for _ in range(12):  # a length that was damaged swallows some of what follows
+    for _ in range(12):  # a damaged length swallows some of the following bytes
         if receiver.decode(sender.encode(attitude()), whole=whole):
             return
     raise AssertionError("it did not find the frames that followed")
 
 
-def test_what_is_not_known_is_counted() -> None:
+def test_unknown_messages_are_counted() -> None:
     receiver = Codec(255, 190)
     number = 0xABCDEF
     frame = struct.pack("<BBBBBBBHB", 0xFD, 1, 0, 0, 0, 1, 1, number & 0xFFFF, number >> 16) + b"\x01\x00\x00"
@@ -92,13 +92,13 @@ def test_signed_frames_need_the_key() -> None:
     sender, receiver = Codec(1, 1, key=KEY), Codec(255, 190, key=KEY)
     first = sender.encode(attitude())
     assert len(receiver.decode(first)) == 1
-    assert receiver.decode(first) == [], "a frame that was taken is not taken twice"
+    assert receiver.decode(first) == [], "a frame is accepted only once"
     assert len(receiver.decode(sender.encode(attitude()))) == 1
     assert Codec(255, 190, key=bytes(32)).decode(sender.encode(attitude())) == []
     assert receiver.decode(Codec(1, 1).encode(attitude())) == [], "not signed"
 
 
-def test_signatures_without_a_key_are_told_apart_from_damage() -> None:
+def test_signatures_without_a_key_are_distinguished_from_damage() -> None:
     sender, receiver = Codec(1, 1, key=KEY), Codec(255, 190)
     assert receiver.decode(sender.encode(attitude())) == []
     assert (receiver.signed, receiver.damaged) == (1, 0)
@@ -110,7 +110,7 @@ def test_a_key_has_32_bytes() -> None:
 
 
 def test_a_recorded_flight_decodes_in_full() -> None:
-    """Each frame stands behind eight bytes of time. All 417 of 5.9 s decode; the file ends within the next one."""
+    """Each frame follows eight bytes of time. All 417 of 5.9 s decode; the file ends within the next one."""
     data, receiver, at = recorded(FLIGHT).read_bytes(), Codec(255, 190), 0
     kinds: Counter[str] = Counter()
     times: list[int] = []
@@ -137,7 +137,7 @@ def test_a_damaged_recording_never_raises(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_datagram_is_taken_as_the_same_bytes_of_a_stream_are(version: int) -> None:
+def test_a_datagram_decodes_like_the_same_bytes_of_a_stream(version: int) -> None:
     sender = Codec(1, 1)
     one, two = (sender.encode(attitude(n), version=version) for n in range(2))
     damaged = one[:-1] + bytes([one[-1] ^ 1])
@@ -161,7 +161,7 @@ def values(kind: type[Message]) -> st.SearchStrategy[list[Any]]:
 
 
 @given(st.data(), st.integers(1, 2))
-def test_a_message_of_numbers_is_what_pymavlink_makes_of_it(data: st.DataObject, version: int) -> None:
+def test_a_numeric_message_equals_pymavlinks(data: st.DataObject, version: int) -> None:
     kinds = [kind for kind in NUMBERS if version == 2 or kind.id < 256]
     kind = data.draw(st.sampled_from(kinds))
     frame = Codec(7, 1).encode(kind(*data.draw(values(kind))), version=version)
@@ -173,11 +173,11 @@ def test_a_message_of_numbers_is_what_pymavlink_makes_of_it(data: st.DataObject,
 
 
 def _attributes(message: Message) -> dict[str, str]:
-    """Return the attributes by their text: a NaN equals nothing."""
+    """Return the attributes as text: a NaN equals nothing."""
     return {name: repr(value) for name, value in vars(message).items() if name != "_header"}
 
 
-def test_a_longer_payload_than_is_known_is_cut() -> None:
+def test_a_longer_payload_than_known_is_cut() -> None:
     frame = bytearray(Codec(7, 1).encode(attitude()))
     frame[1] += 2  # a later version of the message has another field
     frame[-2:] = b"\1\2"
@@ -187,11 +187,11 @@ def test_a_longer_payload_than_is_known_is_cut() -> None:
     assert back.yawspeed == 0.5
 
 
-def test_a_signed_datagram_is_checked_as_a_stream_is() -> None:
+def test_a_signed_datagram_is_checked_like_a_stream() -> None:
     sender, receiver, keyless = Codec(1, 1, key=KEY), Codec(255, 190, key=KEY), Codec(255, 190)
     frame = sender.encode(attitude())
     assert len(receiver.decode(frame, whole=True)) == 1
-    assert receiver.decode(frame, whole=True) == [], "a frame that was taken is not taken twice"
+    assert receiver.decode(frame, whole=True) == [], "a frame is accepted only once"
     assert receiver.decode(Codec(1, 1).encode(attitude()), whole=True) == [], "not signed"
     assert keyless.decode(frame, whole=True) == []
     assert (keyless.signed, keyless.damaged) == (1, 0)
@@ -199,7 +199,7 @@ def test_a_signed_datagram_is_checked_as_a_stream_is() -> None:
 
 @pytest.mark.parametrize("size", [1, 20, 64, 200])
 def test_a_stream_may_be_cut_across_datagrams(size: int) -> None:
-    """As a bridge from a serial line to the network does; another sender's datagrams come in between."""
+    """As by a bridge from a serial line to the network; another sender's datagrams arrive in the middle."""
     sender, receiver, other = Codec(1, 1), Codec(255, 190), Codec(2, 1)
     stream = b"".join(sender.encode(attitude(n), version=1 + n % 2) for n in range(220))
     found: list[Message] = []
@@ -210,7 +210,7 @@ def test_a_stream_may_be_cut_across_datagrams(size: int) -> None:
     assert receiver.damaged == 0
 
 
-def test_a_cut_stream_goes_on_after_a_lost_datagram() -> None:
+def test_a_cut_stream_continues_after_a_lost_datagram() -> None:
     sender, receiver = Codec(1, 1), Codec(255, 190)
     stream = b"".join(sender.encode(attitude(n)) for n in range(200))
     pieces = [stream[at : at + 100] for at in range(0, len(stream), 100)]
@@ -219,7 +219,7 @@ def test_a_cut_stream_goes_on_after_a_lost_datagram() -> None:
     assert len(found) > 140, "each loss costs a few frames"
 
 
-def test_a_sender_of_pieces_can_not_fill_the_memory() -> None:
+def test_a_sender_of_fragments_can_not_fill_the_memory() -> None:
     receiver = Codec(255, 190)
     for sender in range(1000):
         receiver.decode(b"\xfd\xff", whole=True, source=sender)
@@ -227,7 +227,7 @@ def test_a_sender_of_pieces_can_not_fill_the_memory() -> None:
 
 
 class Wall:
-    """The system's clock, as the tests set it."""
+    """The system's clock, set by the tests."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, now_s: float = 1.8e9) -> None:
         self.now_s = now_s
@@ -237,8 +237,8 @@ class Wall:
         return self.now_s
 
 
-def test_the_time_of_signatures_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A vehicle that is switched on 80 s later takes what we send: one minute is the most it may be behind."""
+def test_the_time_of_signatures_advances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A vehicle switched on 80 s later accepts our frames, although it may be behind by at most a minute."""
     wall = Wall(monkeypatch)
     ours = Codec(255, 190, key=KEY)
     ours.encode(attitude())
@@ -249,18 +249,18 @@ def test_the_time_of_signatures_goes_on(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_clock_that_was_never_set_signs_and_follows_the_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """1970, as on a computer without a clock of its own; the vehicle has the time from its satellites."""
+    """1970, as on a computer without a clock; the vehicle has satellite time."""
     wall = Wall(monkeypatch)
     vehicle = Codec(1, 1, key=KEY)
     first = vehicle.encode(attitude())
     wall.now_s = 0.0
     ours = Codec(255, 190, key=KEY)
-    assert vehicle.decode(ours.encode(attitude())) == [], "an old one"
+    assert vehicle.decode(ours.encode(attitude())) == [], "an old frame"
     assert len(ours.decode(first)) == 1
     assert len(vehicle.decode(ours.encode(attitude()))) == 1
 
 
-def test_a_signature_is_never_repeated_where_the_clock_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signature_is_never_repeated_after_the_clock_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = Wall(monkeypatch)
     ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
     for _ in range(3):
@@ -268,7 +268,7 @@ def test_a_signature_is_never_repeated_where_the_clock_goes_back(monkeypatch: py
         wall.now_s -= 10.0
 
 
-def test_who_has_no_key_locks_nobody_out() -> None:
+def test_a_sender_without_the_key_locks_nobody_out() -> None:
     """A forged frame from the far future changes nothing."""
     ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
     forged = bytearray(vehicle.encode(attitude()))

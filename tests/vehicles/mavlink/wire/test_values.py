@@ -28,13 +28,13 @@ ANGLES = st.floats(-3.1, 3.1)
 
 
 def through_a_float(field: float) -> float:
-    """As it travels."""
+    """Return a field as it travels."""
     back: float = struct.unpack("<f", struct.pack("<f", field))[0]
     return back
 
 
 def test_px4_writes_an_integers_bytes() -> None:
-    """COM_DL_LOSS_T = 10 reads 1.4e-44 where that is not known."""
+    """COM_DL_LOSS_T = 10 reads as 1.4e-44 otherwise."""
     assert to_field(10, 6, bytewise=True) == pytest.approx(1.4e-44, rel=0.01)
     assert from_field(1.401298464324817e-44, 6, bytewise=True) == 10
 
@@ -72,7 +72,7 @@ def whole_texts(messages: list[Message]) -> list[str]:
     return [text for message in messages for _, text in texts.on_message(message)]
 
 
-def test_a_text_of_px4_comes_in_chunks_and_ends_in_a_tab() -> None:
+def test_a_px4_text_arrives_in_chunks_and_ends_in_a_tab() -> None:
     text = "Arming denied: Resolve system health failures first\t"
     messages = travelled(chunks_of(text, 2, 5))
     assert [message.text for message in messages] == ["Arming denied: Resolve system health failures firs", "t\t"]
@@ -89,16 +89,16 @@ def test_a_lost_chunk_is_shown() -> None:
     assert whole_texts([messages[0], messages[2]]) == ["a" * 50 + "…" + "c" * 10]
 
 
-def test_a_chunk_that_comes_twice_or_late_makes_no_other_text() -> None:
-    """A STATUSTEXT in chunks came as two events."""
+def test_a_repeated_or_late_chunk_makes_no_other_text() -> None:
+    """A STATUSTEXT in chunks caused two events."""
     first, last = travelled(chunks_of("a" * 50 + "b" * 10, 4, 9))
     assert whole_texts([first, last, last, first]) == ["a" * 50 + "b" * 10]
     assert whole_texts([last, first, last]) == ["…" + "b" * 10]
     again = travelled(chunks_of("c" * 50 + "d" * 10, 4, 9))
-    assert whole_texts([first, last, *again]) == ["a" * 50 + "b" * 10, "c" * 50 + "d" * 10], "after a new start"
+    assert whole_texts([first, last, *again]) == ["a" * 50 + "b" * 10, "c" * 50 + "d" * 10], "after a reboot"
 
 
-def test_texts_that_never_end_are_given_out_and_not_kept() -> None:
+def test_texts_that_never_end_are_returned_and_dropped() -> None:
     texts = Texts()
     told = [whole for n in range(1, 40) for whole in texts.on_message(travelled(chunks_of("x" * 60, 4, n))[0])]
     assert len(told) == 31

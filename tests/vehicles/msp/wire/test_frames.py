@@ -1,4 +1,4 @@
-"""Frames of MSP: what is written is read again, whatever is between, and nothing makes the parser raise."""
+"""MSP frames: written frames are read again, among any other bytes, and nothing makes the parser raise."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_long_payloads(size: int, version: int) -> None:
 
 
 @given(frames)
-def test_both_versions_say_it(frame: Frame) -> None:
+def test_both_versions_encode_it(frame: Frame) -> None:
     assert Parser().feed(encode(frame, version=2)) == [frame]
 
 
@@ -53,14 +53,14 @@ def test_noise_before_a_frame_is_skipped(noise: bytes, frame: Frame) -> None:
 
 
 @given(frames, st.integers(0, 310), frames)
-@example(Frame(1, b"$"), 5, Frame(2))  # what is left passes the check: ``xor`` of it is the next frame's ``$``
-def test_a_frame_that_lost_a_byte_takes_none_with_it(first: Frame, at: int, second: Frame) -> None:
+@example(Frame(1, b"$"), 5, Frame(2))  # the rest passes the check: its ``xor`` is the next frame's ``$``
+def test_a_frame_that_lost_a_byte_spoils_no_other(first: Frame, at: int, second: Frame) -> None:
     whole = encode(first)
     lost = at % len(whole)
     parser = Parser()
-    rest = encode(second) + bytes(MOST + 8)  # whatever comes later ends the search for the end of the broken one
+    rest = encode(second) + bytes(MOST + 8)  # later bytes end the search for the broken frame's end
     found = parser.feed(whole[:lost] + whole[lost + 1 :] + rest)
-    passed_by_chance = [frame for frame in found if frame != second]  # a check of eight bits: once in 256
+    passed_by_chance = [frame for frame in found if frame != second]  # an eight-bit check: once in 256
     assert second in found or passed_by_chance
 
 
@@ -74,7 +74,7 @@ def test_nothing_raises_and_little_is_kept(pieces: list[bytes]) -> None:
     assert len(parser._kept) <= MOST + 9 + 80
 
 
-def test_reset_forgets_the_beginning_of_a_frame() -> None:
+def test_reset_forgets_an_incomplete_frame() -> None:
     parser = Parser()
     parser.feed(encode(Frame(5, b"abc"))[:-2])
     parser.reset()
@@ -85,13 +85,13 @@ def test_reset_forgets_the_beginning_of_a_frame() -> None:
     ("frame", "version"),
     [(Frame(255), 1), (Frame(0x2000), 1), (Frame(1), 3), (Frame(0x10000), None), (Frame(1, bytes(0x10000)), None)],
 )
-def test_what_can_not_be_said(frame: Frame, version: int | None) -> None:
+def test_a_frame_that_can_not_be_encoded(frame: Frame, version: int | None) -> None:
     with pytest.raises(ValueError, match="function"):
         encode(frame, version=version)
 
 
 @given(st.lists(st.tuples(frames, st.booleans()), max_size=5))
 @example([(Frame(105, bytes(300)), False), (Frame(105), False)])
-def test_what_was_encoded_in_a_row_is_found_frame_by_frame(row: list[tuple[Frame, bool]]) -> None:
+def test_frames_encoded_in_a_row_are_found_one_by_one(row: list[tuple[Frame, bool]]) -> None:
     made = [encode(frame, version=2 if newer or frame.function >= LONG else 1) for frame, newer in row]
     assert list(whole_frames(b"".join(made))) == made

@@ -1,4 +1,4 @@
-"""Payloads of MSP: replies of Betaflight 4.6.0, both ways, and hostile bytes."""
+"""MSP payloads: replies of Betaflight 4.6.0, both directions, and hostile bytes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import explained, flag_names
 from skyloop.vehicles.msp.wire.messages import Sensor, Status
 
-#: What Betaflight 4.6.0's own simulation answered, at rest and not set up.
+#: Answers of Betaflight 4.6.0 SITL, at rest and unconfigured.
 STATUS_EX = bytes.fromhex("7d0000002300000000000000000400001d0403000000000004")
 RX_CONFIG = bytes.fromhex("006c07dc051a0400750343080000e20400000000000000000000000000001e0100000000000000")
 BOARD = bytes.fromhex("5349544c00000000045349544c") + bytes(44)
@@ -32,7 +32,7 @@ def test_status() -> None:
     assert (status.count, status.cycle_us, status.modes) == (29, 125, 0)
     assert status.flags is not None
     assert flag_names("BTFL", status.flags, status.count) == ["RXLOSS", "ANGLE", "BOOTGRACE"]
-    assert Status.of_betaflight(STATUS_EX[:15]).flags is None, "an old one does not tell"
+    assert Status.of_betaflight(STATUS_EX[:15]).flags is None, "an old version does not report them"
 
 
 @given(st.integers(0, 2**60 - 1), st.integers(0, 2**29 - 1), st.integers(0, 127))
@@ -65,7 +65,7 @@ def test_settings_of_a_real_one() -> None:
     assert failsafe == msp.FailsafeConfig(1.5, 60.0, 1000, 10.0, 1)
     assert failsafe.encode() == FAILSAFE
     assert msp.rx_map(bytes((0, 1, 3, 2, 4, 5, 6, 7))) == msp.USUAL_MAP
-    with pytest.raises(DecodeError, match="does not say where the sticks are"):
+    with pytest.raises(DecodeError, match="does not contain the sticks"):
         msp.rx_map(bytes((0, 1, 3, 3)))
     assert msp.angle_limit_deg(PID_ADVANCED) == 60
     assert msp.box_names(b"ARM;ANGLE;AIR MODE;") == ["ARM", "ANGLE", "AIR MODE"]
@@ -88,7 +88,7 @@ def test_states_both_ways() -> None:
     battery = msp.Battery(15.87, 12.5, 4)
     assert msp.Battery.of_state(battery.state()) == battery
     assert msp.Battery.of_analog(battery.analog()).voltage_v == 15.87
-    assert msp.Battery.of_analog(battery.analog()[:7]).voltage_v == 15.9, "an old one tells tenths"
+    assert msp.Battery.of_analog(battery.analog()[:7]).voltage_v == 15.9, "an old version reports tenths"
     assert msp.channels(msp.pack_channels([1000, 2000])) == [1000, 2000]
     assert msp.rx_fail(msp.pack_rx_fail([(0, 1500), (2, 1300)])) == [(0, 1500), (2, 1300)]
     inav = msp.Battery.of_inav(bytes.fromhex("40 a006 6400 00000000 00000000 00000000 00000000 4b".replace(" ", "")))
@@ -97,7 +97,7 @@ def test_states_both_ways() -> None:
 
 def test_several_replies_in_one() -> None:
     assert msp.multiple(b"\2ab\0\1c", (1, 2, 3)) == [(1, b"ab"), (2, b""), (3, b"c")]
-    assert msp.multiple(b"\2ab\5c", (1, 2)) == [(1, b"ab")], "what did not fit is left out"
+    assert msp.multiple(b"\2ab\5c", (1, 2)) == [(1, b"ab")], "replies that did not fit are missing"
 
 
 READERS: list[Callable[[bytes], object]] = [
@@ -142,7 +142,7 @@ def test_rates_of_a_real_one() -> None:
     assert rates.yaw == firmwares.AxisRates(7, 0, 67)
     curve = firmwares.rate_curve(rates.kind, rates.roll)
     assert curve(1.0) == pytest.approx(670.0)
-    assert curve(0.5) == pytest.approx(185.0), "as Betaflight's rates tab plots it"
+    assert curve(0.5) == pytest.approx(185.0), "as plotted in Betaflight's rates tab"
     assert firmwares.betaflight_rates(firmwares.pack_betaflight_rates(rates)) == rates
 
 
@@ -159,7 +159,7 @@ def test_a_stick_is_found_for_every_rate(kind: str, centre: int, expo: int, most
     assert reached == pytest.approx(wanted, abs=max(0.5, abs(wanted) * 0.02))
 
 
-def test_a_full_stick_is_the_most() -> None:
+def test_a_full_stick_is_the_maximum() -> None:
     assert firmwares.stick_for(firmwares.inav_curve(70, 30.0), 99.0) == 1.0
     assert firmwares.stick_for(firmwares.inav_curve(70, 30.0), -99.0) == -1.0
     assert firmwares.share_of(lambda _: 0.0)(0.3) == 0.3

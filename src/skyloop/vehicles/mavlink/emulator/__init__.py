@@ -1,4 +1,4 @@
-"""An ArduCopter or a PX4, emulated on the network over a simulated vehicle, for any program that speaks MAVLink.
+"""An emulated ArduCopter or PX4 on the network, flying a simulated vehicle for any MAVLink program.
 
 On free ports of this machine, for a test::
 
@@ -8,9 +8,9 @@ On free ports of this machine, for a test::
 
     host = SimHost(with_multirotors(SimOptions(world="empty", seed=1)))
     with MavlinkFirmware(host, kind=Kind.PX4, ports=Ports.free(Kind.PX4)) as firmware:
-        firmware.address  # mavlink://udpin:127.0.0.1:…, what to give to the driver
+        firmware.address  # mavlink://udpin:127.0.0.1:…, the driver's address
 
-What the two do differently is what was observed on the real ones; ``docs/mavlink.md`` has it as a table.
+The differences between the two were observed on real autopilots; ``docs/mavlink.md`` has them as a table.
 """
 
 from __future__ import annotations
@@ -104,26 +104,26 @@ BOOT_S: Final = 2.0
 
 
 class MavlinkFirmware(Emulator[RunningFirmware]):
-    """The autopilot of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
+    """The autopilot of one drone in a host's world. Several may share a host, each with its own drone and ports.
 
     Make the host with :func:`with_multirotors`.
 
     Args:
         host: The simulated world.
-        drone: Its number in it.
+        drone: Its number in the world.
         kind: ArduCopter or PX4.
-        bind: The address of this machine to listen on.
-        ports: To listen on; None: those of the real one's simulation.
+        bind: The local address to listen on.
+        ports: Ports to listen on; None: those of the autopilot's own simulation.
         system: Its MAVLink system id, 1 to 255; None: the drone's number plus one.
-        faults: Befall UDP datagrams, each way.
-        delay_s: By which UDP datagrams are late, each way.
-        boot_s: From the start until it lets itself be armed, in seconds of the simulation (real ones take 5 to 40).
-        gps: Whether it has GPS; without it the autopilot is not ready before poses come from outside.
-        version: 1: it speaks the old MAVLink, and answers in nothing else.
+        faults: Applied to UDP datagrams, each way.
+        delay_s: Delay of UDP datagrams, each way.
+        boot_s: Simulated time from the start until it can be armed, in seconds (real ones take 5 to 40).
+        gps: Whether it has GPS; without it, the autopilot is not ready until external poses arrive.
+        version: 1: it speaks only MAVLink 1.
         key: 32 bytes that sign everything; None: nothing is signed.
-        video: Host and port to which the front camera's pictures are sent over UDP; None: no camera.
-        loop: The thread of a whole fleet, started after all of it was started, and stopped before any of it; None: a
-            thread of its own.
+        video: Host and port for the front camera's video over UDP; None: no camera.
+        loop: The thread of a whole fleet, started after all of its members and stopped before any; None: a separate
+            thread.
 
     Raises:
         UsageError: An argument is out of range.
@@ -152,7 +152,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         if not 1 <= number <= 255:
             raise UsageError(f"a system id is from 1 to 255, not {number!r}")
         if version not in (1, 2):
-            raise UsageError(f"there is MAVLink 1 and MAVLink 2, not {version!r}")
+            raise UsageError(f"the MAVLink version is 1 or 2, not {version!r}")
         super().__init__(host, drone)
         self._loop = loop
         delay_s = checked_delay(delay_s)
@@ -161,7 +161,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
-        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keep the ports over a restart
         return running
 
     @property
@@ -171,19 +171,19 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def address(self) -> str:
-        """Address of a driver on this machine, over UDP."""
+        """Address for a driver on this machine, over UDP."""
         return f"mavlink://udpin:{self.settings.bind}:{self.settings.ports.remote}"
 
     @property
     def tcp_address(self) -> str:
-        """Address of a driver on this machine, over TCP; raises for a kind that has no such port."""
+        """Address for a driver on this machine, over TCP; raises for a kind without a TCP port."""
         if self.settings.ports.tcp is None:
             raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
         return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"
 
     @property
     def description(self) -> str:
-        """Where it is, in one line for people."""
+        """Kind, system and address, in one line for people."""
         settings = self.settings
         tcp = f", {self.tcp_address}" if settings.ports.tcp is not None else ""
         return (
@@ -193,17 +193,17 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
 
 CAMERA: Final[CameraModel] = replace(FRONT_CAMERA, fps=20.0)
-_CLOCK: Final = Fraction(1, 90_000)  #: of transport streams [s]
+_CLOCK: Final = Fraction(1, 90_000)  #: unit of transport stream time [s]
 _X264: Final = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "scenecut=0:repeat-headers=1:threads=1"}
 _SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
 
 
 class TransportStream:
-    """Encodes and sends each picture as it comes. Not thread-safe.
+    """Encodes and sends each image as it arrives. Not thread-safe.
 
     Args:
-        host: To send to.
-        port: UDP.
+        host: Host to send to.
+        port: UDP port.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -223,15 +223,15 @@ class TransportStream:
         self._stream.pix_fmt = "yuv420p"
         self._stream.bit_rate = _SETTINGS.bitrate_kbps * 1000
         self._stream.gop_size = GROUP
-        self._stream.time_base = self._stream.codec_context.time_base = _CLOCK  # or two pictures may get one stamp
+        self._stream.time_base = self._stream.codec_context.time_base = _CLOCK  # finer than the frame interval
         self._begun_ns: int | None = None
         self._stamp = -1
 
     def pack(self, picture: NDArray[np.uint8], _settings: OneCamera, captured_ns: int) -> None:
-        """Encode and send a picture: BGR, uint8, shape (height, width, 3)."""
+        """Encode and send an image: BGR, uint8, shape (height, width, 3)."""
         self._begun_ns = captured_ns if self._begun_ns is None else self._begun_ns
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
-        # Exposures of a drone may come out of order; a stream's stamps must grow.
+        # A drone's exposures may arrive out of order; a stream's stamps must grow.
         self._stamp = max(self._stamp + 1, round((captured_ns - self._begun_ns) / 1e9 / _CLOCK))
         frame.pts = self._stamp
         frame.time_base = _CLOCK
@@ -244,5 +244,5 @@ class TransportStream:
 
 
 def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
-    """Return the thread that encodes the newest picture; not started."""
+    """Return the thread that encodes the newest image; not started."""
     return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)

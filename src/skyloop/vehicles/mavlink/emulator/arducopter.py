@@ -50,17 +50,17 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
-SINK_WITHOUT_STICKS_M_S: Final = -2.5
-STICK_TIMEOUT_S: Final = 3.0
-STICK_SPEED_M_S: Final = 6.0  #: of a stick at its end
-TURN_RAD_S: Final = math.radians(60)  #: the fastest that CONDITION_YAW turns
-RTL_LOWEST_M: Final = 0.3
-RTL_LEAST_SLOPE: Final = 0.5
-_GUIDED_ITEM: Final = 2  #: "current" of a mission item that is a position to go to now
+SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: in stick modes without a remote control
+STICK_TIMEOUT_S: Final = 3.0  #: after this silence, a remote control over MAVLink counts as gone
+STICK_SPEED_M_S: Final = 6.0  #: at full stick
+TURN_RAD_S: Final = math.radians(60)  #: maximum turn rate of CONDITION_YAW
+RTL_LOWEST_M: Final = 0.3  #: lowest return altitude above home
+RTL_LEAST_SLOPE: Final = 0.5  #: flatter RTL cones are ignored
+_GUIDED_ITEM: Final = 2  #: "current" of a mission item that is a position to fly to now
 _ALTITUDE_ITEM: Final = 3
 CHANNELS: Final = 16
-_OVERRIDDEN: Final = 8
-_IGNORED: Final = 0xFFFF  #: a channel that an override leaves as it is
+_OVERRIDDEN: Final = 8  #: channels that an override can set
+_IGNORED: Final = 0xFFFF  #: a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 _WORDS: Final = {
@@ -76,7 +76,7 @@ class ArduCopter(Autopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT
-    CAPABILITIES = 0xFBEF & ~0xD200  # fences, rally points and terrain are not emulated; of files there are none
+    CAPABILITIES = 0xFBEF & ~0xD200  # fences, rally points and terrain are not emulated, and there are no files
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
     FRAMES = frozenset({WORLD, WORLD_OFFSET, BODY, BODY_OFFSET})
@@ -100,7 +100,7 @@ class ArduCopter(Autopilot):
         self._target_s = 0.0
         self._stick: tuple[float, float, float, float] | None = None  # forward, left, up, yaw
         self._stick_s = -STICK_TIMEOUT_S
-        self._overrides: dict[int, int] = {}  # by channel from 0 [µs]
+        self._overrides: dict[int, int] = {}  # by channel, counted from 0 [µs]
         self._commands |= {
             m.MAV_CMD_CONDITION_YAW: self._condition_yaw,
             m.MAV_CMD_DO_PAUSE_CONTINUE: self._pause_or_continue,
@@ -144,7 +144,7 @@ class ArduCopter(Autopilot):
             return  # only the command takes off
         if self._target is not None and self.time_s - self._target_s > self.parameters["GUID_TIMEOUT"]:
             if isinstance(self._target, AttitudeTarget):
-                self.flight.lean(0.0, 0.0, 0.0, 0.0)  # level, and on it drifts
+                self.flight.lean(0.0, 0.0, 0.0, 0.0)  # level: it drifts on
                 return
             if self._target.place is None:
                 self._target = None
@@ -159,7 +159,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without one the simulated one's throttle stick is low."""
+        """Follow the remote control. Without one, the simulated one's throttle stick is low."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:
@@ -198,7 +198,7 @@ class ArduCopter(Autopilot):
         return Speeds(min(GO_M_S, across), min(SINK_M_S, up), min(SINK_M_S, down))
 
     def _begin_return(self) -> None:
-        """Return at RTL_ALT, or lower near home; never lower than it is."""
+        """Return at RTL_ALT, or lower near home; never below the present height."""
         east, north, up = self.flight.place
         above, distance = up - self.home[2], math.hypot(east - self.home[0], north - self.home[1])
         lowest = max(RTL_LOWEST_M, above + max(0.0, self.parameters["RTL_CLIMB_MIN"] / 100.0))
@@ -236,7 +236,7 @@ class ArduCopter(Autopilot):
         return ACCEPTED
 
     def _disarmed(self) -> None:
-        """Keep the mode: after a landing that is LAND, in which it can't be armed."""
+        """Keep the mode: after a landing it is LAND, which can't be armed."""
 
     # Arming and taking off -------------------------------------------------------------------------------------
 
@@ -268,7 +268,7 @@ class ArduCopter(Autopilot):
 
     def _set_point(self, message: Message) -> None:
         if self.mode != "GUIDED" or not self.armed:
-            return  # dropped without a word
+            return  # drop it silently
         self.set_points += 1
         made: Target | AttitudeTarget | None
         if message.get_type() == "SET_ATTITUDE_TARGET":
@@ -280,16 +280,16 @@ class ArduCopter(Autopilot):
             made = self._finite(self._from_here(message)) if message.coordinate_frame in self.FRAMES else None
         self._target, self._target_s, self._turn = made, self.time_s, None
         if not (isinstance(made, Target) and made.place is None and made.velocity is None):
-            self._rising = False  # even while it takes off
+            self._rising = False  # even during a take-off
 
     @staticmethod
     def _finite(target: Target | None) -> Target | None:
-        """Return a target of finite numbers; any other is a silent stop."""
+        """Return a target if its numbers are finite; any other is a silent stop."""
         numbers = () if target is None else (*(target.velocity or ()), *(target.place or ()))
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target whose position is relative to the vehicle's, as it is in every frame but one."""
+        """Return a target with a position relative to the vehicle, as in every frame but one."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target
@@ -378,13 +378,13 @@ class ArduCopter(Autopilot):
 
     @property
     def channels(self) -> list[int] | None:
-        """Pulse widths of its remote control [µs]: sticks in the middle, the throttle down, and what overrides them."""
+        """The remote control's pulse widths [µs]: sticks centred, throttle down, and the overrides."""
         fresh = self.time_s - self._stick_s < STICK_TIMEOUT_S
         usual = [1500, 1500, 1000, *[1500] * (CHANNELS - 3)]
         return [self._overrides.get(n, width) if fresh else width for n, width in enumerate(usual)]
 
     def _own(self, port: Port, message: Message) -> bool:
-        """Handle its mission, and a position to go to that comes as an item of one."""
+        """Handle mission messages, including a mission item that is a position to fly to."""
         item = message.get_type() in ("MISSION_ITEM", "MISSION_ITEM_INT") and message.mission_type == 0
         if item and message.current in (_GUIDED_ITEM, _ALTITUDE_ITEM):
             port.send(mission_ack(message, self._guided_item(message)))
@@ -407,7 +407,7 @@ class ArduCopter(Autopilot):
         if place is None:
             return MISSION_UNSUPPORTED
         if message.current == _ALTITUDE_ITEM:
-            return MISSION_ACCEPTED  # and nothing comes of it
+            return MISSION_ACCEPTED  # without effect
         if self.mode != "GUIDED" or message.command != m.MAV_CMD_NAV_WAYPOINT:
             return MISSION_ERROR
         self._go_to(Target(place))

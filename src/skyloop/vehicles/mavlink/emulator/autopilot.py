@@ -1,6 +1,6 @@
-"""Behaviour that both autopilots share: messages in, a simulated vehicle flown, messages out. Pure but for the vehicle.
+"""Behaviour shared by both autopilots: messages in, a simulated vehicle flown, messages out. Pure but for the vehicle.
 
-Times are the autopilot's, seconds of the simulation, so that everything goes faster in a faster world.
+Times are the autopilot's, in simulated seconds, so that everything runs faster in a faster world.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ TEMPORARILY_REJECTED: Final = 1
 DENIED: Final = 2
 UNSUPPORTED: Final = 3
 FAILED: Final = 4
-FORCE: Final = 21196  #: "even in flight", of the command to disarm
+FORCE: Final = 21196  #: parameter of the disarm command: "even in flight"
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
-AFTER_LANDING_S: Final = 2.0
-POSES_S: Final = 1.0  #: poses from outside must come for so long, without GPS
-POSE_GAP_S: Final = 0.5
+AFTER_LANDING_S: Final = 2.0  #: on the ground after a flight, until it disarms
+POSES_S: Final = 1.0  #: how long external poses must arrive without GPS
+POSE_GAP_S: Final = 0.5  #: without external poses, until the position is lost
 _GCS: Final = 6  #: MAV_TYPE
-#: What the old way to ask for all messages does not change.
+#: Messages that the old request for all messages does not change.
 _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_HEARTBEAT,
     m.MAVLINK_MSG_ID_TIMESYNC,
@@ -43,7 +43,7 @@ _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
 )
 _COPIES: Final = 1 << 32
-_NOT_GIVEN: Final = 0x7FFFFFFF  #: of a position in COMMAND_INT, as NaN is in COMMAND_LONG
+_NOT_GIVEN: Final = 0x7FFFFFFF  #: placeholder for a position in COMMAND_INT, like NaN in COMMAND_LONG
 
 Arguments = tuple[float, ...]
 Handler = Callable[[Arguments], int]
@@ -51,20 +51,20 @@ PlaceHandler = Callable[[Arguments, int], int]
 
 
 class Autopilot(ABC):
-    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report."""
+    """One autopilot. All methods belong to one thread. Set ``ports``, its links, before the first report."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     CAPABILITIES: ClassVar[int]
     VERSION: ClassVar[int]
-    RATES: ClassVar[dict[int, float]]  #: of the messages that a fresh link gets unasked [1/s]
+    RATES: ClassVar[dict[int, float]]  #: of the messages that a new link gets without a request [1/s]
     FRAMES: ClassVar[frozenset[int]]  #: of set-points
-    ABOVE_SEA: ClassVar[frozenset[int]]  #: frames of places on the Earth, with altitudes above mean sea level
+    ABOVE_SEA: ClassVar[frozenset[int]]  #: frames of global positions with altitudes above mean sea level
     ABOVE_HOME: ClassVar[frozenset[int]]  #: … above home
-    LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of a command with a position in COMMAND_LONG, if it is accepted
-    NOTHING_TO_TELL: ClassVar[int]  #: result for a request of a message that it does not have
+    LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of a position in COMMAND_LONG, by command that accepts one
+    NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not have
     BYTEWISE: ClassVar[bool]
-    REPORTS_PREARM: ClassVar[bool] = True  #: SYS_STATUS shows that it has a check before arming, besides its outcome
-    DISARM_S: ClassVar[float]  #: armed on the ground for so long, it disarms
+    REPORTS_PREARM: ClassVar[bool] = True  #: SYS_STATUS shows that the pre-arm check exists, besides its result
+    DISARM_S: ClassVar[float]  #: it disarms after this time armed on the ground
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         self.flight = FlightControl(vehicle)
@@ -76,17 +76,17 @@ class Autopilot(ABC):
         self.armed = False
         self.mode = ""
         self.failsafe = False
-        self.poses = 0  #: that came from outside
-        self.set_points = 0  #: that were taken
-        self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up of the flight's origin
-        self._home_given = False  # set by somebody: then arming does not change it
+        self.poses = 0  #: external poses received
+        self.set_points = 0  #: set-points accepted
+        self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up from the flight's origin
+        self._home_given = False  # set by a command: arming then leaves it unchanged
         self._manoeuvres = Manoeuvres(self.flight)
         self._boot_s = boot_s
         self._begun_s: float | None = None
         self._captured_ns = 0
         self._armed_s = 0.0
         self._landed_s: float | None = None
-        self._flown = False  # since it was armed
+        self._flown = False  # since arming
         self._gcs_s: float | None = None
         self._pose_s = -math.inf
         self._posing_s = math.inf
@@ -113,7 +113,7 @@ class Autopilot(ABC):
 
     @property
     def boot_ms(self) -> int:
-        """The same as messages have it, 32 bits [ms]."""
+        """The same as a 32-bit message field [ms]."""
         return round(self.time_s * 1000) % _COPIES
 
     @property
@@ -123,29 +123,29 @@ class Autopilot(ABC):
 
     @property
     def has_origin(self) -> bool:
-        """Whether it knows where it is."""
+        """Whether it has a position."""
         if self.gps:
             return self.time_s >= self._boot_s / 2
         return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
 
     @property
     def settled(self) -> bool:
-        """Whether its estimator reports a good position, which is the last thing that a boot waits for."""
+        """Whether its estimator reports a good position, the last step of a boot."""
         return self.time_s >= self._boot_s and self.has_origin
 
     @property
     def ready(self) -> bool:
-        """Whether it may be armed."""
+        """Whether it can be armed."""
         return self.settled and self.mode_allows_arming
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it may be armed in its mode."""
+        """Whether it can be armed in its mode."""
         return True
 
     @property
     def remote(self) -> bool:
-        """Whether it reports that it receives a remote control."""
+        """Whether it reports a received remote control."""
         return False
 
     @property
@@ -175,17 +175,17 @@ class Autopilot(ABC):
         self.flight.update(report)
         if self.armed:
             self._fly()
-            self._look_at_ground()
+            self._check_ground()
         else:
             self.flight.lie()
-        self._look_at_ground_station()
+        self._check_ground_station()
         self._send_due()
 
     @abstractmethod
     def _fly(self) -> None:
-        """Do what the mode does. Called at every tick while it is armed."""
+        """Fly according to the mode. Called at every tick while armed."""
 
-    def _look_at_ground(self) -> None:
+    def _check_ground(self) -> None:
         if not self.flight.standing:
             self._flown, self._landed_s = True, None
             return
@@ -199,7 +199,7 @@ class Autopilot(ABC):
         elif self.time_s - self._landed_s > AFTER_LANDING_S:
             self._disarm(self._words("landed"))
 
-    def _look_at_ground_station(self) -> None:
+    def _check_ground_station(self) -> None:
         lost = self._gcs_s is not None and self.time_s - self._gcs_s > self._gcs_patience_s
         self._ground_station(lost)
 
@@ -220,21 +220,21 @@ class Autopilot(ABC):
                 port.send(parameter)
 
     def send_text(self, text: str, severity: int = WARNING) -> None:
-        """Send a text for people to everybody, in pieces if it is long."""
+        """Send a text for people on all links, in chunks if it is long."""
         self._text = self._text % 0xFFFF + 1
         for port in self.ports:
             for chunk in chunks_of(text, severity, self._text):
                 port.send(chunk)
 
     def send_heartbeat(self) -> None:
-        """Send a heartbeat besides the usual ones."""
+        """Send a heartbeat outside the regular schedule."""
         for port in self.ports:
             port.send(MAKERS[m.MAVLINK_MSG_ID_HEARTBEAT](self))
 
     # Messages come -----------------------------------------------------------------------------------------------
 
     def on_message(self, port: Port, message: Message, now_ns: int) -> None:
-        """Handle a message; answers go to its port. Before the first report all are ignored: it is not awake yet."""
+        """Handle a message; answers go to its port. Before the first report it ignores all messages."""
         if self._begun_s is None or getattr(message, "target_system", 0) not in (0, self.system):
             return
         kind = message.get_type()
@@ -270,7 +270,7 @@ class Autopilot(ABC):
                 port.send(answer)
 
     def _restart(self) -> None:
-        """Boot again, as if it were switched on now."""
+        """Boot again, as if switched on now."""
         self._begun_s = self._gcs_s = None
         self.home, self._home_given = (0.0, 0.0, 0.0), False
         self._pose_s, self._posing_s = -math.inf, math.inf
@@ -279,11 +279,11 @@ class Autopilot(ABC):
 
     @property
     def channels(self) -> list[int] | None:
-        """Pulse widths of its remote control [µs]; None: it reports none."""
+        """The remote control's pulse widths [µs]; None: it reports none."""
         return None
 
     def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
-        """Handle a message that only one of the autopilots answers. Return whether it was such a one."""
+        """Handle a message that only one of the autopilots answers. Return whether it was handled."""
         return False
 
     @abstractmethod
@@ -295,7 +295,7 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _sticks(self, message: Message) -> None:
-        """Handle a remote control that comes over MAVLink."""
+        """Handle a remote control's input over MAVLink."""
 
     def _pose(self) -> None:
         self.poses += 1
@@ -304,7 +304,7 @@ class Autopilot(ABC):
         self._pose_s = self.time_s
 
     def _data_stream(self, port: Port, message: Message) -> None:
-        """Handle the old way to ask for messages: all of them at one rate."""
+        """Handle the old request for messages, which sets one rate for all."""
         rate = min(50, message.req_message_rate) if message.start_stop else 0
         for number in MAKERS:
             if number not in _ON_REQUEST:
@@ -353,7 +353,7 @@ class Autopilot(ABC):
         return m.MAVLink_message_interval_message(number, port.streams.interval_us(number))
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
-        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # nor for NaN
+        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # false for NaN, too
             return FAILED
         port.streams.set_interval(number, interval_us)
         return ACCEPTED
@@ -389,7 +389,7 @@ class Autopilot(ABC):
         self._disarmed()
 
     def crashed(self, text: str) -> None:
-        """Disarm: the vehicle stopped its motors by itself, for this reason."""
+        """Disarm because the vehicle stopped its motors, for this reason."""
         if self.armed:
             self._disarm(f"Crash: Disarming ({text})")
 
@@ -403,20 +403,20 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _refuse_arming(self) -> int | None:
-        """Return the result that refuses, after its text was sent; None where nothing is against it."""
+        """Return the result that refuses, after sending its text; None if arming is allowed."""
 
     @abstractmethod
     def _refuse_disarming(self) -> int:
         """Return the result that refuses to disarm in flight."""
 
     def _datum(self, frame: int) -> float | None:
-        """Return how high the altitude 0 of a frame is above the flight's origin [m]; None for an unknown frame."""
+        """Return the height of a frame's altitude 0 above the flight's origin [m]; None for an unknown frame."""
         if frame in self.ABOVE_SEA:
             return -ORIGIN.altitude_m
         return self.home[2] if frame in self.ABOVE_HOME else None
 
     def _place(self, arguments: Arguments, frame: int) -> Vector | None:
-        """Return the position that a command names; None where it names none."""
+        """Return the position named by a command; None if it names none."""
         latitude, longitude, altitude = arguments[4:7]
         datum = self._datum(frame)
         if datum is None or not on_earth(latitude, longitude) or not math.isfinite(altitude):
@@ -447,9 +447,9 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _go_by(self, manoeuvre: str) -> int:
-        """Land or return, by the command that is no change of mode."""
+        """Land or return, by the command that does not change the mode."""
 
 
 def whole(argument: float) -> int:
-    """Return an argument of a command as a whole number; 0 for NaN, which stands for "not given"."""
+    """Return a command's argument as a whole number; 0 for NaN, which stands for "not given"."""
     return round(argument) if math.isfinite(argument) else 0

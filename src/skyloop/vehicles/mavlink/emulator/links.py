@@ -1,4 +1,4 @@
-"""The emulated autopilot's settings and ports: UDP to one peer, a TCP server for one client, and what each is sent."""
+"""The emulated autopilot's settings and links: UDP to one peer, a TCP server for one client, and their messages."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPort, Loop
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
-REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
-APART: Final = 10
+REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
+APART: Final = 10  #: between the ports of two drones
 
 
 class Kind(StrEnum):
-    """The autopilot that is emulated."""
+    """The emulated autopilot."""
 
     ARDUCOPTER = "arducopter"
     PX4 = "px4"
@@ -31,26 +31,26 @@ class Kind(StrEnum):
 class Ports:
     """Ports of one emulated autopilot."""
 
-    udp: int  #: the autopilot's own, from which it sends to ``remote`` until a message comes
+    udp: int  #: the autopilot's own; sends to ``remote`` until a message arrives
     remote: int  #: UDP, of the other end
-    tcp: int | None = None  #: its server for one client; None: it has none
+    tcp: int | None = None  #: TCP server for one client; None: it has none
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:
-        """Return the ports of the real ones' simulations."""
+        """Return the ports of the autopilots' own simulations."""
         if kind is Kind.PX4:
             return cls(udp=14580 + drone, remote=14540 + drone)
         return cls(udp=5763 + APART * drone, remote=14550 + APART * drone, tcp=5760 + APART * drone)
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports from a number on, for each further drone 10 higher.
+        """Return ports counted from a base, 10 higher for each further drone.
 
-        The autopilot's own UDP port comes first, then the remote one, then that for TCP.
+        The autopilot's own UDP port comes first, then the remote one, then TCP.
 
         Args:
-            kind: Of the autopilot.
-            base: The first port; None: the usual ones; 0: any that are free.
+            kind: The autopilot.
+            base: The first port; None: the standard ones; 0: any free ones.
             drone: Its number.
 
         Raises:
@@ -72,10 +72,10 @@ class Ports:
 
     @classmethod
     def several(cls, kind: Kind, base: int | None, drones: int) -> list[Ports]:
-        """Return the ports of several drones; none of them twice. See :meth:`counted`."""
+        """Return distinct ports for several drones. See :meth:`counted`."""
         if base != 0:
             return [cls.counted(kind, base, drone) for drone in range(drones)]
-        with ExitStack() as held:  # of all of them: the system soon gives a port that was closed to the next who asks
+        with ExitStack() as held:  # hold all of them open: the system soon hands out a closed port again
             return [cls._held(kind, held) for _ in range(drones)]
 
     @classmethod
@@ -94,9 +94,9 @@ def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPO
     """Return options of a world for emulated autopilots: without cameras.
 
     Args:
-        options: Of the world and its drones.
-        rate_hz: How often an autopilot flies and sends [1/s], by default as often as possible. A fleet that is to cost
-            little takes less: no message is sent more often than that.
+        options: Options of the world and its drones.
+        rate_hz: How often an autopilot flies and sends [1/s], by default as often as possible. A lower rate makes a
+            fleet cheaper; no message is sent more often.
     """
     return replace(options or SimOptions(), rate_hz=rate_hz, cameras=())
 
@@ -122,7 +122,7 @@ class Settings:
         return self.version == 2 or message.id < 256
 
 
-MAX_INTERVAL_US: Final = 2**31 - 1  #: the greatest that ``MESSAGE_INTERVAL`` has room for
+MAX_INTERVAL_US: Final = 2**31 - 1  #: maximum of the field of ``MESSAGE_INTERVAL``
 
 
 class Streams:
@@ -134,12 +134,12 @@ class Streams:
         self._due = dict.fromkeys(self._periods, 0.0)
 
     def reset(self) -> None:
-        """Begin anew: the autopilot was switched on again, and its clock with it."""
+        """Start over: the autopilot and its clock were switched on again."""
         self._periods = {number: 1.0 / rate for number, rate in self._usual.items()}
         self._due = dict.fromkeys(self._periods, 0.0)
 
     def set_interval(self, number: int, interval_us: float) -> None:
-        """Set a message's interval, as ``SET_MESSAGE_INTERVAL`` has it: -1 stops it, 0 is its usual rate."""
+        """Set a message's interval as in ``SET_MESSAGE_INTERVAL``: -1 stops it, 0 restores the default."""
         if interval_us < 0:
             self._periods.pop(number, None)
         elif interval_us == 0:
@@ -171,11 +171,11 @@ class Streams:
 OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
-PEER_NS: Final = nanoseconds(3.0)  #: a peer that is silent for so long may be replaced by another
+PEER_NS: Final = nanoseconds(3.0)  #: another peer may replace one that is silent for this long
 
 
 class Port(Protocol):
-    """One link of the autopilot, with the rates that were asked for on it."""
+    """One link of the autopilot, with the message rates requested on it."""
 
     streams: Streams
 
@@ -189,7 +189,7 @@ def _codec(settings: Settings) -> Codec:
 
 
 class UdpPort:
-    """A UDP port: sends to the remote port until a message comes, then to its sender."""
+    """A UDP port: sends to the remote port until a message arrives, then to its sender."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -209,7 +209,7 @@ class UdpPort:
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The bound port, also if 0 was requested."""
         return self._port.port
 
     def send(self, message: Message) -> None:
@@ -233,7 +233,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte."""
+    """A TCP server for one client at a time: the next one waits in the kernel, connected but without data."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -246,7 +246,7 @@ class TcpPort:
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The bound port, also if 0 was requested."""
         return self._server.port
 
     def send(self, message: Message) -> None:

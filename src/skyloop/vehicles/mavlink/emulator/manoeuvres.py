@@ -1,4 +1,4 @@
-"""Set-points, the places on Earth that they name, and the manoeuvres of both autopilots: rise, return, follow, turn.
+"""Set-points, their positions on Earth, and the manoeuvres of both autopilots: rise, return, follow, turn.
 
 Pure but for the vehicle.
 """
@@ -32,7 +32,7 @@ def place_of(latitude_deg: float, longitude_deg: float, up: float) -> Vector:
 
 
 def on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Return whether there is such a position; False for NaN."""
+    """Return whether the position exists; False for NaN."""
     return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
@@ -47,12 +47,12 @@ _YAW_RATE: Final = 0x800
 _NO_RATES: Final = 0x07
 _NO_THRUST: Final = 0x40
 _NO_ATTITUDE: Final = 0x80
-_UNIT_WITHIN: Final = 1e-3
+_UNIT_WITHIN: Final = 1e-3  #: tolerance of a unit quaternion
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What ``SET_POSITION_TARGET_LOCAL_NED`` and ``…_GLOBAL_INT`` ask for, in our axes. None: not asked for."""
+    """A target of ``SET_POSITION_TARGET_LOCAL_NED`` or ``…_GLOBAL_INT``, in our axes. None: not requested."""
 
     place: Vector | None
     velocity: Vector | None = None
@@ -61,7 +61,7 @@ class Target:
     yaw_rate: float = 0.0
 
     def follow(self, flight: FlightControl, speeds: Speeds = USUAL, turn: float | None = None) -> None:
-        """Fly it, with a yaw rate [rad/s] instead of its own if one is given. Called at every tick."""
+        """Fly it, with ``turn`` [rad/s] as yaw rate if given. Called at every tick."""
         if turn is None:
             turn = self.yaw_rate if self.yaw is None else flight.yaw_rate_to(self.yaw)
         if self.velocity is not None and self.place is None:
@@ -75,7 +75,7 @@ class Target:
 
 
 def target_of(message: Message) -> Target:
-    """Return the target of ``SET_POSITION_TARGET_LOCAL_NED``, its numbers finite or not."""
+    """Return the target of ``SET_POSITION_TARGET_LOCAL_NED``, finite or not."""
     mask, in_body = message.type_mask, message.coordinate_frame in (BODY, BODY_OFFSET)
     turn = flip if in_body else swap
     return Target(
@@ -88,9 +88,9 @@ def target_of(message: Message) -> Target:
 
 
 def global_target_of(message: Message, datum: float | None) -> Target | None:
-    """Return the target of ``SET_POSITION_TARGET_GLOBAL_INT``; None for a place or a frame that does not exist.
+    """Return the target of ``SET_POSITION_TARGET_GLOBAL_INT``; None for an invalid position or frame.
 
-    ``datum``: how high its altitude 0 is above our origin [m].
+    ``datum``: height of its altitude 0 above our origin [m].
     """
     mask, place = message.type_mask, None
     if not mask & _POSITION:
@@ -108,20 +108,20 @@ def global_target_of(message: Message, datum: float | None) -> Target | None:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeTarget:
-    """What ``SET_ATTITUDE_TARGET`` asks for, in our axes and signs. No attitude: rates alone."""
+    """A target of ``SET_ATTITUDE_TARGET``, in our axes and signs. Without an attitude: rates only."""
 
     attitude: Vector | None  #: roll, pitch, yaw
     yaw_rate: float
     thrust: float | None
-    unit: bool  #: whether the quaternion is one of a rotation
+    unit: bool  #: whether the quaternion is a rotation
 
     def turn(self, flight: FlightControl) -> float:
-        """Return the yaw rate that it asks for [rad/s]."""
+        """Return the requested yaw rate [rad/s]."""
         return self.yaw_rate if self.attitude is None else flight.yaw_rate_to(self.attitude[2]) + self.yaw_rate
 
     @property
     def tilt(self) -> tuple[float, float]:
-        """Roll and pitch [rad]; rates alone keep it level here."""
+        """Roll and pitch [rad]; level if only rates are requested."""
         return (0.0, 0.0) if self.attitude is None else self.attitude[:2]
 
 
@@ -138,7 +138,7 @@ def attitude_target_of(message: Message) -> AttitudeTarget:
     )
 
 
-_THERE_M: Final = 0.3
+_THERE_M: Final = 0.3  #: a waypoint of a return counts as reached within this
 
 
 class _Leg(Enum):
@@ -163,9 +163,9 @@ class Turn:
     """Turns by an angle from the present heading.
 
     Args:
-        flight: What turns.
+        flight: The flight to turn.
         angle: Counter-clockwise [rad]; may be more than half a turn.
-        fastest: Greatest yaw rate [rad/s].
+        fastest: Maximum yaw rate [rad/s].
     """
 
     def __init__(self, flight: FlightControl, angle: float, fastest: float) -> None:
@@ -188,11 +188,11 @@ class Manoeuvres:
         self._return: _Return | None = None
 
     def begin_rise(self, height_m: float) -> None:
-        """Begin to rise to a height."""
+        """Start to rise to a height."""
         self._rise_m = height_m
 
     def rise(self) -> bool:
-        """Take off and climb. Return whether it is up. Called at every tick."""
+        """Take off and climb. Return whether the height is reached. Called at every tick."""
         flight = self._flyer
         if self._rise_m is None:
             return True
@@ -204,18 +204,18 @@ class Manoeuvres:
         return up >= self._rise_m - 0.1
 
     def begin_return(self, home: Vector, height_m: float, *, wait_s: float = 0.0, final_m: float | None = None) -> None:
-        """Begin to return: climb, go home at that height, wait there, and land.
+        """Start to return: climb, fly home at that height, wait there, and land.
 
         Args:
             home: East, north, up from the origin [m].
-            height_m: Of the way, or as high as it can.
-            wait_s: Over home.
+            height_m: Height of the way, limited to what it can reach.
+            wait_s: Time to wait above home.
             final_m: Height to descend to instead of landing; None: land.
         """
         self._return = _Return(self._flyer.place, home, min(height_m, self._flyer.highest_m), wait_s, final_m)
 
     def return_home(self, speeds: Speeds = USUAL) -> None:
-        """Go on with the return. Called at every tick."""
+        """Continue the return. Called at every tick."""
         flight, way = self._flyer, self._return
         if way is None or flight.standing:
             return

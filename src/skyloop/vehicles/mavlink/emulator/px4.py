@@ -39,10 +39,10 @@ from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: without a remote control
-STICK_SPEED_M_S: Final = 10.0  #: of a stick that is all the way out (MPC_VEL_MANUAL)
-STICK_EXPO: Final = 0.6  #: how much flatter a stick is about its middle (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
-STICK_FILTER_S: Final = 0.1  #: of the speed of a stick
-LIFTS_OFF_AT: Final = 0.2  #: of the throttle stick's way up
+STICK_SPEED_M_S: Final = 10.0  #: at full stick (MPC_VEL_MANUAL)
+STICK_EXPO: Final = 0.6  #: how much flatter a stick is around its centre (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
+STICK_FILTER_S: Final = 0.1  #: filter of a stick's speed
+LIFTS_OFF_AT: Final = 0.2  #: share of the throttle stick's way up
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 _WORDS: Final = {
     "armed": "Armed by external command",
@@ -91,14 +91,14 @@ class Px4(Autopilot):
         super().__init__(vehicle, system, boot_s, gps)
         self.parameters = ParameterTable(services.PX4, bytewise=True)
         self.mode = "AUTO.LOITER"
-        self._intended = self.mode  # what the user asked for; kept under failsafes
+        self._intended = self.mode  # the mode that the user chose; failsafes keep it
         self._before = self.mode  # the mode before a manoeuvre
-        self._waiting_at: Target | None = None  # where HOLD is to be
+        self._waiting_at: Target | None = None  # where HOLD should be
         self._speeds = USUAL
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
         self._lost_gcs = False
-        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up, turning left; the whole way is 1
+        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up, turning left; 1 at full stick
         self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # [1/s], filtered
         self._stick_s = -math.inf
         self._lost_stick_s: float | None = None  # when a remote control in use went silent
@@ -110,7 +110,7 @@ class Px4(Autopilot):
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it may be armed in its mode."""
+        """Whether it can be armed in its mode."""
         return self.mode != "OFFBOARD" or self._fresh
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
@@ -121,19 +121,19 @@ class Px4(Autopilot):
 
     @property
     def _fresh(self) -> bool:
-        """Return whether set-points come."""
+        """Return whether set-points arrive."""
         return self.time_s - self._target_s <= self.parameters["COM_OF_LOSS_T"]
 
     # Modes -----------------------------------------------------------------------------------------------------
 
     @property
     def remote(self) -> bool:
-        """Whether it receives a remote control; a ground station's joystick is one."""
+        """Whether it receives a remote control; a ground station's joystick counts."""
         return self.time_s - self._stick_s <= self.parameters["COM_RC_LOSS_T"]
 
     def _fly(self) -> None:
-        self._look_at_sticks()
-        self._look_at_set_points()
+        self._check_sticks()
+        self._check_set_points()
         if self.mode == "OFFBOARD":
             self._fly_offboard()
         elif self.mode == "AUTO.TAKEOFF":
@@ -152,18 +152,18 @@ class Px4(Autopilot):
         elif self.flight.airborne:
             self._manoeuvres.follow(self._waiting_at, self._lean, self._speeds)
 
-    def _look_at_set_points(self) -> None:
+    def _check_set_points(self) -> None:
         if self.mode == "OFFBOARD" and not self._fresh:
             self.failsafe = True
             self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
         elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost:
-            self.failsafe = False  # back by itself: the user wanted it
+            self.failsafe = False  # recovered: the user had chosen it
             self._enter("OFFBOARD")
 
     @property
     def _lost(self) -> bool:
-        """Return whether a ground station or a remote control has gone silent: OFFBOARD does not come back then."""
+        """Return whether a ground station or remote control has gone silent: OFFBOARD then does not come back."""
         return self._lost_gcs or self._lost_stick_s is not None
 
     def _fly_offboard(self) -> None:
@@ -182,7 +182,7 @@ class Px4(Autopilot):
         self.flight.lean_by_thrust(roll, pitch, thrust, target.turn(self.flight))
 
     def _enter(self, mode: str) -> None:
-        """Change the mode. The next heartbeat reports it, and nothing before."""
+        """Change the mode. Only the next heartbeat reports it."""
         if mode != self.mode:
             self._before, self.mode = self.mode, mode
             self._waiting_at, self._speeds = None, USUAL
@@ -190,7 +190,7 @@ class Px4(Autopilot):
                 self._begin_return()
 
     def _begin_return(self) -> None:
-        """Return at RTL_RETURN_ALT, or within a cone over home; never lower than it is."""
+        """Return at RTL_RETURN_ALT, or within a cone over home; never below the present height."""
         east, north, up = self.flight.place
         above, distance = up - self.home[2], math.hypot(east - self.home[0], north - self.home[1])
         highest, near = self.parameters["RTL_RETURN_ALT"], self.parameters["NAV_ACC_RAD"]
@@ -214,7 +214,7 @@ class Px4(Autopilot):
         return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24 & 0xFF)
 
     def _change_mode(self, arguments: Arguments) -> int:
-        """Change the mode. Accepted, whatever becomes of it."""
+        """Change the mode. Accepted even if it has no effect."""
         main, sub = whole(arguments[1]), whole(arguments[2]) if len(arguments) > 2 else 0
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if mode is None or mode == "AUTO.READY":
@@ -252,7 +252,7 @@ class Px4(Autopilot):
         return TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
-        """Take off, armed or not, standing or flying."""
+        """Take off, armed or not, on the ground or flying."""
         amsl = arguments[6]
         above = self.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
         height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
@@ -289,7 +289,7 @@ class Px4(Autopilot):
     # Places and speeds by command ------------------------------------------------------------------------------
 
     def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
-        """HOLD at another position. Disarmed it only changes the mode."""
+        """HOLD at another position. While disarmed, it only changes the mode."""
         if whole(arguments[1]) != 1:
             return UNSUPPORTED
         fresh = self.mode != "AUTO.LOITER"
@@ -327,7 +327,7 @@ class Px4(Autopilot):
         return ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
-        """Change the speed. Accepted, whatever becomes of it."""
+        """Change the speed. Accepted even if it has no effect."""
         self._speeds = Speeds(across=arguments[1]) if 0 < arguments[1] < math.inf else USUAL
         return ACCEPTED
 
@@ -351,7 +351,7 @@ class Px4(Autopilot):
         since_s = self.time_s - self._stick_s
         if not self.remote:
             self._stick_moves = (0.0, 0.0, 0.0, 0.0)
-        elif since_s == 0.0:  # two in one step: how far it moves shows by the next one
+        elif since_s == 0.0:  # two in one step: the next one shows how far it moved
             return
         else:
             share = since_s / (since_s + STICK_FILTER_S)
@@ -379,10 +379,10 @@ class Px4(Autopilot):
         yaw_rate = turn * math.radians(self.parameters["MPC_MAN_Y_MAX"])
         self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
 
-    def _look_at_sticks(self) -> None:
-        """Hold, and then return, in any mode, once a remote control that was in use has gone silent."""
+    def _check_sticks(self) -> None:
+        """Hold, then return, in any mode, once a remote control that was in use has gone silent."""
         if self.remote:
-            if self._lost_stick_s is not None:  # back before it returned
+            if self._lost_stick_s is not None:  # back before the return began
                 self.failsafe, self._lost_stick_s = False, None
                 self._enter(self._intended)
             return

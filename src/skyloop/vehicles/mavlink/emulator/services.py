@@ -1,6 +1,6 @@
 """The emulated autopilots' parameters, and answers to requests for missions, files and logs. Pure.
 
-An ArduCopter keeps a mission, and flies none.
+An ArduCopter stores a mission but does not fly it.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ MISSION_ERROR: Final = 1
 MISSION_UNSUPPORTED: Final = 3
 MISSION_NO_SPACE: Final = 4
 MISSION_INVALID_SEQUENCE: Final = 13
-MOST_ITEMS: Final = 500
+MOST_ITEMS: Final = 500  #: of a mission
 _SCALE: Final = 1e7  #: of latitude and longitude in MISSION_ITEM_INT
 _HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
 MISSION_INVALID_X: Final = 10
 MISSION_INVALID_Y: Final = 11
 MISSION_INVALID_Z: Final = 12
 
-# Of the files' protocol: what comes, and what is answered.
+# The file protocol's requests and answers.
 _END_SESSION: Final = 1
 _END_SESSIONS: Final = 2
-_NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: list, open, create, remove, ...: requests that name a file
+_NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: list, open, create, remove, ...: requests with a file name
 _IN_SESSION: Final = (5, 7, 15)  #: read, write, read in a burst; nothing was opened
 _LIST: Final = 3
 _ACK: Final = 128
@@ -54,20 +54,20 @@ def mission_ack(message: Message, result: int) -> Message:
 
 
 class Mission:
-    """A mission as ArduCopter keeps it: item 0 is home, whatever is uploaded there.
+    """A mission as ArduCopter stores it: item 0 is always home, even after an upload.
 
     Attributes:
-        current: The number of the item that would be flown next.
+        current: The number of the next item to fly.
     """
 
     def __init__(self) -> None:
         self.current = 0
         self._items: list[Message] = []  # from number 1 on
         self._coming: list[Message] = []
-        self._wanted = 0  # of an upload under way; 0: there is none
+        self._wanted = 0  # item awaited in an upload; 0: no upload
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the answers to a message; None for one that is not about a mission."""
+        """Return the answers to a message; None if it is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None
@@ -125,17 +125,17 @@ class Mission:
 
 
 def answers(message: Message) -> Iterable[Message]:
-    """Yield the answers to a message; none for one that is no such request."""
+    """Yield the answers to a message; none if it is not such a request."""
     kind = message.get_type()
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "MISSION_REQUEST_LIST":
         yield m.MAVLink_mission_count_message(*sender, 0, message.mission_type)
-    elif kind == "MISSION_COUNT":  # an upload; an empty one clears what is not there
+    elif kind == "MISSION_COUNT":  # an upload; an empty one clears nothing
         yield mission_ack(message, MISSION_UNSUPPORTED if message.count else MISSION_ACCEPTED)
     elif kind == "MISSION_CLEAR_ALL":
         yield mission_ack(message, MISSION_ACCEPTED)
     elif kind in ("MISSION_REQUEST", "MISSION_REQUEST_INT", "MISSION_ITEM", "MISSION_ITEM_INT"):
-        yield mission_ack(message, MISSION_ERROR)  # there is none; nobody asked for it
+        yield mission_ack(message, MISSION_ERROR)  # an item that was not requested
     elif kind == "LOG_REQUEST_LIST":
         yield m.MAVLink_log_entry_message(0, 0, 0, 0, 0)
     elif kind == "FILE_TRANSFER_PROTOCOL":
@@ -154,7 +154,7 @@ def _of_files(message: Message) -> Message:
     else:
         answer[_OPCODE], answer[_SIZE] = _NAK, 1
         named = asked[_DATA : _DATA + min(asked[_SIZE], _PAYLOAD - _DATA)].rstrip(b"\0")
-        answer[_DATA] = _END_OF_FILE if opcode == _LIST and named == b"/" else _error(opcode)  # nothing is in the root
+        answer[_DATA] = _END_OF_FILE if opcode == _LIST and named == b"/" else _error(opcode)  # the root is empty
     return m.MAVLink_file_transfer_protocol_message(0, message.get_srcSystem(), message.get_srcComponent(), answer)
 
 
@@ -164,12 +164,12 @@ def _error(opcode: int) -> int:
     return _INVALID_SESSION if opcode in _IN_SESSION else _UNKNOWN_COMMAND
 
 
-AT_ONCE: Final = 16  #: parameters of a list that go out with each report
+AT_ONCE: Final = 16  #: list parameters sent with each report
 INT8: Final = 2
 INT16: Final = 4
 INT32: Final = 6
 
-#: Name: value and MAV_PARAM_TYPE. As the defaults of ArduCopter 4.7-dev.
+#: Name: value and MAV_PARAM_TYPE. The defaults of ArduCopter 4.7-dev.
 ARDUCOPTER: Final[dict[str, tuple[float, int]]] = {
     "ANGLE_MAX": (3000, INT16),
     "ARMING_CHECK": (1, INT32),
@@ -204,7 +204,7 @@ ARDUCOPTER: Final[dict[str, tuple[float, int]]] = {
     "WPNAV_SPEED_DN": (150.0, REAL32),
     "WPNAV_SPEED_UP": (250.0, REAL32),
 }
-#: As the defaults of PX4 1.17.
+#: The defaults of PX4 1.17.
 PX4: Final[dict[str, tuple[float, int]]] = {
     "COM_DISARM_LAND": (2.0, REAL32),
     "COM_DISARM_PRFLT": (10.0, REAL32),
@@ -240,7 +240,7 @@ PX4: Final[dict[str, tuple[float, int]]] = {
 
 
 class ParameterTable:
-    """The values, and the lists that are being sent."""
+    """The values, and the lists being sent."""
 
     def __init__(self, standard: Mapping[str, tuple[float, int]], *, bytewise: bool) -> None:
         self._kinds = {name: kind for name, (_, kind) in standard.items()}
@@ -258,7 +258,7 @@ class ParameterTable:
         self._values[name] = value
 
     def on_message(self, port: Port, message: Message) -> Iterable[Message]:
-        """Handle a message of the parameters' protocol; yield the answers that are sent at once."""
+        """Handle a parameter message; yield the immediate answers."""
         kind = message.get_type()
         if kind == "PARAM_REQUEST_LIST":
             self._lists[port] = deque(range(len(self._names)))

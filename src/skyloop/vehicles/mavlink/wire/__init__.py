@@ -1,4 +1,4 @@
-"""MAVLink as a driver and an emulated autopilot both need it: frames, modes, axes, parameters' values, texts.
+"""MAVLink parts shared by the driver and the emulated autopilot: frames, modes, axes, parameter values, texts.
 
-The messages themselves are pymavlink's; :mod:`skyloop.vehicles.mavlink.wire.codec` imports it, and nothing else does.
+Messages come from pymavlink, which only :mod:`skyloop.vehicles.mavlink.wire.codec` imports.
 """

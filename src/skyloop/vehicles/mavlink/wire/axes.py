@@ -1,10 +1,10 @@
-"""MAVLink's axes and ours.
+"""Conversions between MAVLink's axes and ours. Pure.
 
-World: north, east, down there; east, north, up here. Body: forward, right, down there;
-forward, left, up here. Yaw: clockwise from north there; counter-clockwise from east here. Quaternions: w, x, y, z in
-messages, x, y, z, w in all code. Pure.
+World: MAVLink has north, east, down; we have east, north, up. Body: MAVLink has forward, right, down; we have forward,
+left, up. Yaw: MAVLink counts clockwise from north; we count counter-clockwise from east. Quaternions: w, x, y, z in
+messages; x, y, z, w in all code.
 
-``flip`` and ``swap`` are their own inverses, and so is :func:`yaw_between`. :class:`WorldAxes` move the origin.
+``flip`` and ``swap`` are their own inverses, and so is :func:`yaw_between`. :class:`WorldAxes` moves the origin.
 """
 
 from __future__ import annotations
@@ -25,40 +25,40 @@ _HALF = math.sqrt(0.5)
 
 
 def flip(x: float, y: float, z: float) -> Vector:
-    """Body axes, either way."""
+    """Convert body axes, either way."""
     return x, 0.0 - y, 0.0 - z
 
 
 def swap(x: float, y: float, z: float) -> Vector:
-    """World axes, either way."""
+    """Convert world axes, either way."""
     return y, x, 0.0 - z
 
 
 def yaw_between(yaw: float) -> float:
-    """Heading, either way."""
+    """Convert a heading, either way."""
     return wrap_angle(math.pi / 2 - yaw)
 
 
 def to_wire(q: Quaternion) -> list[float]:
-    """A quaternion (x, y, z, w) as the field ``q`` of a message: w, x, y, z."""
+    """Return a quaternion (x, y, z, w) as a message's field ``q``: w, x, y, z."""
     x, y, z, w = q
     return [w, x, y, z]
 
 
 def from_wire(q: Sequence[float]) -> Quaternion:
-    """The field ``q`` of a message (w, x, y, z) as x, y, z, w."""
+    """Return a message's field ``q`` (w, x, y, z) as x, y, z, w."""
     w, x, y, z = q
     return x, y, z, w
 
 
 def turned_axes(q: Sequence[float]) -> Quaternion:
-    """A rotation from body to world, w, x, y, z, from our axes to MAVLink's or back, up to its sign."""
+    """Convert a body-to-world rotation (w, x, y, z) between our axes and MAVLink's, up to its sign."""
     w, x, y, z = q
     return _HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)
 
 
 def angles_of(q: Quaternion) -> Vector:
-    """Roll, pitch and yaw of a unit quaternion (x, y, z, w)."""
+    """Return roll, pitch and yaw of a unit quaternion (x, y, z, w)."""
     x, y, z, w = q
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
@@ -67,33 +67,32 @@ def angles_of(q: Quaternion) -> Vector:
     )
 
 
-ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: says where the autopilot's axes begin
-ORIGIN_HZ: Final = 1.0
+ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: message with the origin of the autopilot's axes
+ORIGIN_HZ: Final = 1.0  #: requested rate
 _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITION_ESTIMATE")
 
 
 class WorldAxes:
-    """Moves the positions in messages between the world's axes and the autopilot's. Both point the same way.
+    """Moves positions in messages between the world's axes and the autopilot's, which are parallel.
 
-    For an autopilot that begins its axes at its first fix: ArduPilot refuses another origin while it flies by
-    satellites, and several vehicles would have several axes.
+    For an autopilot whose axes begin at its first fix: ArduPilot refuses another origin while it flies by GPS, so
+    several vehicles would each have their own.
 
     Args:
-        begin: Latitude and longitude [°] and altitude [m] of where the world's axes begin; None: where the autopilot's
-            do.
+        begin: Origin of the world's axes: latitude and longitude [°] and altitude [m]; None: the autopilot's own.
     """
 
     def __init__(self, begin: tuple[float, float, float] | None) -> None:
         self.begin = begin
-        self._shift: Vector | None = None if begin is not None else (0.0, 0.0, 0.0)  # north, east, down, of theirs
+        self._shift: Vector | None = None if begin is not None else (0.0, 0.0, 0.0)  # origin offset: north, east, down
 
     def forget(self) -> None:
-        """Forget where the autopilot's axes begin: it may have been started again."""
+        """Forget the autopilot's origin: it may have rebooted."""
         if self.begin is not None:
             self._shift = None
 
     def received(self, message: Message, radius_m: float) -> bool:
-        """Move a local position of the vehicle's into the world's axes; return whether the message is of use."""
+        """Move the vehicle's local position into the world's axes; return whether the message can be used."""
         if self.begin is None:
             return True
         kind = message.get_type()
@@ -104,7 +103,7 @@ class WorldAxes:
         return kind != "LOCAL_POSITION_NED" or self._move(message, 1.0)
 
     def sent(self, message: Message) -> bool:
-        """Move a position for the vehicle into its own axes; return whether the message is to be sent."""
+        """Move a position for the vehicle into its own axes; return whether to send the message."""
         if self.begin is None or message.get_type() not in _POSITIONS:
             return True
         if getattr(message, "coordinate_frame", m.MAV_FRAME_LOCAL_NED) != m.MAV_FRAME_LOCAL_NED:

@@ -1,8 +1,8 @@
-"""MAVLink frames, 1 and 2, with pymavlink: bytes to messages and back, texts and parameters in them.
+"""MAVLink 1 and 2 frames with pymavlink: bytes to messages and back, with the texts and parameters inside.
 
-Pure but for the wall clock of signatures. A parameter's number is in the float field of ``PARAM_VALUE`` and
-``PARAM_SET`` in one of two ways. ArduPilot converts integers to floats; PX4 puts the integer's bytes there.
-``AUTOPILOT_VERSION.capabilities`` says which (``PARAM_ENCODE_BYTEWISE``).
+Pure except for the wall clock in signatures. The float field of ``PARAM_VALUE`` and ``PARAM_SET`` holds an integer in
+one of two ways: ArduPilot converts it to a float; PX4 stores its bytes. ``AUTOPILOT_VERSION.capabilities`` says which
+(``PARAM_ENCODE_BYTEWISE``).
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ except ImportError as error:
 
 __all__ = ["KEY_BYTES", "MAX_FRAME", "Codec", "Message", "dialect"]
 
-#: One of pymavlink's messages; its fields are attributes.
+#: A pymavlink message; its fields are attributes.
 Message: TypeAlias = Any
 
-MAX_FRAME: Final = 280  #: bytes of the longest frame, with its signature
+MAX_FRAME: Final = 280  #: bytes of the longest frame, signature included
 KEY_BYTES: Final = 32
 _AROUND_V1: Final = 8  #: bytes of a frame's header and checksum
-_AROUND_V2: Final = 12
-_SIGNATURE: Final = 13
+_AROUND_V2: Final = 12  #: the same of MAVLink 2
+_SIGNATURE: Final = 13  #: bytes
 _LEAST: Final = _AROUND_V1
 _MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
-_MOST_SOURCES: Final = 16  #: whose cut frames are kept; anybody can send datagrams
-_SIGNED: Final = 1  #: of the flags that a receiver must understand
-_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, from which signatures count time in steps of 10 µs
+_MOST_SOURCES: Final = 16  #: senders whose cut frames are kept: anybody can send datagrams
+_SIGNED: Final = 1  #: one of the flags that a receiver must understand
+_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, when signature time begins, in steps of 10 µs
 _STEPS_PER_S: Final = 100_000
-_OLD: Final = 60 * _STEPS_PER_S  #: a sender that is heard for the first time may be behind by so much
-_UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: which radios send, who have no key
-_HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, number in sequence, system, component, kind
-_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two kinds of flags, the same; the kind has three bytes
+_OLD: Final = 60 * _STEPS_PER_S  #: how far behind a new sender's time may be
+_UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: sent by radios, which have no key
+_HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, sequence number, system, component, type
+_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, the same; the type has three bytes
 
 
 class _Kind(NamedTuple):
-    """A kind of message whose fields are numbers, and how one is made of its payload.
+    """A message type with numeric fields only, and how to build it from a payload.
 
-    pymavlink's own way takes three times as long, most of it to sort fields, and to make room for what strings and
-    arrays need.
+    pymavlink's own decoder takes three times as long, mostly because it sorts the fields and makes room for strings and
+    arrays in every message.
     """
 
     make: type[Message]
-    common: dict[str, Any]  #: attributes that all messages of the kind have alike
-    fields: list[str]  #: in the order of the payload
-    size: int  #: of the whole payload; zeros at its end are not sent
+    common: dict[str, Any]  #: attributes shared by all messages of the type
+    fields: list[str]  #: in payload order
+    size: int  #: of the whole payload; trailing zeros are not sent
     unpack: Callable[[bytes], tuple[Any, ...]]
-    seed: bytes  #: what the checksum takes in besides the frame
+    seed: bytes  #: what the checksum covers besides the frame
 
 
-@lru_cache(maxsize=512)  # anybody may send numbers of kinds that there are not
+@lru_cache(maxsize=512)  # bounded: anybody may send invalid message numbers
 def _kind_of(number: int) -> _Kind | None:
-    """Return how messages of a kind are made; None for one that is not known or has strings or arrays."""
+    """Return how to build a message type; None if it is unknown or has strings or arrays."""
     made: Any = dialect.mavlink_map.get(number)
     if made is None or any(made.array_lengths) or set(made.lengths) != {1}:
         return None
@@ -72,9 +72,9 @@ def _kind_of(number: int) -> _Kind | None:
 
 
 def _decode_plain(data: bytes) -> Message | None:
-    """Return the message of one whole frame without a signature; None: this is for pymavlink to decode, or to refuse.
+    """Return the message of one whole unsigned frame; None: leave it to pymavlink to decode or reject.
 
-    It is what pymavlink makes of the frame, attribute by attribute.
+    The result equals pymavlink's, attribute by attribute.
     """
     incompatible = compatible = 0
     if data[0] == dialect.PROTOCOL_MARKER_V1:
@@ -96,13 +96,13 @@ def _decode_plain(data: bytes) -> Message | None:
     attributes.update(kind.common)
     attributes.update(zip(kind.fields, kind.unpack(data[begin:end].ljust(kind.size, b"\0")[: kind.size]), strict=True))
     message._msgbuf, message._crc = bytearray(data), checksum
-    message._payload = message._msgbuf[_HEADER_V1.size : end]  # as pymavlink has it, for both versions
+    message._payload = message._msgbuf[_HEADER_V1.size : end]  # as in pymavlink, for both versions
     message._header = dialect.MAVLink_header(number, incompatible, compatible, length, sequence, system, component)
     return message
 
 
 def _length_of(data: bytes) -> int | None:
-    """Return how long the frame is that begins here; None: none begins, or too little of it is there to tell."""
+    """Return the length of the frame that starts here; None if there is none, or too little of it."""
     if len(data) < _LEAST or data[0] not in _MARKERS:
         return None
     if data[0] == dialect.PROTOCOL_MARKER_V1:
@@ -111,7 +111,7 @@ def _length_of(data: bytes) -> int | None:
 
 
 def _begins_with_a_frame(data: bytes) -> bool:
-    """Whether a whole frame of a known kind with the right checksum stands first."""
+    """Return whether the data starts with a whole, known frame with a valid checksum."""
     length = _length_of(data)
     if length is None or len(data) < length:
         return False
@@ -126,20 +126,20 @@ def _begins_with_a_frame(data: bytes) -> bool:
 
 
 class _Signatures:
-    """Time and senders of one link's signatures, as MAVLink 2 has them: time never stands still nor goes back."""
+    """The time and senders of one link's MAVLink 2 signatures. The time only increases."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._newest = 0  # of all that was sent and taken
-        self._streams: dict[tuple[int, int, int], int] = {}  # link, system and component: the newest that was taken
+        self._newest = 0  # newest time sent or accepted
+        self._streams: dict[tuple[int, int, int], int] = {}  # newest time accepted by link, system and component
 
     def now(self) -> int:
-        """Return the time for the next signature: this host's, or that of a sender who is ahead, and never the last."""
+        """Return the next signature's time: this host's or, if later, just after the newest time so far."""
         self._newest = max(self._newest + 1, int((time.time() - _SIGNING_EPOCH_S) * _STEPS_PER_S))
         return self._newest
 
     def check(self, frame: bytearray, system: int, component: int) -> bool:
-        """Return whether a signed frame is to be taken; one without the key changes nothing, whatever it claims."""
+        """Return whether to accept a signed frame; one signed without the key changes nothing, whatever it claims."""
         signature = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
         if not hmac.compare_digest(signature, bytes(frame[-6:])):
             return False
@@ -153,28 +153,28 @@ class _Signatures:
 
 
 class Codec:
-    """One end of one link: its numbering, what is left of a frame that is not whole yet, and its signatures.
+    """One end of a link: its sequence numbers, unfinished frames and signatures.
 
-    ``key``: 32 bytes; with them everything that is sent is signed and nothing is taken that is not (MAVLink 2 only).
+    ``key``: 32 bytes; with a key, everything sent is signed and everything unsigned is rejected (MAVLink 2 only).
     """
 
     def __init__(self, system: int, component: int, *, key: bytes | None = None) -> None:
         if key is not None and len(key) != KEY_BYTES:
             raise UsageError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
-        self.frames = 0  #: whole ones that came
-        self.damaged = 0  #: pieces that were no frame, or one that is damaged
-        self.unknown = 0  #: frames of kinds that nothing is known of
-        self.signed = 0  #: frames that came with a signature while no key is known: not taken
+        self.frames = 0  #: whole frames received
+        self.damaged = 0  #: damaged frames, and pieces that are no frame
+        self.unknown = 0  #: frames of unknown types
+        self.signed = 0  #: signed frames rejected for lack of a key
         self._key = key
         self._signatures = None if key is None else _Signatures(key)
-        self._rests: dict[Hashable, bytes] = {}  # by sender of datagrams, what is left of a frame that was cut
+        self._rests: dict[Hashable, bytes] = {}  # incomplete frames by sender of datagrams
         self._sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self._receiver = self._fresh()
         if key is not None:
             self._sender.signing.secret_key, self._sender.signing.sign_outgoing = key, True
 
     def encode(self, message: Message, *, version: int = 2) -> bytes:
-        """A frame, numbered. Raises ``struct.error`` for a field that does not fit."""
+        """Return a numbered frame. Raises ``struct.error`` for a field that does not fit."""
         old = version == 1 and self._key is None
         if self._signatures is not None:
             self._sender.signing.timestamp = self._signatures.now()
@@ -183,19 +183,19 @@ class Codec:
         return frame
 
     def decode(self, data: bytes, *, whole: bool = False, source: Hashable = None) -> list[Message]:
-        """The messages that these bytes complete. Never raises for what it is fed.
+        """Return the messages that these bytes complete. Never raises, whatever the input.
 
-        ``whole``: a datagram, of ``source``. A frame may go on in that one's next datagram, as behind a bridge that
-        cuts a serial line's bytes anywhere.
+        ``whole``: a datagram from ``source``. A frame may continue in the sender's next datagram: some bridges cut a
+        serial line's bytes anywhere.
         """
         if not whole:
             return self._parsed(data)
         rest = self._rests.pop(source, b"")
-        if _length_of(data) == len(data):  # what nearly all datagrams are: no search for where a frame begins and ends
+        if _length_of(data) == len(data):  # nearly every datagram: needs no search for frame boundaries
             self.damaged += bool(rest)
             return self._decoded(data)
         if rest and _begins_with_a_frame(data):
-            rest = b""  # what followed it was lost
+            rest = b""  # the end of that frame was lost
             self.damaged += 1
         self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         found = self._parsed(rest + data)
@@ -222,7 +222,7 @@ class Codec:
         except dialect.MAVError:
             self.damaged += 1
             return []
-        except Exception:  # noqa: BLE001  whatever a field of noise made of it: restart with the next bytes
+        except Exception:  # noqa: BLE001  noise in a field broke the parser: restart with the next bytes
             self._receiver = self._fresh()
             self.damaged += 1
             return []
@@ -252,30 +252,30 @@ class Codec:
         return receiver
 
 
-CHUNK: Final = 50
-_MOST_OPEN: Final = 8  #: texts that are begun and not ended: the oldest is given out as it is
+CHUNK: Final = 50  #: characters of a STATUSTEXT
+_MOST_OPEN: Final = 8  #: unfinished texts; beyond that the oldest is returned incomplete
 
 
 def chunks_of(text: str, severity: int, number: int) -> list[Message]:
-    """The messages of one text. ``number``: of this text; 0 for one that fits one message."""
+    """Split one text into messages. ``number``: the text's id; 0 for one that fits a single message."""
     data = text.encode("ascii", "replace")
     if len(data) < CHUNK:
         return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]
-    pieces = [data[at : at + CHUNK] for at in range(0, len(data) + 1, CHUNK)]  # the last one has room for its end
+    pieces = [data[at : at + CHUNK] for at in range(0, len(data) + 1, CHUNK)]  # the last piece is never full
     return [dialect.MAVLink_statustext_message(severity, piece, number, at) for at, piece in enumerate(pieces)]
 
 
 class Texts:
-    """Puts chunks together. What a lost chunk held is shown as an ellipsis."""
+    """Joins the chunks of texts. An ellipsis stands for a lost chunk."""
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], tuple[int, dict[int, str]]] = {}
         self._ended: dict[tuple[int, int], dict[int, str]] = {}
 
     def on_message(self, message: Message) -> list[tuple[int, str]]:
-        """The texts that are complete with this message, with their severities (0 emergency to 7 debug).
+        """Return the texts completed by this message, with their severities (0 emergency to 7 debug).
 
-        A chunk that comes twice, or after the last one of its text, makes no other text.
+        A chunk that arrives twice, or after its text's last one, starts no new text.
         """
         text = _printable(message.text)
         number = message.id
@@ -285,7 +285,7 @@ class Texts:
         if key in self._ended:
             if self._ended[key].get(message.chunk_seq, text) == text:
                 return []
-            del self._ended[key]  # the vehicle was started anew, and counts its texts from the beginning
+            del self._ended[key]  # the vehicle rebooted and numbers its texts from the start
         _, chunks = self._open.setdefault(key, (message.severity, {}))
         ended: list[tuple[int, str]] = []
         chunks[message.chunk_seq] = text
@@ -308,9 +308,9 @@ def _printable(text: str) -> str:
     return "".join(each if each.isprintable() or each == " " else " " for each in text)
 
 
-BYTEWISE: Final = 0x10  #: of the capabilities
+BYTEWISE: Final = 0x10  #: a bit of the capabilities
 REAL32: Final = 9
-#: ``MAV_PARAM_TYPE``: how an integer lies in the four bytes, its least and its greatest value.
+#: ``MAV_PARAM_TYPE``: layout of an integer in the four bytes, and its range.
 _INTEGERS: Final = {
     1: ("<B3x", 0, 0xFF),
     2: ("<b3x", -0x80, 0x7F),
@@ -322,25 +322,25 @@ _INTEGERS: Final = {
 
 
 def is_integer(kind: int) -> bool:
-    """Whether this ``MAV_PARAM_TYPE`` is a whole number."""
+    """Return whether this ``MAV_PARAM_TYPE`` is a whole number."""
     return kind in _INTEGERS
 
 
 def bounds(kind: int) -> tuple[int, int]:
-    """Least and greatest value of an integer's type."""
+    """Return the least and greatest value of an integer type."""
     _, low, high = _INTEGERS[kind]
     return low, high
 
 
 def from_field(field: float, kind: int, *, bytewise: bool) -> int | float:
-    """The number. Raises :class:`DecodeError` for a type that is not known or an integer that is none."""
+    """Return the number. Raises :class:`DecodeError` for an unknown type or an integer field without an integer."""
     if not is_integer(kind):
         if kind != REAL32:
-            raise DecodeError(f"a parameter of type {kind} is not known")
+            raise DecodeError(f"parameter type {kind} is unknown")
         return field
     if not bytewise:
         if not math.isfinite(field):
-            raise DecodeError(f"{field} is no whole number")
+            raise DecodeError(f"{field} is not a whole number")
         return round(field)
     form, _, _ = _INTEGERS[kind]
     number: int = struct.unpack(form, struct.pack("<f", field))[0]
@@ -348,7 +348,7 @@ def from_field(field: float, kind: int, *, bytewise: bool) -> int | float:
 
 
 def to_field(value: float, kind: int, *, bytewise: bool) -> float:
-    """The field for a number that fits its type. Raises ``struct.error`` for one that does not."""
+    """Return the field for a number that fits its type. Raises ``struct.error`` otherwise."""
     if not (bytewise and is_integer(kind)):
         return float(value)
     field: float = struct.unpack("<f", struct.pack(_INTEGERS[kind][0], int(value)))[0]

@@ -1,4 +1,4 @@
-"""The autopilots' modes by name: numbers of ArduCopter, and main and sub modes of PX4.
+"""Mode names: ArduCopter's numbers, and PX4's main and sub modes.
 
 Sources: ``mode.h`` of ArduCopter, ``px4_custom_mode.h`` of PX4.
 """
@@ -10,7 +10,7 @@ from typing import Final
 
 
 class Autopilot(IntEnum):
-    """``MAV_AUTOPILOT`` of those that are known here."""
+    """The supported ``MAV_AUTOPILOT`` values."""
 
     ARDUPILOT = 3
     PX4 = 12
@@ -24,11 +24,11 @@ class ModeFlag(IntFlag):
 
 
 class SystemState(IntEnum):
-    """``system_status`` of a heartbeat, as far as it says something here."""
+    """``system_status`` of a heartbeat: the values used here."""
 
     STANDBY = 3
     ACTIVE = 4
-    CRITICAL = 5  #: a failsafe is at work
+    CRITICAL = 5  #: a failsafe is active
     EMERGENCY = 6
     TERMINATION = 8
 
@@ -94,17 +94,17 @@ PX4_NUMBERS: Final = {name: numbers for numbers, name in PX4_MODES.items()}
 
 
 def copter_mode(custom_mode: int) -> str:
-    """The name of a heartbeat's ``custom_mode``."""
+    """Return the name of a heartbeat's ``custom_mode``."""
     return COPTER_MODES.get(custom_mode, f"MODE_{custom_mode}")
 
 
 def px4_mode(custom_mode: int) -> str:
-    """The name of a heartbeat's ``custom_mode``."""
+    """Return the name of a heartbeat's ``custom_mode``."""
     main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
     return PX4_MODES.get((main, sub)) or PX4_MODES.get((main, 0)) or f"MODE_{main}.{sub}"
 
 
 def px4_custom(name: str) -> int:
-    """The ``custom_mode`` of a name."""
+    """Return the ``custom_mode`` of a name."""
     main, sub = PX4_NUMBERS[name]
     return main << 16 | sub << 24

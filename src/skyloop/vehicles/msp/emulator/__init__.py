@@ -1,4 +1,4 @@
-"""A racing drone with Betaflight, emulated over a simulated vehicle, for any program that speaks MSP over TCP.
+"""An emulated racing drone with Betaflight, flying a simulated vehicle for any program that speaks MSP over TCP.
 
 For a test::
 
@@ -9,10 +9,10 @@ For a test::
     host = SimHost(with_racers(SimOptions(world="room", seed=1)))
     with BetaflightFirmware(host, port=0) as firmware:
         firmware.address  # for a driver: msp://tcp:127.0.0.1:…
-        host.simulation.truth(0).position_m  # what the vehicle really does
+        host.simulation.truth(0).position_m  # the vehicle's true position
 
-Its barometer and GPS are those of the simulated vehicle. It answers what a driver needs, and is set up as
-``docs/msp.md`` asks for.
+Its barometer and GPS are the simulated vehicle's. It answers the driver's requests, and is set up as ``docs/msp.md``
+asks.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The bound port, also if 0 was requested."""
         return self._server.port
 
     def _receive(self, data: bytes) -> None:
@@ -81,17 +81,17 @@ class RunningFirmware(RunningEmulator):
 
 
 class BetaflightFirmware(Emulator[RunningFirmware]):
-    """The flight controller of one drone of a host's world. Several may share a host, each with a drone and a port.
+    """The flight controller of one drone in a host's world. Several may share a host, each with its own drone and port.
 
     Make the host with :func:`with_racers`.
 
     Args:
         host: The simulated world.
-        drone: Its number in it.
-        bind: The address of this machine to listen on.
-        port: TCP; 0 for any free one.
-        settings: How it is set up.
-        loop: The thread of a whole fleet; None: a thread of its own.
+        drone: Its number in the world.
+        bind: The local address to listen on.
+        port: TCP port; 0: any free one.
+        settings: Its settings.
+        loop: The thread of a whole fleet; None: a separate thread.
     """
 
     def __init__(
@@ -111,12 +111,12 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self._bind, self._port, self.settings, self._loop)
-        self._port = running.port  # found again after a restart
+        self._port = running.port  # keep the port over a restart
         return running
 
     @property
     def port(self) -> int:
-        """The real port, where 0 was asked for."""
+        """The bound port, also if 0 was requested."""
         return self._started.port
 
     @property
@@ -126,10 +126,10 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def address(self) -> str:
-        """Address of a driver on this machine."""
+        """Address for a driver on this machine."""
         return f"msp://tcp:{self._bind}:{self.port}"
 
     @property
     def description(self) -> str:
-        """Where it is, in one line for people."""
+        """Kind, number and address, in one line for people."""
         return f"betaflight drone {self.drone}: {self.address}"

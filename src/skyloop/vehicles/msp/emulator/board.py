@@ -1,6 +1,6 @@
 """The flight controller's settings and logic: receiver, arming, failsafe, flight, answers. Pure.
 
-What it does when the sticks stop was measured with Betaflight 4.6.0's own simulation (``docs/msp.md``).
+Its reaction to missing sticks was measured with Betaflight 4.6.0's SITL (``docs/msp.md``).
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from skyloop.vehicles.msp.wire.messages import (
     Status,
 )
 
-PORT: Final = 5761  #: of the first serial port of Betaflight's own simulation
+PORT: Final = 5761  #: of the first serial port in Betaflight's SITL
 CHANNELS: Final = 18
-HOVER_THROTTLE: Final = 0.32  #: that carries it, of a full stick; estimate
-THRUST_POWER: Final = 1.6  #: of the throttle; estimate
+HOVER_THROTTLE: Final = 0.32  #: hover throttle, as a share of full throttle; estimate
+THRUST_POWER: Final = 1.6  #: exponent of the throttle; estimate
 CELLS: Final = 4
 
-#: A 5-inch quadrotor with a battery of four cells. Estimates of the usual size.
+#: A 5-inch quadrotor with a four-cell battery. Estimates of typical values.
 RACER: Final = VehicleParameters(
     mass_kg=0.6,
     radius_m=0.18,
@@ -64,12 +64,12 @@ RACER: Final = VehicleParameters(
 )
 REPORTS_HZ: Final = 100.0
 _ACTUAL: Final = AxisRates(7, 0, 67)
-#: Betaflight's own: 70 degrees/s about the middle of a stick, 670 at its end.
+#: Betaflight's own: 70 degrees/s around the centre of a stick, 670 at its end.
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
-#: (permanent number, name) in the order of the status' bits, as Betaflight 4.6 lists them without more features.
+#: (permanent number, name) in the order of the status bits, as listed by Betaflight 4.6 without more features.
 BOXES: Final = ((0, "ARM"), (1, "ANGLE"), (2, "HORIZON"), (27, "FAILSAFE"), (28, "AIR MODE"), (36, "PREARM"))
-#: Replies of Betaflight 4.6.0 to what the emulation has no state of, by number: how many bytes, and the first of them
-#: as hexadecimal digits; the rest are zeros. Recorded from its own simulation, with its defaults, at rest.
+#: Replies of Betaflight 4.6.0 for which the emulator keeps no state, by number: size in bytes, and the first bytes in
+#: hexadecimal; the rest are zeros. Recorded from its SITL, with default settings, at rest.
 RECORDED: Final[dict[int, tuple[int, str]]] = {
     5: (30, "4e6f76203236203230323631353a30343a323700484f52495a4f1f402b20"),
     10: (0, ""),
@@ -115,8 +115,8 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
-#: Writes that Betaflight 4.6.0 acknowledges even when empty, of the numbers up to 100; they have no effect
-#: here. Not among them: 59, 61, 68 (which restarts it) and 69, to which it gives answers of their own or none.
+#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. Missing:
+#: 59, 61, 68 (which restarts it) and 69, which get other answers or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
 )
@@ -124,7 +124,7 @@ EMPTY_WRITES: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class BoardSettings:
-    """How the flight controller is set up: by default, as ``docs/msp.md`` asks for."""
+    """The flight controller's settings: by default, as ``docs/msp.md`` asks."""
 
     ranges: tuple[ModeRange, ...] = (ModeRange(0, 0, 1700, 2100), ModeRange(1, 1, 900, 2100))
     failsafe: FailsafeConfig = field(default_factory=lambda: FailsafeConfig(1.5, 60.0, 1000, 10.0, 1))
@@ -136,39 +136,39 @@ class BoardSettings:
     rx_msp: bool = True
     gps: bool = True
     barometer: bool = True
-    boot_s: float = 0.5  #: until it lets itself be armed [s]; real ones take 5
-    flags: int = 0  #: that keep it from arming besides, a bit each
+    boot_s: float = 0.5  #: until it can be armed [s]; 5 s on real ones
+    flags: int = 0  #: further flags that prevent arming, one bit each
 
 
 def with_racers(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are racers. They have no camera: MSP carries no video."""
+    """Return options of a world whose drones are racers, without cameras: MSP carries no video."""
     return replace(options or SimOptions(), parameters=RACER, rate_hz=REPORTS_HZ, cameras=())
 
 
 API: Final = (1, 47)
 VERSION: Final = (4, 6, 0)
 NAME: Final = "EMULATED"
-FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: with ARM_SWITCH
-LOSS_NS: Final = nanoseconds(0.15)  #: without sticks for so long, the receiver is lost
-HOLD_NS: Final = nanoseconds(0.3)  #: until then the last sticks are in force
-RECOVERY_NS: Final = nanoseconds(0.5)  #: so long sticks must come again
-IDLE: Final = 0.055  #: share of the throttle at which motors turn while it is armed
-LEVEL_RAD: Final = math.radians(25.0)  #: it arms within
-GROUND_M: Final = 0.06
-ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: an arbitrary place for the world's origin
+FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: including ARM_SWITCH
+LOSS_NS: Final = nanoseconds(0.15)  #: without sticks for this long, the receiver is lost
+HOLD_NS: Final = nanoseconds(0.3)  #: how long the last sticks stay in force
+RECOVERY_NS: Final = nanoseconds(0.5)  #: how long sticks must arrive again
+IDLE: Final = 0.055  #: share of the throttle at which the motors idle while armed
+LEVEL_RAD: Final = math.radians(25.0)  #: greatest tilt at which it arms
+GROUND_M: Final = 0.06  #: below this height with little thrust, it is on the ground
+ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: an arbitrary origin for the world
 SATELLITES: Final = 14
 _ROLL, _PITCH, _YAW, _THROTTLE = range(4)
 
 
 def bit(name: str) -> int:
-    """Return a flag that keeps it from arming as its bit."""
+    """Return the bit of a flag that prevents arming."""
     return 1 << (FLAGS - 1 if name == ARM_SWITCH else BETAFLIGHT_FLAGS.index(name))
 
 
 class Board:
     """One flight controller. Not thread-safe. Used on the loop's thread.
 
-    ``received``: sticks that came, in the order roll, pitch, yaw, throttle, AUX; ``frames``: how many.
+    ``received``: the latest sticks, in the order roll, pitch, yaw, throttle, AUX; ``frames``: how many frames.
     """
 
     def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:
@@ -176,7 +176,7 @@ class Board:
         self.armed = False
         self.received: list[int] = []
         self.frames = 0
-        self.silenced = False  #: answers nothing, as a line that is cut
+        self.silenced = False  #: answers nothing, like a cut line
         self._flight = FlightControl(vehicle)
         self._report: Report | None = None
         self._begun_ns = now_ns
@@ -186,10 +186,10 @@ class Board:
         self._landing_ns: int | None = None
         self._not_disarmed = False
         self._had_sticks = False
-        self._refused = False  # the arm switch was on while something kept it from arming
+        self._refused = False  # the arm switch was on while something prevented arming
         self._crashed = False
         self._ground_m = 0.0
-        self._data = [1500, 1500, 1500, 885, *[1500] * (CHANNELS - 4)]  # what is in force
+        self._data = [1500, 1500, 1500, 885, *[1500] * (CHANNELS - 4)]  # the sticks in force
         tilt = share_of(rate_curve(settings.rates.kind, settings.rates.roll))
         self._tilt: Callable[[float], float] = lambda stick: math.radians(settings.angle_limit_deg) * tilt(stick)
         self._turn = rate_curve(settings.rates.kind, settings.rates.yaw)
@@ -370,7 +370,7 @@ class Board:
                 self._data[channel] = usual[channel] if channel < len(usual) else 1500
 
     def _fail(self, now_ns: int) -> None:
-        """Do what is to be done when the sticks have stopped: land, or drop."""
+        """Execute the failsafe after the sticks have stopped: land, or drop."""
         config = self.settings.failsafe
         if self._landing_ns is None:
             self._landing_ns = now_ns
@@ -417,5 +417,5 @@ class Board:
         flight.lean_by_thrust(self._lean(roll), self._lean(pitch), thrust, turn)
 
     def _lean(self, stick: float) -> float:
-        """Return the angle of a stick in ANGLE mode; without that mode it stays level, for nothing else is emulated."""
+        """Return the angle of a stick in ANGLE mode; level in other modes, which are not emulated."""
         return math.copysign(self._tilt(min(1.0, abs(stick))), stick) if self._is_on(1) else 0.0

@@ -1,1 +1,1 @@
-"""MSP, the MultiWii serial protocol, versions 1 and 2, as Betaflight and INAV speak it. Both ways, pure."""
+"""MSP, the MultiWii serial protocol, versions 1 and 2, as used by Betaflight and INAV. Both directions, pure."""

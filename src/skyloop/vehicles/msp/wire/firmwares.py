@@ -1,7 +1,7 @@
-"""How far a stick has to be moved: the firmware's rate curves and their inverse. Pure.
+"""The firmwares' rate curves and their inverse, from rates and angles to sticks. Pure.
 
-Betaflight's five kinds of rates, as its documentation plots them; from version 4.5 on ANGLE mode leans along the same
-curve, earlier in proportion to the stick. INAV has one cubic for roll and pitch and one for yaw.
+Betaflight has five kinds of rates, as plotted in its documentation. From version 4.5 on, ANGLE mode leans along the
+same curve, before that in proportion to the stick. INAV has one cubic for roll and pitch and one for yaw.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Final
 from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire.messages import INAV
 
-Curve = Callable[[float], float]  #: from a stick, 0 to 1, to a rate [degrees/s] or a share; grows
+Curve = Callable[[float], float]  #: from a stick, 0 to 1, to a rate [degrees/s] or a share; increasing
 
 _KINDS: Final = ("betaflight", "raceflight", "kiss", "actual", "quick")
-_STEPS: Final = 24
+_STEPS: Final = 24  #: of the bisection
 
 
 @dataclass(frozen=True, slots=True)
 class AxisRates:
-    """The three numbers of an axis, 0 to 255 as the firmware keeps them."""
+    """The three numbers of an axis, 0 to 255, as stored by the firmware."""
 
     centre: int
     expo: int
@@ -42,7 +42,7 @@ class Rates:
 def betaflight_rates(payload: bytes) -> Rates:
     """Read Betaflight's ``RC_TUNING``, from API 1.43 on with the kind of rates. Raises :class:`DecodeError`."""
     if len(payload) < 14:
-        raise DecodeError(f"RC_TUNING of {len(payload)} bytes: 14 are the least")
+        raise DecodeError(f"RC_TUNING of {len(payload)} bytes: at least 14 expected")
     number = payload[22] if len(payload) > 22 else 0
     return Rates(
         _KINDS[number] if number < len(_KINDS) else "unknown",
@@ -61,7 +61,7 @@ def pack_betaflight_rates(rates: Rates) -> bytes:
 
 
 def rate_curve(kind: str, rates: AxisRates) -> Curve:
-    """Return how fast a stick turns [degrees/s]; for an unknown kind a straight line to 200."""
+    """Return the turn rate [degrees/s] by stick; for an unknown kind, a straight line to 200."""
     makers = {"betaflight": _betaflight, "raceflight": _raceflight, "kiss": _kiss, "actual": _actual, "quick": _quick}
     return makers[kind](rates) if kind in makers else lambda stick: 200.0 * stick
 
@@ -104,18 +104,18 @@ def _quick(rates: AxisRates) -> Curve:
 
 
 def inav_curve(expo: int, full: float) -> Curve:
-    """Return INAV's curve by its expo (0 to 100) and what a full stick comes to, in any unit."""
+    """Return INAV's curve from its expo (0 to 100) and the value of a full stick, in any unit."""
     return lambda stick: full * _bent(stick, expo / 100, 3)
 
 
 def share_of(curve: Curve) -> Curve:
-    """Return the curve as a share of what a full stick comes to."""
+    """Return the curve as a share of its value at full stick."""
     full = curve(1.0)
     return lambda stick: curve(stick) / full if full > 0 else stick
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, that comes to a value; a full one if none does."""
+    """Return the stick, -1 to 1, for a value; a full stick if none reaches it."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:
@@ -131,7 +131,7 @@ def stick_for(curve: Curve, wanted: float) -> float:
     return -stick if wanted < 0 else stick
 
 
-#: Betaflight 4.1 (API 1.42) on, from bit 0; ARM_SWITCH is always the last of those that a version has.
+#: Betaflight 4.1 (API 1.42) on, from bit 0; ARM_SWITCH is always a version's last flag.
 BETAFLIGHT_FLAGS: Final = (
     *("NOGYRO", "FAILSAFE", "RXLOSS", "NOT_DISARMED", "BOXFAILSAFE", "RUNAWAY", "CRASH", "THROTTLE", "ANGLE"),
     *("BOOTGRACE", "NOPREARM", "LOAD", "CALIB", "CLI", "CMS", "BST", "MSP", "PARALYZE", "GPS", "RESCUE_SW"),
@@ -139,7 +139,7 @@ BETAFLIGHT_FLAGS: Final = (
     "POS_HOLD_SW",
 )
 ARM_SWITCH: Final = "ARM_SWITCH"
-#: INAV's, by bit.
+#: INAV's flags, by bit.
 INAV_FLAGS: Final = {
     6: "GEOZONE",
     7: "FAILSAFE",
@@ -166,10 +166,10 @@ INAV_FLAGS: Final = {
     29: "DSHOT_BEEPER",
     30: "LANDING_DETECTED",
 }
-#: What a flag means and what helps, for people; flags that need no more than time are left out of the advice.
+#: Meaning and remedy of each flag, for people. Flags that clear with time have no remedy.
 MEANINGS: Final = {
     "NOGYRO": "no gyroscope was found",
-    "FAILSAFE": "failsafe is active: sticks are received again for half a second first",
+    "FAILSAFE": "failsafe is active until sticks arrive for half a second",
     "RXLOSS": "no sticks are received",
     "NOT_DISARMED": "the arm switch was on before sticks were received",
     "BOXFAILSAFE": "the failsafe switch is on",
@@ -181,29 +181,29 @@ MEANINGS: Final = {
     "NOPREARM": "the prearm switch is off",
     "LOAD": "its processor is overloaded",
     "CALIB": "its sensors are being calibrated: keep it still",
-    "CLI": "its command line is in use: end it",
+    "CLI": "its command line is open: exit it",
     "CMS": "its menu is open",
-    "MSP": "a configurator keeps it from arming: close that",
-    "PARALYZE": "paralyze is active: switch it off and on again",
-    "GPS": "it has no GPS fix, and GPS rescue is set up",
+    "MSP": "a configurator prevents arming: close it",
+    "PARALYZE": "paralyze is active: power-cycle it",
+    "GPS": "it has no GPS fix, which GPS rescue needs",
     "RESCUE_SW": "the GPS rescue switch is on",
     "DSHOT_TELEM": "motor controllers send no telemetry",
     "REBOOT_REQD": "settings were changed: restart it",
-    "DSHOT_BBANG": "the outputs to the motors do not work",
+    "DSHOT_BBANG": "the motor outputs do not work",
     "NO_ACC_CAL": "its accelerometer was never calibrated",
     "MOTOR_PROTO": "no motor protocol is set",
-    "FLIP_SWITCH": "the switch to turn over after a crash is on",
+    "FLIP_SWITCH": "the crash flip switch is on",
     "ALT_HOLD_SW": "the altitude hold switch is on",
     "POS_HOLD_SW": "the position hold switch is on",
-    ARM_SWITCH: "the arm switch is on though it can't be armed: it is switched off and on again",
+    ARM_SWITCH: "the arm switch is on though it can't be armed: it will be switched off and on",
     "GEOZONE": "it is in a forbidden zone",
     "NOT_LEVEL": "it is not level",
     "SENSORS_CALIBRATING": "its sensors are being calibrated: keep it still",
     "SYSTEM_OVERLOADED": "its processor is overloaded",
-    "NAVIGATION_UNSAFE": "navigation is not safe: it waits for GPS, see nav_extra_arming_safety",
+    "NAVIGATION_UNSAFE": "navigation is not safe: it waits for GPS (nav_extra_arming_safety)",
     "COMPASS_NOT_CALIBRATED": "its compass was never calibrated",
     "ACC_NOT_CALIBRATED": "its accelerometer was never calibrated",
-    "HARDWARE_FAILURE": "a sensor that is set up does not work",
+    "HARDWARE_FAILURE": "a configured sensor does not work",
     "RC_LINK": "no sticks are received",
     "INVALID_SETTING": "a setting is invalid: its command line's status names it",
     "NO_PREARM": "the prearm switch is off",
@@ -218,7 +218,7 @@ ARMED_OF_INAV: Final = 1 << 2  #: among the flags of INAV's status
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:
-    """Return what keeps it from arming, by the firmware's own names. ``count``: how many flags it has; 0: not known."""
+    """Return the flags that prevent arming, by the firmware's own names. ``count``: its number of flags; 0: unknown."""
     names = []
     for bit in range(32):
         if not flags >> bit & 1:
@@ -234,5 +234,5 @@ def flag_names(variant: str, flags: int, count: int) -> list[str]:
 
 
 def explained(names: list[str]) -> str:
-    """Return names with what they mean, for people."""
+    """Return names with their meanings, for people."""
     return "; ".join(f"{name} ({MEANINGS[name]})" if name in MEANINGS else name for name in names)

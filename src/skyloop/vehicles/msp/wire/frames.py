@@ -1,4 +1,4 @@
-"""Frames of MSP: version 1, its long form for 255 bytes and more, and version 2. Pure.
+"""MSP frames: version 1, its long form for 255 bytes and more, and version 2. Pure.
 
 Version 1 is ``$M`` direction size function payload xor; version 2 is ``$X`` direction flags function(16) size(16)
 payload CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-MOST: Final = 1024  #: bytes of a payload that the parser waits for; the longest in use, names of modes, is below 700
-LONG: Final = 255  #: a size of version 1 that says: the real one follows, in two bytes
+MOST: Final = 1024  #: longest payload that the parser waits for; the longest in use, mode names, is below 700 bytes
+LONG: Final = 255  #: size in version 1 that announces the real size in the next two bytes
 LARGEST: Final = 0xFFFF
 
 
 class Direction(Enum):
-    """Who speaks. The value is the third byte of a frame."""
+    """The sender. The value is the third byte of a frame."""
 
     REQUEST = ord("<")  #: to the flight controller
     REPLY = ord(">")
-    ERROR = ord("!")  #: the flight controller doesn't know the function, or refuses it
+    ERROR = ord("!")  #: the flight controller does not know the function, or refuses it
 
 
 _DIRECTIONS: Final = {each.value: each for each in Direction}
@@ -33,9 +33,9 @@ _V2: Final = struct.Struct("<BHH")
 class Frame:
     """One frame."""
 
-    function: int  #: 0 to 65535; from 255 on only version 2 can say it
+    function: int  #: 0 to 65535; from 255 on, version 2 only
     payload: bytes = b""  #: at most 65535 bytes
-    direction: Direction = Direction.REQUEST  #: who speaks
+    direction: Direction = Direction.REQUEST  #: the sender
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -52,7 +52,7 @@ _CRC: Final = _crc_table()
 
 
 def crc8(data: bytes) -> int:
-    """Return the CRC-8/DVB-S2 of some bytes: polynomial 0xD5, nothing reflected, from 0."""
+    """Return the CRC-8/DVB-S2 of some bytes: polynomial 0xD5, not reflected, initial value 0."""
     crc = 0
     for byte in data:
         crc = _CRC[crc ^ byte]
@@ -60,7 +60,7 @@ def crc8(data: bytes) -> int:
 
 
 def xor(data: bytes) -> int:
-    """Return the exclusive or of all bytes, which version 1 checks with."""
+    """Return the exclusive or of all bytes, version 1's checksum."""
     made = 0
     for byte in data:
         made ^= byte
@@ -68,7 +68,7 @@ def xor(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, version: int | None = None) -> bytes:
-    """Return the bytes of a frame, in the lowest version that can say it unless one is given. Raises ``ValueError``."""
+    """Return a frame's bytes, by default in the lowest version that can hold it. Raises ``ValueError``."""
     function, payload = frame.function, frame.payload
     if not 0 <= function <= LARGEST or len(payload) > LARGEST:
         raise ValueError(f"function {function} with {len(payload)} bytes does not fit into a frame")
@@ -86,7 +86,7 @@ def encode(frame: Frame, *, version: int | None = None) -> bytes:
 
 
 def whole_frames(data: bytes) -> Iterator[bytes]:
-    """Yield the frames of which ``data`` consists, as :func:`encode` made them."""
+    """Yield the frames in ``data``, which must be output of :func:`encode`."""
     while data:
         if data[1:2] == b"X":
             size = 9 + int.from_bytes(data[6:8], "little")
@@ -97,10 +97,10 @@ def whole_frames(data: bytes) -> Iterator[bytes]:
 
 
 class Parser:
-    """Finds frames in a stream of bytes, whatever else is in it. Never raises.
+    """Finds frames in a stream of bytes, among any other bytes. Never raises.
 
-    After a frame whose checksum is wrong the search goes on at the byte after its ``$``: a frame that lost some bytes
-    does not take its successor with it. ``skipped`` counts bytes that belong to no frame, ``damaged`` wrong checksums.
+    After a bad checksum, the search resumes at the byte after the ``$``, so that a frame that lost some bytes does not
+    take the next one with it. ``skipped`` counts bytes outside frames, ``damaged`` bad checksums.
     """
 
     def __init__(self) -> None:
@@ -109,11 +109,11 @@ class Parser:
         self.damaged = 0
 
     def reset(self) -> None:
-        """Forget the beginning of a frame: what follows comes from a new connection."""
+        """Forget an incomplete frame: the next bytes come from a new connection."""
         self._kept.clear()
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Return the frames that are complete with these bytes."""
+        """Return the frames that these bytes complete."""
         self._kept += data
         found: list[Frame] = []
         at = 0
@@ -127,7 +127,7 @@ class Parser:
             at = start
             taken = self._frame(at, found)
             if taken == 0:
-                break  # not complete
+                break  # incomplete
             if taken < 0:
                 self.skipped += 1
                 at += 1
@@ -137,7 +137,7 @@ class Parser:
         return found
 
     def _frame(self, at: int, found: list[Frame]) -> int:
-        """Return how long the frame at this ``$`` is; 0: there is more to come; -1: it is none."""
+        """Return the length of the frame at this ``$``; 0: incomplete; -1: not a frame."""
         kept = self._kept
         left = len(kept) - at
         if left < 3:
@@ -163,7 +163,7 @@ class Parser:
         return length
 
     def _head(self, at: int, left: int) -> tuple[int, int, int] | None:
-        """Return function, where the payload begins, and its size; None while that has not come yet."""
+        """Return the function, the payload's start and its size; None until they have arrived."""
         kept = self._kept
         if kept[at + 1] == ord("X"):
             if left < 8:

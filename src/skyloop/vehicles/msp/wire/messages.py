@@ -1,8 +1,8 @@
-"""Payloads of MSP's functions, both ways. Pure.
+"""Payloads of MSP's functions, both directions. Pure.
 
-All numbers are little endian. A payload that is longer than expected is of a newer firmware, and what follows is left
-out; one that is too short raises :class:`skyloop.errors.DecodeError`. Layouts: Betaflight's and INAV's wikis on MSP,
-checked against Betaflight 4.6.0.
+All numbers are little endian. A payload longer than expected comes from newer firmware, and its end is ignored; one
+that is too short raises :class:`skyloop.errors.DecodeError`. Layouts: Betaflight's and INAV's wikis on MSP, checked
+against Betaflight 4.6.0.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class Function(IntEnum):
 
 def _unpack(form: struct.Struct, payload: bytes, what: str) -> tuple[int, ...]:
     if len(payload) < form.size:
-        raise DecodeError(f"{what} of {len(payload)} bytes: {form.size} are the least")
+        raise DecodeError(f"{what} of {len(payload)} bytes: at least {form.size} expected")
     return form.unpack_from(payload)
 
 
-# Who it is -----------------------------------------------------------------------------------------------------------
+# Identity ------------------------------------------------------------------------------------------------------------
 
 BETAFLIGHT: Final = "BTFL"
 INAV: Final = "INAV"
@@ -66,7 +66,7 @@ INAV: Final = "INAV"
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What a flight controller says of itself."""
+    """A flight controller's identity."""
 
     variant: str = ""  #: four letters, such as :data:`BETAFLIGHT`
     version: tuple[int, int, int] = (0, 0, 0)
@@ -81,7 +81,7 @@ class Identity:
 
 
 def api_version(payload: bytes) -> tuple[int, int]:
-    """Return the version of the API, major and minor."""
+    """Return the API version, major and minor."""
     _, major, minor = _unpack(struct.Struct("<BBB"), payload, "API_VERSION")
     return major, minor
 
@@ -93,14 +93,14 @@ def version(payload: bytes) -> tuple[int, int, int]:
 
 
 def text(payload: bytes, longest: int = 64) -> str:
-    """Return printable ASCII, anything else left out."""
+    """Return printable ASCII, without any other characters."""
     return "".join(chr(byte) for byte in payload[:longest] if 32 <= byte < 127)
 
 
 def board(payload: bytes) -> str:
-    """Return the name of the board: its target's where it has one, else four letters."""
+    """Return the board's name: its target's if it has one, else four letters."""
     if len(payload) < 4:
-        raise DecodeError(f"BOARD_INFO of {len(payload)} bytes: 4 are the least")
+        raise DecodeError(f"BOARD_INFO of {len(payload)} bytes: at least 4 expected")
     if len(payload) > 9:
         name = text(payload[9 : 9 + payload[8]])
         if name:
@@ -108,7 +108,7 @@ def board(payload: bytes) -> str:
     return text(payload[:4])
 
 
-# How it is -----------------------------------------------------------------------------------------------------------
+# State ---------------------------------------------------------------------------------------------------------------
 
 
 class Sensor(IntEnum):
@@ -123,13 +123,13 @@ class Sensor(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What is on, and what keeps it from arming."""
+    """Active sensors and modes, and the flags that prevent arming."""
 
-    sensors: int  #: a bit for each of :class:`Sensor`
-    modes: int  #: a bit for each mode that is active, in the order of ``BOXIDS``
-    flags: int | None = None  #: that prevent arming, a bit each; None where this reply does not tell
-    count: int = 0  #: how many flags this version has; 0: that is not told
-    cycle_us: int = 0  #: time of one turn of the control loop [µs]
+    sensors: int  #: one bit per :class:`Sensor`
+    modes: int  #: one bit per active mode, in the order of ``BOXIDS``
+    flags: int | None = None  #: one bit per flag that prevents arming; None if this reply does not have them
+    count: int = 0  #: number of flags of this version; 0: unknown
+    cycle_us: int = 0  #: duration of one control loop [µs]
     load: int = 0  #: of the processor [%]
 
     def has(self, sensor: Sensor) -> bool:
@@ -138,7 +138,7 @@ class Status:
 
     @classmethod
     def of_betaflight(cls, payload: bytes) -> Self:
-        """Read ``STATUS`` or ``STATUS_EX`` of Betaflight, API 1.36 on. Raises :class:`DecodeError`."""
+        """Read Betaflight's ``STATUS`` or ``STATUS_EX``, API 1.36 on. Raises :class:`DecodeError`."""
         cycle, _, sensors, modes, _, load, _, _ = _unpack(_STATUS, payload, "STATUS")
         if len(payload) <= _STATUS.size:
             return cls(sensors, modes, None, 0, cycle, load)
@@ -196,7 +196,7 @@ _ATTITUDE: Final = struct.Struct("<hhh")
 
 @dataclass(frozen=True, slots=True)
 class Altitude:
-    """Height above where it was armed [m], and climb [m/s]."""
+    """Height above the place of arming [m], and climb [m/s]."""
 
     height_m: float
     climb_m_s: float
@@ -217,12 +217,12 @@ _ALTITUDE: Final = struct.Struct("<ih")
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """What the battery gives."""
+    """State of the battery."""
 
     voltage_v: float  #: [V]
     current_a: float  #: [A]
-    cells: int = 0  #: how many it has; 0: not known
-    left: float | None = None  #: charge left, 0 to 1; None: not told
+    cells: int = 0  #: number of cells; 0: unknown
+    left: float | None = None  #: remaining charge, 0 to 1; None: not reported
 
     @classmethod
     def of_state(cls, payload: bytes) -> Self:
@@ -263,7 +263,7 @@ _INAV_ANALOG: Final = struct.Struct("<BHhIIIIB")
 
 @dataclass(frozen=True, slots=True)
 class CellVoltages:
-    """Of an empty and a full cell [V]."""
+    """Voltages of an empty and a full cell [V]."""
 
     empty_v: float = 3.3
     full_v: float = 4.2
@@ -277,7 +277,7 @@ class CellVoltages:
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """A fix. Angles [degrees], ``speed_m_s`` over the ground towards ``course_deg``, clockwise from north."""
+    """A fix. Angles [degrees], ``speed_m_s`` over ground towards ``course_deg``, clockwise from north."""
 
     fix: bool
     satellites: int
@@ -305,7 +305,7 @@ _GPS: Final = struct.Struct("<BBiihHH")
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw numbers of the sensors: only the gyroscope's, in degrees a second, have the same unit on every board."""
+    """Raw sensor values: only the gyroscope's, in degrees per second, have the same unit on every board."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]
@@ -329,7 +329,7 @@ _IMU: Final = struct.Struct("<9h")
 
 
 def channels(payload: bytes) -> list[int]:
-    """Return pulse widths [µs]: of ``RC``, in the order roll, pitch, yaw, throttle, AUX 1 and so on."""
+    """Return pulse widths [µs] from ``RC``, in the order roll, pitch, yaw, throttle, AUX 1 and so on."""
     return [value for (value,) in struct.iter_unpack("<H", payload[: len(payload) // 2 * 2])]
 
 
@@ -339,7 +339,7 @@ def pack_channels(widths_us: Sequence[int]) -> bytes:
 
 
 def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]]:
-    """Return the replies that ``MULTIPLE`` carries, as asked for, as far as they fitted into it."""
+    """Return the replies in ``MULTIPLE`` to the requested functions, as far as they fitted."""
     found = []
     at = 0
     for function in functions:
@@ -355,16 +355,16 @@ def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]
 
 @dataclass(frozen=True, slots=True)
 class ModeRange:
-    """Where an AUX channel switches a mode on."""
+    """The range of an AUX channel that switches a mode on."""
 
     mode: int  #: its permanent number
-    aux: int  #: the channel, from 0 for AUX 1
+    aux: int  #: the channel, counted from 0 for AUX 1
     low_us: int  #: from this pulse width on [µs]
-    high_us: int  #: below this one [µs]; 2100 has no end
+    high_us: int  #: below this one [µs]; 2100 is unlimited
 
 
 def mode_ranges(payload: bytes) -> list[ModeRange]:
-    """Return the ranges of ``MODE_RANGES`` that are not empty."""
+    """Return the ranges in ``MODE_RANGES`` that are not empty."""
     found = []
     for mode, aux, low, high in struct.iter_unpack("<BBBB", payload[: len(payload) // 4 * 4]):
         if low < high:
@@ -381,18 +381,18 @@ def pack_mode_ranges(ranges: Sequence[ModeRange], places: int = 20) -> bytes:
 
 
 def box_names(payload: bytes) -> list[str]:
-    """Return the names of ``BOXNAMES``, in the order of the bits of :attr:`Status.modes`."""
+    """Return the names in ``BOXNAMES``, in the order of the bits of :attr:`Status.modes`."""
     return [name for name in text(payload, len(payload)).split(";") if name]
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig:
-    """What the firmware does when the receiver is silent."""
+    """The firmware's reaction to a silent receiver."""
 
-    delay_s: float  #: until it begins [s]
-    landing_s: float  #: how long a landing takes, or the motors stay on [s]
-    throttle_us: int  #: while it lands [µs]
-    low_throttle_s: float  #: a throttle that was low for so long lets it disarm at once [s]
+    delay_s: float  #: until it starts [s]
+    landing_s: float  #: duration of a landing, or of running motors [s]
+    throttle_us: int  #: during a landing [µs]
+    low_throttle_s: float  #: with a low throttle for this long, it disarms at once [s]
     procedure: int  #: Betaflight 0 land, 1 drop, 2 GPS rescue; INAV 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod
@@ -411,15 +411,15 @@ _FAILSAFE: Final = struct.Struct("<BBHBHB")
 
 
 class OnLoss(IntEnum):
-    """What a channel is set to 0.3 s after the receiver fell silent."""
+    """The value of a channel 0.3 s after the receiver fell silent."""
 
-    AUTO = 0  #: sticks in the middle, no throttle
+    AUTO = 0  #: centred sticks, no throttle
     HOLD = 1
     SET = 2
 
 
 def rx_fail(payload: bytes) -> list[tuple[int, int]]:
-    """Return :class:`OnLoss` and pulse width [µs] of each channel of ``RXFAIL_CONFIG``."""
+    """Return :class:`OnLoss` and pulse width [µs] of each channel in ``RXFAIL_CONFIG``."""
     return list(struct.iter_unpack("<BH", payload[: len(payload) // 3 * 3]))
 
 
@@ -430,7 +430,7 @@ def pack_rx_fail(channels: Sequence[tuple[int, int]]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class RxConfig:
-    """Pulse widths [µs]: below ``low_us`` the throttle counts as low; outside the valid ones a channel has failed."""
+    """Pulse widths [µs]: below ``low_us`` the throttle is low; a channel outside the valid range has failed."""
 
     low_us: int = 1050
     middle_us: int = 1500
@@ -451,20 +451,20 @@ class RxConfig:
 
 _RX: Final = struct.Struct("<BHHHBHH")
 
-RX_MSP: Final = 1 << 14  #: of Betaflight's features: sticks come by MSP
-USUAL_MAP: Final = (0, 1, 3, 2)  #: AETR: where ``SET_RAW_RC`` has roll, pitch, yaw and throttle
+RX_MSP: Final = 1 << 14  #: a bit of Betaflight's features: sticks arrive by MSP
+USUAL_MAP: Final = (0, 1, 3, 2)  #: AETR: positions of roll, pitch, yaw and throttle in ``SET_RAW_RC``
 
 
 def rx_map(payload: bytes) -> tuple[int, ...]:
-    """Return where ``SET_RAW_RC`` has roll, pitch, yaw and throttle, in any order. Raises :class:`DecodeError`."""
+    """Return the positions of roll, pitch, yaw and throttle in ``SET_RAW_RC``. Raises :class:`DecodeError`."""
     made = tuple(payload[:4])
     if sorted(made) != [0, 1, 2, 3]:
-        raise DecodeError(f"RX_MAP {payload[:8].hex()} does not say where the sticks are")
+        raise DecodeError(f"RX_MAP {payload[:8].hex()} does not contain the sticks")
     return made
 
 
 def features(payload: bytes) -> int:
-    """Return the bits of ``FEATURE_CONFIG``."""
+    """Return the bits in ``FEATURE_CONFIG``."""
     (bits,) = _unpack(struct.Struct("<I"), payload, "FEATURE_CONFIG")
     return bits
 
@@ -473,9 +473,9 @@ ANGLE_LIMIT_AT: Final = 17
 
 
 def angle_limit_deg(payload: bytes) -> int:
-    """Return the tilt of a full stick [degrees], from Betaflight's ``PID_ADVANCED``."""
+    """Return the tilt of a full stick [degrees] from Betaflight's ``PID_ADVANCED``."""
     if len(payload) <= ANGLE_LIMIT_AT:
-        raise DecodeError(f"PID_ADVANCED of {len(payload)} bytes: {ANGLE_LIMIT_AT + 1} are the least")
+        raise DecodeError(f"PID_ADVANCED of {len(payload)} bytes: at least {ANGLE_LIMIT_AT + 1} expected")
     if payload[ANGLE_LIMIT_AT] == 0:
         raise DecodeError("PID_ADVANCED has no angle limit")
     return payload[ANGLE_LIMIT_AT]
