@@ -130,9 +130,9 @@ MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
 
 
-#: The first switch arms, angle mode is always on, the third keeps it from being armed (PARALYZE). MSP is answered as
-#: fast as it is asked, and on a second port too. It can be armed at once, not 5 s after its start. Without sticks it
-#: goes on level with a little less than the throttle that carries a racer, and lands by that after 2 s.
+#: The first switch arms, angle mode is always on, and the third prevents arming (PARALYZE). The firmware answers MSP at
+#: full rate, on a second port too, and can be armed at once instead of 5 s after its start. Without sticks it flies
+#: level at slightly less than the hover throttle of a racer, and starts to land 2 s later.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
@@ -148,11 +148,11 @@ SETTINGS: Final = (
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
-#: For the first answer of a start. Healthy ones take 0.8 s; one in ten never answers, by a race between its threads.
+#: Time for the first answer after a start. A healthy one takes 0.8 s; one in ten never answers: its threads race.
 ANSWER_S: Final = 1.5
-LONGEST_ANSWER_S: Final = 6.0  #: as that is doubled with each start in vain, for a computer that is busy
-#: Until its flight control has run, which ends BOOTGRACE: after 5 s with settings of an earlier version. Where its
-#: scheduler drops the loop it answers, and can never be armed.
+LONGEST_ANSWER_S: Final = 6.0  #: the limit of ANSWER_S, which doubles with each failed start for a busy computer
+#: Time for the flight control's first run, which ends BOOTGRACE: 5 s with settings of an earlier version. If the
+#: scheduler drops that loop, the firmware answers but can never be armed.
 RUN_S: Final = 8.0
 START_S: Final = 5.0  #: from the start of its process until its first motors, at most
 ATTEMPT_S: Final = 0.5
