@@ -81,6 +81,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
     skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
     outcome: Outcome | None = None  #: what became of the newest intent; None: a proxy that does not tell
+    next_owner: str | None = None  #: name of the first in the queue for the authority; None: nobody waits
 
     @property
     def waking_up(self) -> bool:
