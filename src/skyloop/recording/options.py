@@ -130,7 +130,7 @@ def first_path(path: Path, drones: list[str], options: Options) -> Path:
         raise UsageError(f"{path.parent} is no folder: make it first")
     first = numbered(path, 1) if options.rotates else path
     if first.exists() and not options.overwrite:
-        raise UsageError(f"{first} exists already: choose another name, or allow it to be overwritten")
+        raise UsageError(f"{first} exists already: choose another name, or overwrite=True (--overwrite)")
     return path
 
 
@@ -151,7 +151,7 @@ class Status(msgspec.Struct, frozen=True):
     """The status of a recording at one time."""
 
     state: RecorderState = RecorderState.STARTING
-    reason: str = ""  #: why it is paused or has failed
+    reason: str = ""  #: why it is paused, has failed or leaves frames out
     path: str = ""  #: the file that is written, or that was written last
     files: tuple[str, ...] = ()  #: all of them, oldest first
     seconds: float = 0.0  #: since it started

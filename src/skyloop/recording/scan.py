@@ -217,7 +217,7 @@ def _check_magic(found: Scan, head: bytes) -> None:
         return
     if not head:
         raise FileFormatError(f"{found.path} is empty: nothing was recorded")
-    raise FileFormatError(f"{found.path} is no MCAP file: it begins with {head!r} and not with {MAGIC!r}")
+    raise FileFormatError(f"{found.path} is no MCAP file: it begins with {head!r}")
 
 
 class _Scanner:
