@@ -115,7 +115,8 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
         returns = feedback.return_phase in (ReturnPhase.CLIMBING, ReturnPhase.FLYING)
         yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'} by itself")
     elif feedback.failsafe is not Failsafe.NONE:
-        yield _warning("failsafe", "failsafe: hovering by itself")
+        end = "" if feedback.lease else ", landing next unless somebody takes control"  # without a lease none commands
+        yield _warning("failsafe", f"failsafe: hovering by itself{end}")
     charge = feedback.battery
     if charge is not None and charge < thresholds.battery_critical:
         yield urgent("battery", f"battery critical: {charge:.0%}")

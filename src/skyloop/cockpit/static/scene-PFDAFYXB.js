@@ -1,4 +1,4 @@
-import{a as ll,h as fe,p as cl}from"./chunk-KXTZWR3B.js";/**
+import{a as ll,h as fe,p as cl}from"./chunk-HRU3Z32D.js";/**
  * @license
  * Copyright 2010-2025 Three.js Authors
  * SPDX-License-Identifier: MIT
