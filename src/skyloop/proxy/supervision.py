@@ -382,7 +382,6 @@ class FlightSupervisor:
         """Let feedback show who is in command, the failsafe's step and whose the flight is."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
-        first = next(iter(authority.waiting), None)
         self._publisher.stamp(
             {
                 "owner": name_of(self._sessions, owner.app_id) if owner is not None else None,
@@ -393,7 +392,7 @@ class FlightSupervisor:
                 "others": flight.others if flight.whose is Whose.OTHERS else None,
                 "start_position_m": self._back.start,
                 "return_phase": self._back.phase,
-                "next_owner": None if first is None else name_of(self._sessions, first.app_id),
+                "next_owner": next((name_of(self._sessions, one.app_id) for one in authority.waiting), None),
             }
         )
 
