@@ -74,6 +74,7 @@ class Page {
     ...[...this.panes.values()].map((pane) => pane.alarmSource),
   ]);
   private listed_ms = performance.now();
+  private readonly recordings: RecordingList;
   /** The visible area of each pane [pixels²]. */
   private readonly seen = new Map<string, number>();
   private readonly sight = new IntersectionObserver((entries) => this.look(entries), { threshold: [0, 0.05, 0.25, 0.5, 0.75, 1] });
@@ -87,10 +88,11 @@ class Page {
   ) {
     this.help = new Help(() => this.flying);
     this.safety = who.role === "pilot" ? new Safety((handlers) => new LastingSocket("/ws/control", handlers), new ServerClock(), this.countdown) : null;
-    const settings = new SettingsDialog();
+    this.recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot", () => this.showRecorded());
+    const role = named(t.roles, who.role ?? "");
+    const settings = new SettingsDialog(who.role === "pilot" ? who.name : role, () => this.panes.forEach((pane) => pane.rename()));
     followTheme(() => this.repaint());
     for (const element of [this.safety?.element, this.safety?.message, this.countdown.element]) keepInReach(element ?? null);
-    const role = named(t.roles, who.role ?? "");
     const person = h("span", { class: "person", title: who.name || role }, who.name ? `${who.name} · ${role}` : role);
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, t.page.logOut) : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
@@ -99,8 +101,7 @@ class Page {
     if (this.safety) this.said.append(this.safety.message);
     new ResizeObserver(() => this.measure()).observe(this.bar);
     window.addEventListener("resize", () => this.measure());
-    const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
-    this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
+    this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, this.recordings.element);
     root.replaceChildren(this.bar, this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       flown: () => [...this.panes.values()].filter(isFlown),
@@ -200,6 +201,10 @@ class Page {
     return this.inOverview ? this.rows.filter((row) => !isRecording(row)).map((row) => row.name) : [...this.panes.keys()];
   }
 
+  private showRecorded(): void {
+    for (const pane of this.panes.values()) pane.recorded(this.recordings.of(pane.name));
+  }
+
   /** This page's own relation to a drone. */
   private own(name: string): Own {
     const pane = this.panes.get(name);
@@ -260,8 +265,15 @@ class Page {
         close: (one) => this.close(one),
         help: () => this.help.open(),
         fly: (one) => this.flight.toggle(one),
-        known: (one) => this.panes.size === 1 && this.flight.offer(one),
+        known: (one) => {
+          one.recorded(this.recordings.of(one.name));
+          if (this.panes.size === 1) this.flight.offer(one);
+        },
         fillScreen: () => this.flight.fillScreen(),
+        record: async (one) => {
+          const { text, tone } = await this.recordings.toggle(one.name);
+          one.notify(text, tone);
+        },
         panels: (shown) => {
           memory.set("panels", String(shown));
           this.frame();
@@ -272,6 +284,7 @@ class Page {
       this.panes.set(name, pane);
       this.sight.observe(pane.element);
       this.main.append(pane.element);
+      pane.recorded(this.recordings.of(name));
     }
     this.select(name);
     this.arrange();

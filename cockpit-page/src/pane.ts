@@ -8,10 +8,11 @@ import { CameraControls } from "./cameracontrols.js";
 import { Channels } from "./channels.js";
 import { ServerClock } from "./clock.js";
 import { Deck } from "./deck.js";
-import { h, memory, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
+import { h, memory, setAttribute, setDisabled, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { corners, FlightHud } from "./flightmode.js";
 import type { FollowHost } from "./followtool.js";
+import { clock } from "./format.js";
 import { Freshness } from "./freshness.js";
 import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
@@ -19,7 +20,7 @@ import { Instruments } from "./instruments.js";
 import { named, t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
-import type { Alarm, DroneRow, State, Vehicle } from "./model.js";
+import type { Alarm, DroneRow, RunningRecording, State, Vehicle } from "./model.js";
 import { Parameters, Writes } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -47,6 +48,8 @@ export interface PaneHost {
   /** Its kind has become known: it could be flown. */
   known(pane: Pane): void;
   fillScreen(): void;
+  /** Start or stop recording its flight. */
+  record(pane: Pane): Promise<void>;
   /** With or without the panels beside the picture: remembered. */
   panels(shown: boolean): void;
   /** Its emergency stop, or the outcome of one, may have changed. */
@@ -73,6 +76,8 @@ export class Pane {
   private dirty = false;
   private readonly clock = new ServerClock();
   private readonly socket: LastingSocket;
+  private control: LastingSocket | null = null;
+  private renamed = false;
   private readonly history = new History();
   private readonly trail = new Trail();
   private readonly battery = new Battery();
@@ -93,6 +98,9 @@ export class Pane {
   private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
   private readonly full = h("button", { type: "button", class: "full", "aria-label": t.pane.fullScreen, onclick: () => this.host.fillScreen() }, corners());
   private readonly panels = h("button", { type: "button", class: "small panels", "aria-pressed": "false", onclick: () => this.host.panels(this.panels.getAttribute("aria-pressed") !== "true") }, t.pane.panels);
+  private readonly recordDot = h("i", { class: "record-dot" });
+  private readonly recordText = h("span", {}, t.recordings.record);
+  private readonly record = h("button", { type: "button", class: "small record-flight", hidden: true, onclick: () => void this.toggleRecord() }, this.recordDot, this.recordText);
   /** On the smaller one of picture and map, when the other fills nearly the whole pane: swaps them. */
   private readonly swap = h("button", { type: "button", class: "swap", onclick: () => this.enlarge(this.element.dataset["large"] === "map" ? "picture" : "map") }, h("span", { "aria-hidden": "true" }, "⤢"));
   private readonly stage: Stage;
@@ -155,7 +163,8 @@ export class Pane {
       message: (data) => this.onMessage(JSON.parse(data as string) as Vehicle | State),
       state: (open, code) => this.linked(open, code),
     });
-    this.pilot = pilots ? new Pilot((handlers) => new LastingSocket(`${base}/control`, handlers), this.clock, this.listener()) : null;
+    const control = (): string => `${base}/control?name=${encodeURIComponent(memory.get("name") ?? "")}`;
+    this.pilot = pilots ? new Pilot((handlers) => (this.control = new LastingSocket(control, handlers)), this.clock, this.listener()) : null;
     this.update();
   }
 
@@ -230,6 +239,7 @@ export class Pane {
 
   act(deed: Deed | "reset"): void {
     this.host.select(this.name);
+    setText(this.notice, ""); // of what was pressed before
     if (deed === "help") this.host.help();
     else if (this.isRecording) this.notify(t.pane.recording, "quiet");
     else if (this.pilot === null) this.notify(t.pane.watch, "warn");
@@ -261,6 +271,23 @@ export class Pane {
     if (now_ms - this.noticed_ms > NOTICE_MS) setText(this.notice, "");
   }
 
+  /** The person changed their name: it counts once this page neither has control nor waits for it. */
+  rename(): void {
+    this.renamed = true;
+    this.update();
+  }
+
+  /** Show whether the drone is being recorded. */
+  recorded(one: RunningRecording | null): void {
+    setHidden(this.record, this.pilot === null || this.target === null);
+    setText(this.recordText, one === null ? t.recordings.record : clock(one.seconds));
+    setAttribute(this.recordDot, "class", one === null ? "record-dot" : "record-dot live");
+    setAttribute(this.record, "aria-label", one === null ? t.recordings.recordOf(this.name) : t.recordings.stopOf(one.drones.join(", ")));
+    setAttribute(this.record, "title", one?.reason || this.record.getAttribute("aria-label") || "");
+    setAttribute(this.record, "aria-pressed", String(one !== null));
+    setTone(this.record, one?.reason ? "bad" : "quiet");
+  }
+
   /** The colours have changed. */
   repaint(): void {
     this.map.repaint();
@@ -270,7 +297,7 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.pill, this.battery.element, this.full, this.panels, this.fly, close);
+    const head = h("header", { class: "pane-head" }, this.title, this.hud.element, this.endReplay, this.pill, this.battery.element, this.full, this.record, this.panels, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
     this.said.append(this.kind, this.fresh.element, this.ended, this.alarms.element, this.notice, this.alarms.chip);
     const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, this.said, this.alarms.voice, body, this.thumbs.element, this.strip.element);
@@ -295,6 +322,7 @@ export class Pane {
         if (command === "stop") this.notify(t.pane.stopShown, "bad");
         if (command === "goto") this.notify(t.pane.reached, "ok");
         if (command === "given" && name !== undefined) this.notify(t.pane.handedOver(name), "ok");
+        if (command === "granted") this.notify(t.pane.granted, "ok");
       },
     };
   }
@@ -406,6 +434,10 @@ export class Pane {
     if (this.connected && state && !live) this.instruments.lost(state);
     this.stage.still(over ? t.replay.last : this.playback?.paused ? t.replay.paused : "");
     this.strip.update(vehicle, state, pilot, isOld, recording);
+    if (this.renamed && pilot?.authority.state === "none") {
+      this.renamed = false;
+      this.control?.reopen();
+    }
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
     const nowhere = recording ? t.pane.recordingFlies : isOld ? t.pane.isOld : !placed ? t.pane.noPosition : !mine ? t.pane.takeToFly : t.pane.notInAir;
@@ -440,6 +472,12 @@ export class Pane {
     setTone(this.notice, tone);
     setText(this.notice, text);
     this.noticed_ms = performance.now();
+  }
+
+  private async toggleRecord(): Promise<void> {
+    setDisabled(this.record, true); // a second press would begin a second one
+    await this.host.record(this);
+    setDisabled(this.record, false);
   }
 
   private async stopReplay(): Promise<void> {

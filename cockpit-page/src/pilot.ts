@@ -255,11 +255,13 @@ export class Pilot {
 
   private onMessage(message: PilotMessage): void {
     if (message.type === "authority") {
+      const waited = this.waits;
       this.authority = message;
       this.received_ms = this.now_ms();
       if (message.mine || message.given) this.ended = "";
       else if (message.why) this.ended = message.why;
-      if (message.given && message.why) this.listener.done("given", message.why);
+      if (message.given && message.why) this.listener.done("given", message.holder ?? "");
+      if (message.mine && waited) this.listener.done("granted");
       if (!message.mine) this.end();
       if (!message.mine) this.questions = [];
       this.listener.changed();

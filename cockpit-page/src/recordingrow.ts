@@ -9,6 +9,8 @@ import type { PastRecording } from "./model.js";
 
 export interface RowHost {
   readonly pilots: boolean;
+  /** The folder of the files. */
+  folder(): string;
   /** Do it, show errors, and refresh the list; `doing`: the text meanwhile, by the seconds passed. */
   act(work: () => Promise<unknown>, doing?: (seconds: number) => string): Promise<boolean>;
   replayed(drone: string): void;
@@ -26,6 +28,7 @@ export class RecordingRow {
   private readonly open = h("button", { type: "button", class: "small", "aria-expanded": "false", onclick: () => this.toggle() }, t.recordings.more);
   private readonly more = h("div", { class: "rec-more", hidden: true });
   private readonly path: string;
+  private readonly views: readonly HTMLElement[];
 
   constructor(
     private one: PastRecording,
@@ -34,13 +37,15 @@ export class RecordingRow {
     this.path = `/api/recordings/${encodeURIComponent(one.name)}`;
     setAttribute(this.open, "aria-label", t.recordings.moreOf(one.name));
     const report = h("a", { class: "button small", href: `${this.path}/report`, target: "_blank", rel: "noopener", "aria-label": t.recordings.reportOf(one.name) }, t.recordings.report);
-    const acts = h("span", { class: "rec-acts" }, host.pilots ? this.replayButton(null) : null, report, this.open);
+    this.views = [...(host.pilots ? [this.replayButton(null)] : []), report];
+    const acts = h("span", { class: "rec-acts" }, ...this.views, this.open);
     this.element = h("li", { "data-recording": one.name }, h("span", { class: "rec-name" }, this.title), this.facts, this.note, acts, this.more);
     this.update(one);
   }
 
   update(one: PastRecording): void {
     this.one = one;
+    for (const view of this.views) setHidden(view, one.started === null); // nothing of it can be read
     const started = one.started === null ? "" : new Date(one.started * 1000).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
     setText(this.title, one.name.replace(/\.mcap$/, ""));
     const drones = one.drones.length > 2 ? t.overview.count(one.drones.length) : one.drones.join(", ");
@@ -80,7 +85,8 @@ export class RecordingRow {
     const keep = h("button", { type: "button", class: "small", onclick: () => setHidden(sure, true) }, t.recordings.no);
     sure.append(h("span", {}, t.recordings.sure(one.name)), h("button", { type: "button", class: "small danger", onclick: () => void host.act(() => this.throwAway()) }, t.recordings.yes), keep);
     const remove = h("button", { type: "button", class: "small danger", "aria-label": t.recordings.deleteOf(one.name), onclick: () => this.ask(sure, keep) }, t.recordings.delete);
-    return [this.naming(), this.noting(), h("span", { class: "rec-acts" }, ...others, download, remove), sure];
+    const elsewhere = h("p", { class: "note" }, t.recordings.elsewhere, h("code", {}, `skyloop log export "${host.folder()}/${one.name}" --to csv`));
+    return [this.naming(), this.noting(), h("span", { class: "rec-acts" }, ...others, download, remove), sure, ...(one.started === null ? [] : [elsewhere])];
   }
 
   private ask(sure: HTMLElement, keep: HTMLElement): void {

@@ -1,7 +1,7 @@
 // Recordings: the running ones, and the past ones, filtered and sorted.
 
 import { get, post, errorText } from "./api.js";
-import { h, memory, setDisabled, setHidden, setText } from "./dom.js";
+import { h, memory, setDisabled, setHidden, setText, type Tone } from "./dom.js";
 import { bytes, clock } from "./format.js";
 import { t } from "./language/index.js";
 import type { PastRecording, Recordings, RunningRecording } from "./model.js";
@@ -45,6 +45,8 @@ export class RecordingList {
   private readonly trash = h("div", { class: "rec-trash", hidden: true });
   private readonly rows = new Map<string, RecordingRow>();
   private known: readonly PastRecording[] = [];
+  private goOn: readonly RunningRecording[] = [];
+  private folder = "";
   private trashed = "";
   private round = 0;
   private some = false;
@@ -53,6 +55,7 @@ export class RecordingList {
     private readonly drones: () => string[],
     private readonly replayed: (name: string) => void,
     private readonly pilots: boolean,
+    private readonly changed: () => void = () => undefined,
   ) {
     this.order.append(...Object.entries(t.recordings.orders).map(([value, label]) => h("option", { value }, label)));
     this.order.value = memory.get("recordings-order") ?? "newest";
@@ -63,7 +66,7 @@ export class RecordingList {
   }
 
   private tick(): void {
-    setDisabled(this.start, this.drones().length === 0);
+    setDisabled(this.start, this.unrecorded.length === 0);
     this.round += 1;
     if (!document.hidden && (this.some || this.round % IDLE_PERIODS === 0)) void this.load();
   }
@@ -76,7 +79,34 @@ export class RecordingList {
     }
   }
 
-  private show({ running, past, trash }: Recordings): void {
+  /** The one that goes on of a drone. */
+  of(drone: string): RunningRecording | null {
+    return this.goOn.find((one) => one.drones.includes(drone)) ?? null;
+  }
+
+  /** Record a drone, or end that; what to say of it. */
+  async toggle(drone: string): Promise<{ text: string; tone: Tone }> {
+    const running = this.of(drone);
+    let [text, tone]: [string, Tone] = ["", "ok"];
+    try {
+      if (running === null) await post("/api/recordings", { drones: [drone] });
+      else text = t.recordings.saved((await post<RunningRecording>(`/api/recordings/${running.id}/stop`)).path.split("/").at(-1) ?? "");
+    } catch (error) {
+      [text, tone] = [errorText(error), "warn"];
+    }
+    await this.load();
+    return { text, tone };
+  }
+
+  /** What a press would record: a drone is recorded once at a time. */
+  private get unrecorded(): string[] {
+    return this.drones().filter((drone) => this.of(drone) === null);
+  }
+
+  private show({ folder, running, past, trash }: Recordings): void {
+    this.folder = folder;
+    this.goOn = running;
+    this.changed();
     this.some = running.length > 0;
     this.running.replaceChildren(...running.map((one) => this.runningRow(one)));
     setHidden(this.none, running.length + past.length > 0);
@@ -107,7 +137,7 @@ export class RecordingList {
   private row(one: PastRecording): RecordingRow {
     const known = this.rows.get(one.name);
     if (known) known.update(one);
-    const row = known ?? new RecordingRow(one, { pilots: this.pilots, act: (work, doing) => this.act(work, "", doing), replayed: this.replayed, thrown: (name) => this.offerUndo(name) });
+    const row = known ?? new RecordingRow(one, { pilots: this.pilots, folder: () => this.folder, act: (work, doing) => this.act(work, "", doing), replayed: this.replayed, thrown: (name) => this.offerUndo(name) });
     this.rows.set(one.name, row);
     return row;
   }
@@ -138,7 +168,9 @@ export class RecordingList {
   }
 
   private async begin(): Promise<void> {
-    await this.act(() => post("/api/recordings", { drones: this.drones() }));
+    setDisabled(this.start, true);
+    await this.act(() => post("/api/recordings", { drones: this.unrecorded }));
+    setDisabled(this.start, this.unrecorded.length === 0);
   }
 
   /** `done`: the text afterwards; `doing`: the text meanwhile, by the seconds passed. */

@@ -1,6 +1,6 @@
 // The person's settings for this browser.
 
-import { h, setHidden, setText, unique } from "./dom.js";
+import { h, memory, setHidden, setText, unique } from "./dom.js";
 import { whyJpeg } from "./h264.js";
 import { LANGUAGE_NAMES, t } from "./language/index.js";
 import { Modal } from "./modal.js";
@@ -13,7 +13,13 @@ export class SettingsDialog {
   readonly button: HTMLButtonElement;
   readonly modal: Modal;
 
-  constructor() {
+  /** `name`: by which the person logged in; empty: the person may choose one. `renamed`: another one was chosen. */
+  constructor(name: string, renamed: () => void) {
+    const own = h("input", { type: "text", value: memory.get("name") ?? "", maxlength: 40, "aria-label": t.settings.name, autocomplete: "nickname", spellcheck: "false" });
+    own.addEventListener("change", () => {
+      memory.set("name", own.value.trim());
+      renamed();
+    });
     const mode = h("p", { class: "note" });
     const video = h("p", { class: "note" });
     void whyJpeg().then((why) => setText(video, t.settings.videoNote(why)));
@@ -22,6 +28,7 @@ export class SettingsDialog {
     if (location.protocol === "https:") void fetch(AUTHORITY, { method: "HEAD" }).then(({ ok }) => setHidden(trust, !ok), () => undefined);
     const languages = Object.keys(LANGUAGE_NAMES);
     this.modal = new Modal(t.settings.title, "settings", [
+      name ? "" : h("fieldset", { class: "choice" }, h("legend", {}, t.settings.name), own, h("p", { class: "note" }, t.settings.nameNote)),
       choice("theme", t.settings.theme, t.settings.themes),
       choice("units", t.settings.units, t.settings.unit, h("p", { class: "note" }, t.settings.unitsNote)),
       choice("sound", t.settings.sound, t.settings.sounds),

@@ -46,7 +46,7 @@ export class LastingSocket {
   private timer: unknown;
 
   constructor(
-    private readonly path: string,
+    private readonly path: string | (() => string),
     private readonly handlers: Handlers,
     private readonly around: Surroundings = browser,
   ) {
@@ -70,8 +70,13 @@ export class LastingSocket {
     this.wire.close();
   }
 
+  /** Begin anew, as the path says now. */
+  reopen(): void {
+    this.wire.close();
+  }
+
   private open(): void {
-    const wire = this.around.connect(this.path);
+    const wire = this.around.connect(typeof this.path === "string" ? this.path : this.path());
     wire.binaryType = "arraybuffer";
     wire.onopen = () => {
       this.pause = FIRST_PAUSE_MS;

@@ -36,7 +36,7 @@ export function nowText(authority: Authority, questions: readonly Question[], as
   if (state === "queued" || state === "preempted") return t.strip.now.inLine(holder ?? t.strip.theHolder, t.strip.now.wait(names, true), state === "preempted");
   if (holder === null) return t.strip.now.free(names.length ? t.strip.now.wait(names, false) : "");
   const wins = authority.priority !== null && priority < authority.priority;
-  const may = asks ? t.strip.now.ask : wins ? t.strip.now.higher(priority) : t.strip.now.noHigher(priority);
+  const may = !wins ? t.strip.now.noHigher(priority) : asks ? t.strip.now.ask : t.strip.now.higher(priority);
   return t.strip.now.others(holder, names.length ? t.strip.now.wait(names, false) : t.strip.now.nobody, may);
 }
 
@@ -64,6 +64,8 @@ export class Strip {
   private readonly endedText = h("span", {});
   private readonly ended: HTMLElement;
   private readonly buttons: readonly [string, HTMLButtonElement][];
+  private free = true;
+  private mustAsk = false; // another has control, with a priority that the chosen one is no higher than
 
   constructor(
     drone: string,
@@ -95,9 +97,9 @@ export class Strip {
     return Number.isFinite(value) && this.priority.value !== "" ? Math.max(0, Math.min(31, value)) : USUAL_PRIORITY;
   }
 
-  /** Whether to ask the holder first. */
+  /** Whether to ask the holder first: the person wants it, or control can't be taken otherwise. */
   get asks(): boolean {
-    return this.ask.getAttribute("aria-pressed") === "true";
+    return this.mustAsk || this.ask.getAttribute("aria-pressed") === "true";
   }
 
   /** `pilot` is null for an observer; `old`: the newest state is out of date. A recording has no flight controls. */
@@ -110,8 +112,12 @@ export class Strip {
     const flies = vehicle?.can_fly ?? true;
     const [can, mine] = [flies && (pilot?.isReady ?? false), pilot?.mine ?? false];
     const emergency = state?.flight === "emergency";
-    setHidden(this.take, mine || pilot === null || !flies);
-    for (const choice of [this.priority, this.ask]) setHidden(choice, mine || pilot === null || !flies);
+    const { holder = null, priority = null } = pilot?.authority ?? {};
+    this.free = holder === null;
+    this.mustAsk = !this.free && !mine && (priority === null || this.wanted >= priority);
+    for (const choice of [this.take, this.priority]) setHidden(choice, mine || pilot === null || !flies);
+    setHidden(this.ask, this.take.hidden || this.free || this.mustAsk); // nobody to ask, or no choice
+    this.nameTake();
     setHidden(this.release, !mine && !(pilot?.waits ?? false));
     setText(this.release.firstElementChild as Element, pilot?.waits ? t.strip.stopWaiting : t.strip.release);
     setText(this.line, pilot?.waits ? lineText(pilot.authority) : "");
@@ -148,6 +154,10 @@ export class Strip {
   private choose(asks: boolean): void {
     memory.set("ask-first", String(asks));
     setAttribute(this.ask, "aria-pressed", String(asks));
-    setText(this.take.firstElementChild as Element, asks ? t.strip.askForControl : t.strip.take);
+    this.nameTake();
+  }
+
+  private nameTake(): void {
+    setText(this.take.firstElementChild as Element, this.asks && !this.free ? t.strip.askForControl : t.strip.take);
   }
 }

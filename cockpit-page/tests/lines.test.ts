@@ -86,11 +86,13 @@ class FakeWire implements Wire {
   }
 }
 
-function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]; later: () => void; states: boolean[]; received: unknown[] } {
+function lasting(path: string | (() => string) = "/ws"): { socket: LastingSocket; wires: FakeWire[]; paths: string[]; pauses: number[]; later: () => void; states: boolean[]; received: unknown[] } {
+  const paths: string[] = [];
   const [wires, pauses, states, received]: [FakeWire[], number[], boolean[], unknown[]] = [[], [], [], []];
   let act: () => void = () => undefined;
   const around = {
-    connect: () => {
+    connect: (where: string) => {
+      paths.push(where);
       wires.push(new FakeWire());
       return wires.at(-1) as FakeWire;
     },
@@ -102,8 +104,8 @@ function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]
       act = () => undefined;
     },
   };
-  const socket = new LastingSocket("/ws", { message: (data) => received.push(data), state: (open) => states.push(open) }, around);
-  return { socket, wires, pauses, later: () => act(), states, received };
+  const socket = new LastingSocket(path, { message: (data) => received.push(data), state: (open) => states.push(open) }, around);
+  return { socket, wires, paths, pauses, later: () => act(), states, received };
 }
 
 test("a socket comes back, with longer and longer pauses, and short ones again after it was open", () => {
@@ -121,6 +123,17 @@ test("a socket comes back, with longer and longer pauses, and short ones again a
   later();
   wires.at(-1)?.end(4403);
   assert.equal(pauses.at(-1), REFUSED_PAUSE_MS, "not allowed: no hurry");
+});
+
+test("a socket that begins anew asks for its path again", () => {
+  let name = "";
+  const { socket, wires, paths, later } = lasting(() => `/ws?name=${name}`);
+  wires[0]?.open();
+  name = "Anna";
+  socket.reopen();
+  wires[0]?.end(1000);
+  later();
+  assert.deepEqual(paths, ["/ws?name=", "/ws?name=Anna"]);
 });
 
 test("nothing is sent or kept while it is not open; closed is closed", () => {
@@ -153,7 +166,9 @@ test("a route of a connection that broke is forgotten, and control that was give
   receive(held(true));
   receive({ ...held(false, "survey.py"), state: "preempted", why: "survey.py has control now", given: true });
   assert.equal(pilot.ended, "");
-  assert.equal(told.at(-1), "given: survey.py has control now");
+  assert.equal(told.at(-1), "given: survey.py");
+  receive(held(true));
+  assert.equal(told.at(-1), "granted: undefined", "it waited, and has it back");
   link(false);
   assert.equal(told.at(-1), null, "“Fly the route” is not held back by a flight that is gone");
 });

@@ -60,7 +60,14 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
             (link(), flying(state=FlightState.EMERGENCY), 0.1, {}),
             [("emergency", "critical", "emergency: the motors are off")],
         ),
-        ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), [("failsafe", "warning", "failsafe: hovering")]),
+        (
+            (link(), flying(failsafe=Failsafe.HOVER, lease=3), 0.1, {}),
+            [("failsafe", "warning", "failsafe: hovering")],
+        ),
+        (
+            (link(), flying(failsafe=Failsafe.HOVER), 0.1, {}),
+            [("failsafe", "warning", "failsafe: hovering, landing next unless someone takes control")],
+        ),
         ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), [("failsafe", "critical", "failsafe: landing")]),
         ((link(), flying(battery=0.19), 0.1, {}), [("battery", "warning", "battery low: 19%")]),
         ((link(), flying(battery=0.14), 0.1, {}), [("battery", "critical", "battery critical: 14%")]),

@@ -143,12 +143,41 @@ def test_authority_passes_from_a_controller_to_a_person_and_back(deck: Deck) -> 
         assert page.pane.get_attribute("data-mine") == "false"
 
 
-def test_a_lower_priority_is_refused_with_its_reason(deck: Deck) -> None:
+def test_who_is_no_higher_asks_with_the_same_press_and_hears_when_it_has_control(deck: Deck) -> None:
     deck.proxy("busy")
     page = deck.page("busy")
-    with skyloop.connect("busy", name="first.py", authority=skyloop.Authority(priority=2)):
-        page.wait_for_text(".holder", "first.py")
-        page.press_until("c", lambda: "first.py has control with priority 2" in page.says(".notice"), "it says why not")
+    first = page.pane.get_by_role("button", name="Ask first")
+    with skyloop.connect("busy", name="first.py", authority=skyloop.Authority(priority=2)) as drone:
+        page.wait_for_text(".now", "ask for it, as your priority 8 is no higher")
+        assert not first.is_visible(), "there is no choice"
+        page.press_until("c", lambda: "first.py was asked" in page.says(".waiting"), "it asks")
+        page.pane.locator(".priority").fill("1")
+        page.until(first.is_visible, "it could be taken now")
+        page.wait_for_text(".taking .primary", "Take control")
+        drone.release_authority()
+        page.wait_for_text(".notice", "You have control now")
+    assert page.problems == []
+
+
+def test_a_person_has_a_name_which_others_see(deck: Deck) -> None:
+    deck.proxy("named")
+    ann, ben = deck.page("named"), deck.page("named")
+    ann.take_control()
+    ben.wait_for_text(".holder", "cockpit ")
+    ann.page.get_by_role("button", name="Settings").click()
+    ann.page.get_by_label("Your name").fill("Ann")
+    ann.page.get_by_label("Your name").press("Enter")
+    ann.press("Escape")
+    assert ann.pane.get_attribute("data-mine") == "true", "a name is no reason to lose control"
+    ann.press("r")
+    ben.wait_for_text(".holder", "Nobody")
+    ann.take_control()
+    ben.wait_for_text(".holder", "Ann (cockpit ")
+    ann.wait_for_text(".holder", "You (Ann, cockpit ")
+    ann.page.reload()
+    ann.take_control()
+    ben.wait_for_text(".holder", "Ann (cockpit ")
+    assert ann.problems == ben.problems == []
 
 
 def allow_time(name: str) -> None:

@@ -49,6 +49,33 @@ def drag(page: DronePage, share: float) -> None:
     mouse.up()
 
 
+def test_a_flight_is_recorded_beside_its_picture_and_only_once(deck: Deck, tmp_path: Path) -> None:
+    (tmp_path / "broken.mcap").write_bytes(b"no recording")
+    deck.address = deck.cockpit("--recordings", str(tmp_path))
+    deck.proxy("large")
+    page = deck.page("large", panels=False)
+    page.wait_for_new_picture()
+    record = page.pane.locator(".record-flight")
+    record.click()
+    page.until(lambda: "0:0" in (record.text_content() or ""), "how long it is by now")
+    page.page.get_by_role("button", name="All drones").click()
+    every = page.page.get_by_role("button", name="Record", exact=True)
+    page.until(every.is_disabled, "all are being recorded")
+    page.page.go_back()
+    record.click()
+    page.wait_for_text(".notice", "Recorded: large-")
+    assert len(list(tmp_path.glob("large-*.mcap"))) == 1
+    page.page.get_by_role("button", name="All drones").click()
+    row = page.page.locator('[data-recording="broken.mcap"]')
+    page.until(lambda: "no MCAP file" in (row.text_content() or ""), "what is wrong with it")
+    assert not row.get_by_role("link", name="Report").is_visible(), "nothing of it can be read"
+    row.get_by_role("button", name="More").click()
+    assert row.get_by_role("button", name="Delete").is_visible()
+    page.page.locator('[data-recording^="large-"]').get_by_role("button", name="More").click()
+    page.page.get_by_text(f'skyloop log export "{tmp_path}/large-').wait_for()
+    assert page.problems == []
+
+
 def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: Path) -> None:
     deck.address = deck.cockpit("--recordings", str(tmp_path))
     deck.proxy("filmed")

@@ -77,6 +77,13 @@ def test_sticks_that_a_stop_overtakes_are_refused_and_the_stop_is_not(
         assert {told["do"] for told in pilot.told if told["type"] == "refused"} == {"fly"}
 
 
+def test_a_refusal_to_a_page_does_not_repeat_the_pages_own_name(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take()
+        pilot.say("fly", forward=0.5)
+        assert pilot.wait("refused", do="fly")["why"].startswith("velocity refused: velocity is not possible")
+
+
 def test_a_stop_that_does_not_show_is_never_done_and_the_drone_hovers(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:

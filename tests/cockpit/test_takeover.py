@@ -12,11 +12,12 @@ import pytest
 from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
 from skyloop.cockpit import takeover
+from skyloop.cockpit.access import Person
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.station import PilotConnection
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
-from skyloop.messages import Event, EventKind, FlightState
+from skyloop.messages import Event, EventKind, FlightState, Role
 from tests.support.cockpit import Node, until
 from tests.support.cockpit_page import Page, page
 from tests.support.testclient import TestClient
@@ -254,6 +255,22 @@ def test_every_page_knows_which_pages_wait(client: TestClient, node: Node) -> No
         second.say("release")
         for one in (first, third):
             one.wait("authority", waiting=[])
+
+
+def test_a_page_knows_which_program_goes_on_when_it_releases(client: TestClient, node: Node) -> None:
+    with node.connect("demo") as demo, page(client) as pilot:
+        pilot.take(8)
+        pilot.wait("authority", waiting=["demo"])
+        demo.release_authority()
+        pilot.wait("authority", waiting=[])
+
+
+def test_a_person_is_called_as_the_page_says_unless_the_login_has_a_name(client: TestClient, node: Node) -> None:
+    with page(client, name="Anna\x1b[31m  Lee") as anna, page(client) as other:
+        assert anna.take(8).told[-1]["app"].startswith("Anna[31m Lee (cockpit ")
+        other.wait("authority", holder=anna.told[-1]["app"])
+    assert Person(Role.PILOT, "ann").called("Boss") == "ann"
+    assert Person(Role.PILOT).called("x" * 100) == "x" * 40
 
 
 def test_a_closed_page_leaves_the_line(client: TestClient, node: Node) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from skyloop.cli.naming import keys_directory
 from tests.support.pages import PAGES, ROOT, prose, spans
 
 MOST_BYTES = 300_000
@@ -39,6 +40,15 @@ def test_files_that_are_named_exist(page: Path) -> None:
     for span in spans(page):
         for named in re.findall(r"(?:^|\s)((?:docs|src|tests|scripts)/[\w./-]*)(?=\s|$)", span):
             assert (ROOT / named).exists(), f"{page.name} names {named}"
+
+
+def test_the_folder_of_keys_is_where_keys_makes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/anna")
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    folder = str(keys_directory()).replace("/home/anna", "~")
+    named = {path for page in PAGES for path in re.findall(r"~/\.config/skyloop/[\w./-]*", page.read_text())}
+    assert named
+    assert [path for path in named if not path.startswith(folder)] == []
 
 
 def test_pictures_are_small_and_all_are_shown() -> None:

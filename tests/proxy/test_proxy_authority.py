@@ -242,9 +242,22 @@ def test_a_holder_is_asked_and_hands_over(bench: Bench) -> None:
     assert (handed.app, handed.data["by"], handed.data["granted"]) == ("alice", "bob", True)
     assert bench.driver.told == [Velocity(0.5), Hover()]
     bench.tick()
-    assert bob.last_feedback().owner == "bob"
+    assert (bob.last_feedback().owner, bob.last_feedback().next_owner) == ("bob", "alice")
     assert bob.told(EventKind.AUTHORITY_GRANTED)[-1].data["identity"] == "this process"
     assert alice.told(EventKind.AUTHORITY_QUEUED)[-1].data["position"] == 1
+
+
+def test_feedback_says_who_is_next_until_that_one_leaves_the_queue(bench: Bench) -> None:
+    alice, bob, carl = bench.pilot("alice"), bench.join("bob"), bench.join("carl")
+    bench.tick()
+    assert alice.last_feedback().next_owner is None
+    bob.ask(RequestAuthority(16, queue=True))
+    carl.ask(RequestAuthority(20, queue=True))
+    bench.tick()
+    assert alice.last_feedback().next_owner == "bob"
+    bob.ask(ReleaseAuthority())  # which nobody is told of by an event
+    bench.tick()
+    assert alice.last_feedback().next_owner == "carl"
 
 
 def test_a_holder_that_does_not_answer_is_pre_empted_after_the_time_to_ask(bench: Bench) -> None:

@@ -96,13 +96,19 @@ def test_the_table_and_the_pictures(log: Log, flight: Path, other_flight: Path, 
         assert ended.code == 0
         row = next(line for line in ended.out.splitlines() if line.strip().startswith("forward")).split()
         assert row[1:5] == ["0.2000", "m/s", "0.2000", "m/s"]
-        assert "they part at 0.51 s" in ended.out
+        assert "they diverge at 0.51 s" in ended.out
         assert f"{tmp_path / name}: " in ended.err
     page = (tmp_path / "both.html").read_text()
     assert "other.mcap against flight.mcap" in page
     assert "forward [m/s]" in page
     assert "http://" not in page
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_nothing_in_common_is_said_in_whole_lines(log: Log, flight: Path, tmp_path: Path) -> None:
+    ended = log("compare", flight, write_flight(tmp_path / "places.mcap", Plan(places=True)))
+    assert "no set-point is in both at one time" in ended.out
+    assert any("s compared, " in line and "they diverge at" in line for line in ended.out.splitlines())
 
 
 def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:

@@ -113,6 +113,12 @@ def test_mp4_keeps_each_frames_time(log: Log, flight: Path, tmp_path: Path, burn
     assert corner > 200 if burn else corner < 160  # white digits on a dark ramp, away from the bright column
 
 
+def test_mp4_has_its_ending_and_finds_a_place_in_a_folder(log: Log, flight: Path, tmp_path: Path) -> None:
+    for output, written in ((tmp_path / "film", "film.mp4"), (tmp_path, f"{flight.stem}-front.mp4")):
+        assert log("export", flight, "--to", "mp4", "-o", output).code == 0
+        assert (tmp_path / written).is_file()
+
+
 def jpeg(width: int, height: int) -> bytes:
     return cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
 

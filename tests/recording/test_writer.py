@@ -263,6 +263,16 @@ def test_a_full_disk_pauses_and_no_essential_sample_is_lost(make: Make, tmp_path
     assert bench.backlog.dropped == {}
 
 
+def test_the_reason_for_left_out_frames_is_shown(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), min_free_mb=100.0)
+    assert bench.writer.shown_reason == ""
+    bench.writer._judge_room(bench.writer._floor - 1)
+    assert bench.writer.state.value == "recording"
+    assert "no frames are recorded" in bench.writer.shown_reason
+    bench.writer._judge_room(2 * bench.writer._floor)
+    assert bench.writer.shown_reason == ""
+
+
 def test_a_file_after_a_pause_overwrites_nothing(make: Make, tmp_path: Path) -> None:
     (tmp_path / "flight-0002.mcap").write_text("precious")
     bench = make(tmp_path, Disk(), overwrite=True)

@@ -11,6 +11,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Self
+from urllib.parse import quote
 
 from skyloop.cockpit import serve_cockpit
 from skyloop.messages import (
@@ -72,8 +73,8 @@ class Page:
 
 
 @contextmanager
-def page(client: TestClient, drone: str = "alpha") -> Iterator[Page]:
-    with open_socket(client, f"drones/{drone}/control") as socket:
+def page(client: TestClient, drone: str = "alpha", name: str = "") -> Iterator[Page]:
+    with open_socket(client, f"drones/{drone}/control?name={quote(name)}") as socket:
         yield Page(socket)
 
 

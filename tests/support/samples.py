@@ -139,6 +139,7 @@ SAMPLES: dict[str, Sample] = {
         return_phase=ReturnPhase.FLYING,
         skipped=5,
         outcome=Outcome(2, 31, Fate.REFUSED, Refusal.WRONG_STATE, "follow.py: velocity refused: it stands"),
+        next_owner="anna",
     ),
     "feedback-minimal": Feedback(captured_ns=1),
     "frame": FrameHeader("front", 12, 3_000_000_000, 3_000_500_000, 320, 240, Encoding.BGR8, 230_400, INTRINSICS),

@@ -146,7 +146,7 @@ def export(
 
     H.264 is copied as recorded, in seconds, unless the time is written into the frames. For lerobot, flights become
     episodes of a LeRobotDataset: pictures, the state at their capture, and the commands. rrd is a file for Rerun's
-    viewer, with all drones.
+    viewer, with all drones. Foxglove and Lichtblick open the recording itself.
     """
     from skyloop.cli import log_tables
     from skyloop.recording.review import tables as ways
@@ -166,7 +166,7 @@ def export(
     (file,) = files
     recording = _open(file)
     if to is Form.RRD:
-        _export_rrd(recording, output or file.with_suffix(".rrd"), drone)
+        _export_rrd(recording, _file(output, f"{file.stem}.rrd", file), drone)
         return
     name = recording.drone(drone).name
     if to is Form.MP4:
@@ -174,7 +174,7 @@ def export(
         if camera and len(camera) > 1:
             raise UsageError(f"{len(camera)} cameras given: mp4 takes one at a time")
         chosen = camera[0] if camera else _first_camera(recording, name)
-        target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
+        target = _file(output, f"{file.stem}-{chosen}.mp4", file)
         with progress_bar(f"exporting {chosen}") as progress:
             found = export_mp4(recording, name, chosen, target, burn_time=burn_time, encode=encode, progress=progress)
         for line in log_tables.exported(found, chosen):
@@ -221,7 +221,9 @@ def compare(
     if json:
         typer.echo(log_tables.comparison_json(found))
     else:
-        console().print(log_tables.comparison(found, str(old), str(new)))
+        screen = console()
+        for part_ in log_tables.comparison(found, str(old), str(new)):
+            screen.print(part_)
     if output is not None:
         from skyloop.recording.review.compare import write_comparison
 
@@ -308,6 +310,13 @@ def _open(file: Path) -> Recording:
     from skyloop.recording.reader import Recording
 
     return Recording.open(file)
+
+
+def _file(output: Path | None, name: str, beside: Path) -> Path:
+    """Return the file to write: in a folder with that name, else with its ending."""
+    if output is None:
+        return beside.with_name(name)
+    return output / name if output.is_dir() else output.with_suffix(output.suffix or Path(name).suffix)
 
 
 def _first_camera(recording: Recording, drone: str) -> str:

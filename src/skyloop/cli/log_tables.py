@@ -131,24 +131,10 @@ def comparison_json(found: Comparison) -> str:
     return msgspec.json.encode(shown).decode()
 
 
-def comparison(found: Comparison, old: str, new: str) -> Table:
-    """Return the differences of two recordings."""
+def comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
+    """Return the differences of two recordings, as parts to print."""
     parts = "they never diverge" if found.part_at_s is None else f"they diverge at {found.part_at_s:.2f} s"
-    table = Table(
-        named("set-point"),
-        "RMS",
-        "largest",
-        "at",
-        "compared",
-        box=None,
-        title=f"{new} against {old}",
-        title_justify="left",
-        caption=(
-            f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
-            f"the same kind of action {found.same_action:.1%} of the time; {parts}"
-        ),
-        caption_justify="left",
-    )
+    table = Table(named("set-point"), "RMS", "largest", "at", "compared", box=None)
     for field in found.fields:
         table.add_row(
             field.name,
@@ -157,4 +143,9 @@ def comparison(found: Comparison, old: str, new: str) -> Table:
             f"{field.largest_at_s:.2f} s",
             f"{field.seconds:.1f} s",
         )
-    return table
+    return [
+        f"{new} against {old}",
+        table if found.fields else "no set-point is in both at one time",
+        f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
+        f"the same kind of action {found.same_action:.1%} of the time; {parts}",
+    ]

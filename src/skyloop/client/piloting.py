@@ -421,6 +421,8 @@ class ActionWait:
             return f"{text}, and its own link is {newest.vehicle_link.value} ({newest.link_reason})"
         if newest is not None and newest.waking_up:
             return f"{text}; it is {newest.link_reason}"
+        if newest is not None and "replay.position_s" in (newest.native or {}):
+            return f"{text}; a replay flies only when its recording does: begin there, with ?start=SECONDS"
         return f"{text}; {self._why}" if self._why and self._why_link is self._vehicle_link else text
 
     def _note(self, why: str) -> None:

@@ -56,6 +56,7 @@ _LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of the tables
 Scope = Mapping[str, Any]
 Endpoint = tuple[str, int]  #: address and port
 
+MOST_NAME: Final = 40  #: characters of a name that a person wishes to have
 _log = logging.getLogger(__name__)
 
 
@@ -117,6 +118,10 @@ class Person:
     def may(self, role: Role) -> bool:
         """Return whether this person has a role's permissions: a pilot may also observe."""
         return self.role is Role.PILOT or role is Role.OBSERVER
+
+    def called(self, wish: str) -> str:
+        """Return the name that others see; ``wish`` counts only for who was given none."""
+        return self.name or " ".join("".join(filter(str.isprintable, wish)).split())[:MOST_NAME]
 
 
 class Gate(Protocol):

@@ -233,7 +233,8 @@ class Cockpit:
             await socket.close(NOT_ALLOWED, "only a pilot may do this")
             return
         photos = self._recordings.folder / "photos"
-        await ControlSession(socket, station, person.name, photos=photos, follower=self._follower).run()
+        name = person.called(socket.query_params.get("name", ""))
+        await ControlSession(socket, station, name, photos=photos, follower=self._follower).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
         """Return the station of the requested drone; None, with the socket closed, if there is none."""

@@ -565,7 +565,7 @@ class ControlSession:
         watched = self._follow.is_under_way or (self._route is not None and self._route.is_under_way)
         refused = outcome.fate in (Fate.UNDER_WAY, Fate.REFUSED, Fate.OTHERS)
         if not watched and (refused or self._awaited or self._is_under_way):
-            self._refuse(*self._last_command, outcome.text)
+            self._refuse(*self._last_command, outcome.text.removeprefix(f"{self.app}: "))  # the page knows whose
         if watched or self._place.is_under_way:
             self.let_go(outcome.text)  # the same feedback shows whether others have the vehicle
         elif self._last_command[0] == TakeOff().do:

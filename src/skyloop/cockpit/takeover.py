@@ -225,9 +225,11 @@ class AuthorityReport:
         """
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
+        heir: str | None = None  # the first in the queue, which may be a program
         try:
             feedback = self._station.feedback()
             holder, priority = self._station.view.holder(feedback), feedback.owner_priority
+            heir = feedback.next_owner
         except LinkError:
             holder, priority = None, None
         mine = state == "held"
@@ -245,6 +247,9 @@ class AuthorityReport:
         self._was_mine = mine
         why = None if self._loss is None else self._why(self._loss, holder, lost)
         waiting = sorted(session.app for session in self._station.sessions if session.waits)
+        # Of the pages it is known here first.
+        if heir is not None and not lost and heir not in {session.app for session in self._station.sessions}:
+            waiting.insert(0, heir)
         if (state, holder, priority, place, why, waiting) == self._sent:
             return None
         self._sent = state, holder, priority, place, why, waiting

@@ -81,6 +81,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far the vehicle is on its way back to the start
     skipped: Count = 0  #: samples before this one that the proxy left out for a subscriber with a lower rate
     outcome: Outcome | None = None  #: fate of the newest intent; None: the proxy does not report it
+    next_owner: str | None = None  #: name of the first in the queue for the authority; None: the queue is empty
 
     @property
     def waking_up(self) -> bool:

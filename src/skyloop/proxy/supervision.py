@@ -395,6 +395,7 @@ class FlightSupervisor:
                 "others": flight.others if flight.whose is Whose.OTHERS else None,
                 "start_position_m": self._returns.start,
                 "return_phase": self._returns.phase,
+                "next_owner": next((name_of(self._sessions, one.app_id) for one in authority.waiting), None),
             }
         )
 

@@ -94,7 +94,7 @@ class Engine:
         writer = self._writer
         return Status(
             writer.state,
-            writer.reason,
+            writer.shown_reason,
             str(writer.path),
             tuple(map(str, writer.files)),
             ((self._ended_ns or time.monotonic_ns()) - self._started_ns) / 1e9,

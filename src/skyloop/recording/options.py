@@ -130,7 +130,7 @@ def first_path(path: Path, drones: list[str], options: Options) -> Path:
         raise UsageError(f"{path.parent} is not a folder: create it first")
     first = numbered(path, 1) if options.rotates else path
     if first.exists() and not options.overwrite:
-        raise UsageError(f"{first} already exists: choose another name, or allow overwriting")
+        raise UsageError(f"{first} already exists: choose another name, or overwrite=True (--overwrite)")
     return path
 
 
@@ -151,7 +151,7 @@ class Status(msgspec.Struct, frozen=True):
     """The status of a recording at one time."""
 
     state: RecorderState = RecorderState.STARTING
-    reason: str = ""  #: why it is paused or has failed
+    reason: str = ""  #: why it is paused, has failed or leaves frames out
     path: str = ""  #: the current or last file
     files: tuple[str, ...] = ()  #: all files, oldest first
     seconds: float = 0.0  #: time since the start

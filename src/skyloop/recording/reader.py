@@ -419,6 +419,6 @@ def describe(path: Path) -> Described:
             problem=recording.cut,
         )
     except SkyloopError as error:
-        return Described(problem=str(error).replace(path.name, shown_name(path)))
+        return Described(problem=str(error).removeprefix(f"{path} ").replace(path.name, shown_name(path)))
     except Exception as error:  # noqa: BLE001  one file's surprise must not hide the others
         return Described(problem=f"{shown_name(path)} can't be read: {error!r:.300}")

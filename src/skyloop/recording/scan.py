@@ -216,7 +216,7 @@ def _check_magic(found: Scan, head: bytes) -> None:
         return
     if not head:
         raise FileFormatError(f"{found.path} is empty: nothing was recorded")
-    raise FileFormatError(f"{found.path} is not an MCAP file: it begins with {head!r}, not {MAGIC!r}")
+    raise FileFormatError(f"{found.path} is not an MCAP file: it begins with {head!r}")
 
 
 class _Scanner:

@@ -116,7 +116,7 @@ class FileWriter:
             if self.room is Room.NOTHING:
                 raise UsageError(
                     f"{folder} has {free / MB:.0f} MB left, but recording keeps {self._floor / MB:.0f} MB free: "
-                    "choose another folder, or a lower floor"
+                    "choose another folder, or a lower min_free_mb (--min-free-mb)"
                 )
             self._open()
         except OSError as error:
@@ -128,6 +128,12 @@ class FileWriter:
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
+
+    @property
+    def shown_reason(self) -> str:
+        """Why it is paused, has failed or leaves frames out."""
+        short = self.state is RecorderState.RECORDING and self.room is Room.NO_FRAMES
+        return "the disk is nearly full: no frames are recorded" if short else self.reason
 
     @property
     def path(self) -> Path:

@@ -126,6 +126,14 @@ def test_a_paused_seek_shows_image_and_state_of_one_instant(flight: Path) -> Non
         assert (state.native or {})["replay.applied"] in ("takeoff", "velocity")
 
 
+def test_a_take_off_before_the_recorded_one_says_where_to_begin(flight: Path) -> None:
+    with (
+        skyloop.connect(f"replay://{flight}?speed=max", on_exit="hover") as drone,
+        pytest.raises(skyloop.NoAnswerError, match=r"begin there, with \?start=SECONDS"),
+    ):
+        drone.takeoff(timeout_s=0.05)
+
+
 def test_times_never_go_back_and_samples_are_fresh(flight: Path) -> None:
     script = Script(flight, (2.0, to(0.2)), (3.0, paused), (3.5, to(3.0)), (3.8, to(0.0)), (4.0, played))
     for captured in (

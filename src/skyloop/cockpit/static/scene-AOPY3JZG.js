@@ -1,4 +1,4 @@
-import{a as ll,h as fe,p as cl}from"./chunk-J7OYUINO.js";/**
+import{a as ll,h as fe,p as cl}from"./chunk-X7VYYYYC.js";/**
  * @license
  * Copyright 2010-2025 Three.js Authors
  * SPDX-License-Identifier: MIT
