@@ -174,7 +174,7 @@ class Config(Mapping[str, Value]):
     def __contains__(self, name: object) -> bool:
         return any(parameter.name == name for parameter in self.parameters())
 
-    def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  one request for all names
+    def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  # one request for all names
         """Return (name, value) of all parameters, sorted by name."""
         return [(parameter.name, parameter.value) for parameter in self.parameters()]
 
