@@ -349,7 +349,7 @@ class CommandChecks:
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
         """Whether it matters where the vehicle is: a hover only in its place, a take-off only on the ground."""
-        if type(action) is Hover:
+        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent takes it from nobody
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
