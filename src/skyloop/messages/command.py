@@ -238,7 +238,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.REPLACED: "a newer command took its place",
     Fate.WITHDRAWN: "its application wants it no more: the call was cancelled, failed, or ran out of time",
     Fate.TIMED_OUT: "it did not leave the ground within 20 s, or was to hover or land and was not heard for 60 s",
-    Fate.LANDED: "the vehicle landed or disarmed, whoever made it",
+    Fate.LANDED: "the vehicle lands, or has landed or disarmed, whoever made it",
     Fate.EMERGENCY: "there was an emergency, or somebody stopped the motors",
     Fate.AUTHORITY: "the authority was granted anew, lost or given back",
     Fate.LINK: "the link to the vehicle broke or came back, which ends no landing, or the application's own was lost",
