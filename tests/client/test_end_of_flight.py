@@ -341,6 +341,11 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 
+def landed_by_others(proxy: ScriptedProxy) -> None:
+    proxy.state = LANDING
+    proxy.more["others"] = "the vehicle is in LAND"
+
+
 @pytest.mark.parametrize(
     ("take", "told"),
     [
@@ -349,13 +354,7 @@ def test_what_returns_for_its_battery_is_waited_for_and_nothing_is_said_to_it(
             lambda proxy: proxy.more.update(others="the vehicle is in RTL"),
             "the vehicle is in RTL: the drone is left to it",
         ),
-        (
-            lambda proxy: (
-                setattr(proxy, "state", FlightState.LANDING),
-                proxy.more.update(others="the vehicle is in LAND"),
-            ),
-            "the vehicle is in LAND: the drone is left to it",
-        ),
+        (landed_by_others, "the vehicle is in LAND: the drone is left to it"),
     ],
 )
 def test_what_others_fly_is_left_to_them_at_the_end(
