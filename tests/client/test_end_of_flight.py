@@ -337,6 +337,11 @@ def test_a_return_for_the_battery_is_awaited_without_further_commands(proxy: Scr
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 
+def landed_by_others(proxy: ScriptedProxy) -> None:
+    proxy.state = LANDING
+    proxy.more["others"] = "the vehicle is in LAND"
+
+
 @pytest.mark.parametrize(
     ("take", "told"),
     [
@@ -345,6 +350,7 @@ def test_a_return_for_the_battery_is_awaited_without_further_commands(proxy: Scr
             lambda proxy: proxy.more.update(others="the vehicle is in RTL"),
             "the vehicle is in RTL: leaving the drone to it",
         ),
+        (landed_by_others, "the vehicle is in LAND: leaving the drone to it"),
     ],
 )
 def test_a_vehicle_flown_by_others_is_left_to_them_at_the_end(

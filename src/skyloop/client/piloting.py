@@ -192,7 +192,7 @@ class Piloting:
         feedback = self._state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
-                if land and feedback.others:  # it may be a flight of ours whose link was lost for a minute
+                if land and feedback.others and feedback.state not in _SINKING:  # it may have been ours a minute ago
                     _log.warning("%s: %s: it stays in the air, not landed from here", self._state.name, whose)
                 report(f"{whose}: leaving the drone to it")
             return None

@@ -237,7 +237,7 @@ ENDINGS: Final[dict[Fate, str]] = {
     Fate.REPLACED: "a newer command took its place",
     Fate.WITHDRAWN: "its application withdrew it: the call was cancelled, failed, or timed out",
     Fate.TIMED_OUT: "it did not leave the ground within 20 s, or was silent for 60 s before it hovered or landed",
-    Fate.LANDED: "the vehicle landed or disarmed, for whatever reason",
+    Fate.LANDED: "the vehicle is landing, or has landed or disarmed, for whatever reason",
     Fate.EMERGENCY: "there was an emergency, or someone stopped the motors",
     Fate.AUTHORITY: "the authority was granted again, lost or given back",
     Fate.LINK: "the vehicle link broke or came back (which ends no landing), or the application's connection was lost",

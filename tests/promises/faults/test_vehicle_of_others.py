@@ -246,6 +246,21 @@ def test_a_new_order_takes_it_back(kind: Kind, note: Path) -> None:
 
 
 @KINDS
+def test_a_hover_takes_it_back_above_the_ceiling_too(kind: Kind, note: Path) -> None:
+    """It was made a descent, and no set-point takes a vehicle back; a real PX4's RTL climbs to 30 m."""
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with taken_off(scene) as drone:
+            scene.station_mode("RTL" if kind is Kind.ARDUCOPTER else "LOITER")
+            wait_until(lambda: proxy.handler.flight.others != "", "it is seen")
+            drone.config["limits.altitude"] = 4.0
+            drone.hover()
+            guided = "GUIDED" if kind is Kind.ARDUCOPTER else "OFFBOARD"
+            wait_until(lambda: scene.mode == guided, "it is ours again")
+            wait_until(lambda: scene.height < 4.8, "it comes down to the ceiling")
+
+
+@KINDS
 @pytest.mark.parametrize("meanwhile", ["nobody", "station"])
 def test_a_killed_proxy_ends_its_own_flight_when_it_is_back_unless_others_took_it(
     kind: Kind, meanwhile: str, note: Path

@@ -218,6 +218,24 @@ def about_to_rise(autopilot: int) -> Bench:
 
 
 @AUTOPILOTS
+def test_a_pilot_who_takes_the_vehicle_before_its_heartbeat_shows_the_arming_keeps_it(autopilot: int) -> None:
+    """A PX4 tells it once a second: sticks moved in that second were answered by a take-off."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(vehicle.heartbeat())
+    bench.apply(Takeoff())
+    bench.answer(ARM)
+    bench.tick()
+    vehicle.armed, vehicle.status, vehicle.mode = True, 4, other_mode(autopilot, "sticks")
+    bench.hear(vehicle.heartbeat())
+    bench.said.clear()
+    bench.go_on(3.0)
+    assert bench.commands() == []
+    assert any("not from here" in text for text in bench.texts)
+
+
+@AUTOPILOTS
 def test_a_hover_ends_a_take_offs_climb(autopilot: int) -> None:
     """A cancelled takeoff() left it climbing to the end."""
     bench = climbing(autopilot)

@@ -348,7 +348,7 @@ class CommandChecks:
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
         """Return whether the vehicle's position matters: for a hover in flight, for a take-off on the ground."""
-        if type(action) is Hover:
+        if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take it back
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 

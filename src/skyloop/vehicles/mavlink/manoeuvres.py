@@ -244,7 +244,7 @@ class TakeoffSequence:
         self.refused = ""  #: why it is not armed yet
         self.arm_asked_ns: int | None = None  #: the last arming request; None: it was already armed
         self._arming_ns: int | None = None  # the first arming request; earlier answers are to the landing's disarming
-        self._ready = False  # it was seen armed in the mode for taking off
+        self._ready = False  # it was armed in the mode for taking off
 
     @property
     def started(self) -> bool:
@@ -279,7 +279,7 @@ class TakeoffSequence:
             if vehicle.armed or answer == ACCEPTED:
                 self._armed_ns = now_ns
                 self.refused = ""
-                self._disarms = self._disarms and answer != ACCEPTED
+                self._disarms, self._ready = self._disarms and answer != ACCEPTED, self._ready or answer == ACCEPTED
             elif answer is not None:
                 self.refused = f"arming was {result_name(answer)}" + (f": {self.reason}" if self.reason else "")
             if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
