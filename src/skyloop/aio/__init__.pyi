@@ -1132,8 +1132,8 @@ def connect(
     The result connects when it is awaited, or entered with ``async with``. ``speed=max`` is refused.
 
     Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. A vehicle that was
-    started just now is waited for until it can take off, and the log (``skyloop``) says so; after ``timeout_s`` the
-    call returns all the same, and :meth:`Drone.takeoff` goes on waiting.
+    started just now is waited for until it can take off, and the log (``skyloop``) says so; after ``timeout_s``,
+    or 60 s, the call returns all the same, and :meth:`Drone.takeoff` goes on waiting.
 
     Args:
         target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
@@ -1141,7 +1141,8 @@ def connect(
             looked up on this host first and then, if ``network`` allows, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
+        timeout_s: Time for the proxy to answer and the vehicle to wake up [s]; None or 0: 5 s for a name and 20 s for
+            an address, and then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. One that

@@ -194,9 +194,7 @@ Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
 PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off that nobody asked for in so long is given up if it is not armed
-#: An armed one that does not leave the ground by then is given up. A real ArduCopter takes 4.5 s by its clock, which is
-#: slow on a busy computer.
-RISING_NS: Final = nanoseconds(12.0)
+RISING_NS: Final = nanoseconds(12.0)  #: an armed one that does not leave the ground by then is given up (usual: 4.5 s)
 ARM_PACE_S: Final = 1.0
 ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledgement of arming counts, until a heartbeat shows it
 LANDED_NS: Final = nanoseconds(2.5)  #: after this a landing has disarmed it, or does not: a PX4 does after 2 s
