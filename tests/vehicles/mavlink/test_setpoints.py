@@ -303,6 +303,22 @@ def test_a_landing_ends_a_take_off_on_the_ground_by_disarming(autopilot: int) ->
     assert bench.commands() == []
 
 
+def test_a_vehicle_slow_to_leave_the_ground_gets_time() -> None:
+    """A real ArduCopter, 4.5 s after it was armed by its clock, which was slow: it was disarmed just before."""
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.apply(Takeoff())
+    bench.vehicle.mode = "GUIDED"
+    bench.go_on(0.3)
+    bench.answer(ARM)
+    bench.vehicle.armed = True
+    bench.go_on(10.0)
+    bench.apply(Takeoff(), new=False)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) not in bench.commands()
+    bench.vehicle.status, bench.vehicle.landed, bench.vehicle.place = 4, Landed.IN_AIR, (0.0, 0.0, -1.5)
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.HOVERING
+
+
 def test_a_cancelled_climb_continues_by_a_position() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     vehicle = bench.vehicle

@@ -194,7 +194,7 @@ Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
 PATIENCE_NS: Final = nanoseconds(6.0)  #: give up a take-off not requested for this long if the vehicle is not armed
-RISING_NS: Final = nanoseconds(8.0)  #: give up if an armed vehicle is still on the ground after this
+RISING_NS: Final = nanoseconds(12.0)  #: give up if an armed vehicle is still on the ground by then; usual: 4.5 s
 ARM_PACE_S: Final = 1.0  #: between repeated commands to arm or take off
 ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledged arming counts without a heartbeat that confirms it
 LANDED_NS: Final = nanoseconds(2.5)  #: a landing has disarmed the vehicle by then, or never will: a PX4 does after 2 s
