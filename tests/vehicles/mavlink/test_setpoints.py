@@ -218,6 +218,29 @@ def about_to_rise(autopilot: int) -> Bench:
 
 
 @AUTOPILOTS
+def test_a_pilot_who_takes_the_vehicle_before_it_is_armed_keeps_it(autopilot: int) -> None:
+    """Its mode was asked for again, and it was armed and took off."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(vehicle.heartbeat())
+    bench.apply(Takeoff())
+    bench.tick()
+    assert (ARM, 1.0, 0.0, 0.0, 0.0) in bench.commands()
+    vehicle.mode = other_mode(autopilot, "sticks")
+    bench.hear(vehicle.heartbeat())
+    bench.said.clear()
+    bench.go_on(3.0)
+    with pytest.raises(DriverError, match="not chosen here"):
+        bench.apply(Takeoff(), new=False)
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    bench.apply(Takeoff())
+    bench.go_on(0.1)
+    assert bench.commands()
+
+
+@AUTOPILOTS
 def test_a_pilot_who_takes_the_vehicle_before_its_heartbeat_shows_the_arming_keeps_it(autopilot: int) -> None:
     """A PX4 tells it once a second: sticks moved in that second were answered by a take-off."""
     bench = Bench(Vehicle(autopilot)).found()
@@ -232,7 +255,7 @@ def test_a_pilot_who_takes_the_vehicle_before_its_heartbeat_shows_the_arming_kee
     bench.said.clear()
     bench.go_on(3.0)
     assert bench.commands() == []
-    assert any("not from here" in text for text in bench.texts)
+    assert any("not chosen here" in text for text in bench.texts)
 
 
 @AUTOPILOTS

@@ -224,6 +224,7 @@ class TakeoffSequence:
         self.done = False
         self.given_up = ""  #: the reason, once given up
         self.taken_over = False  #: another operator chose a mode in the air
+        self.declined = False  #: given up because another operator chose a mode before it was armed
         self.rose = False  #: it has left the ground
         self.lead_ns: int | None = None  #: when set-points began to flow
         self.reason = ""  #: the vehicle's own reason why it can't be armed
@@ -244,7 +245,7 @@ class TakeoffSequence:
         self.refused = ""  #: why it is not armed yet
         self.arm_asked_ns: int | None = None  #: the last arming request; None: it was already armed
         self._arming_ns: int | None = None  # the first arming request; earlier answers are to the landing's disarming
-        self._ready = False  # it was armed in the mode for taking off
+        self._ready = False  # it was in the mode for taking off, to be armed or armed: another mode is others' choice
 
     @property
     def started(self) -> bool:
@@ -263,6 +264,7 @@ class TakeoffSequence:
         elif self._armed_ns is None:
             self.arm_asked_ns = now_ns
             self._arming_ns = now_ns if self._arming_ns is None else self._arming_ns
+            self._ready = True
             commands.request(ARM, now_ns, ARM_PACE_S)
         elif vehicle.mode in (self._autopilot.ARMING, *self._autopilot.TAKING_OFF) or self._climb_command is not None:
             self._climb_command = self._climb_command or self._autopilot.takeoff_command(self._height_m, vehicle)
@@ -279,11 +281,15 @@ class TakeoffSequence:
             if vehicle.armed or answer == ACCEPTED:
                 self._armed_ns = now_ns
                 self.refused = ""
-                self._disarms, self._ready = self._disarms and answer != ACCEPTED, self._ready or answer == ACCEPTED
+                self._disarms = self._disarms and answer != ACCEPTED
             elif answer is not None:
                 self.refused = f"arming was {result_name(answer)}" + (f": {self.reason}" if self.reason else "")
             if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
                 self.given_up = self.refused or "the vehicle does not answer"
+            self._observe_mode(vehicle, cut_short=False, now_ns=now_ns)
+            if self.taken_over and not self.given_up:  # a pilot at the vehicle wants it otherwise: ask for nothing more
+                self.taken_over, self.declined = False, True
+                self.given_up = f"it changed to {vehicle.mode}, which was not chosen here: take off again"
             return
         if vehicle.armed and self._disarms:
             self._disarms = not self._landing_is_over(commands, now_ns)

@@ -108,6 +108,7 @@ class SetpointController:
         self._arms_until_ns: int | None = None  # a take-off aborted by a landing may arm the vehicle until then
         self._disarms_until_ns = 0  # a failed or cut-off take-off may arm the vehicle until then
         self._blind_until_ns = 0
+        self._not_again = ""  # why repeats of a take-off are refused
         self._events: list[VehicleEvent] = []
 
     # Decisions ---------------------------------------------------------------------------------------------------
@@ -153,7 +154,7 @@ class SetpointController:
         if not alone:
             self.ownership.check(action, now_ns, new=new)
         if isinstance(action, Takeoff):
-            self._take_off(vehicle, now_ns)
+            self._take_off(vehicle, now_ns, new=new)
         elif isinstance(action, Land):
             if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats don't undo others' mode
                 self._land(vehicle)
@@ -178,9 +179,12 @@ class SetpointController:
             return False
         return not self._leave(vehicle)
 
-    def _take_off(self, vehicle: VehicleState | None, now_ns: int) -> None:
+    def _take_off(self, vehicle: VehicleState | None, now_ns: int, *, new: bool) -> None:
         if vehicle is None:
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
+        self._not_again = "" if new else self._not_again
+        if self._not_again:
+            raise DriverError(self._not_again)
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
             self._takeoff.asked_ns = now_ns
             if self._takeoff.refused and not self._takeoff.started:
@@ -424,6 +428,7 @@ class SetpointController:
             self._leave(vehicle)
         elif takeoff.given_up:
             self._notify(f"the vehicle did not take off: {takeoff.given_up}", reason="no_takeoff")
+            self._not_again = takeoff.given_up if takeoff.declined else ""
             self._end()
             if takeoff.arm_asked_ns is not None:
                 self.goal = Goal.LAND if vehicle.armed else Goal.NOTHING
