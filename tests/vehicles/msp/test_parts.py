@@ -18,7 +18,7 @@ from skyloop.vehicles.msp.firmware import Setup, hindrances
 from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import PATIENCE_NS, MotionEstimate, Questions, Telemetry, charge_left
+from skyloop.vehicles.msp.telemetry import PATIENCE_NS, Motion, MotionEstimate, Questions, Telemetry, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange
@@ -368,6 +368,33 @@ def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(
     with pytest.raises(DriverError, match="disarmed"):
         setpoints.apply(Attitude(climb=0.5), 4)
     assert setpoints.phase is Phase.STANDING
+
+
+def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_landing() -> None:
+    """A simulated world ran slower than the firmware's clock: its motors were stopped at 1.6 m, without an event."""
+    setpoints, now_ns = SetpointController(), 0
+    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints.receiving, setpoints.phase, setpoints.hover = True, Phase.FLYING, 0.4
+
+    def descend(climb: float, height: float, time_s: float) -> Phase:
+        nonlocal now_ns
+        setpoints.apply(Attitude(climb=-0.5), now_ns)
+        for _ in range(round(time_s / 0.02)):
+            now_ns += 20_000_000
+            setpoints.on_motion(Motion(climb_m_s=climb, height_m=height, precise=True))
+            setpoints.channels(now_ns)
+        return setpoints.phase
+
+    descend(-0.4, 1.8, 1.0)
+    assert descend(0.0, 1.6, 2.2) is Phase.FLYING
+    throttle = setpoints.throttle
+    assert descend(-0.3, 1.5, 0.5) is Phase.FLYING, "it fell once its throttle was low"
+    assert setpoints.throttle > throttle
+    descend(-0.4, 0.1, 0.5)
+    assert descend(0.0, 0.0, 2.2) is Phase.STANDING
+    setpoints.phase = Phase.FLYING
+    descend(-0.4, 1.0, 0.5)
+    assert descend(0.0, 1.0, 4.0) is Phase.STANDING, "on a table"
 
 
 def test_a_vehicle_found_again_disarmed_can_take_off_at_once() -> None:

@@ -59,6 +59,10 @@ STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means no
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction once it seems to be on the ground, share per second
 OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
+#: The same where it seems to stand far above the ground it left: what still falls at this throttle is in the air, even
+#: if its measured motion lags, as that of a simulated world which runs slower than the firmware's clock.
+OFF_HIGH_BELOW: Final = 0.15
+HIGH_M: Final = 0.5
 BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
 BLIND_NS: Final = nanoseconds(6.0)  #: without a measured climb for this long, it is disarmed
 MOST_LEARNT: Final = 0.9  #: limits of the learnt hover throttle
@@ -449,7 +453,8 @@ class SetpointController:
         upright = max(0.5, math.cos(self._wanted.roll) * math.cos(self._wanted.pitch))
         wanted = hover * (1 + lift / GRAVITY_M_S2) / upright * self._sink
         self.throttle = max(0.0, min(self.limits.throttle, wanted))
-        if stands and self.throttle < OFF_BELOW * hover:
+        high = (self._motion.height_m or 0.0) > HIGH_M
+        if stands and self.throttle < (OFF_HIGH_BELOW if high else OFF_BELOW) * hover:
             self._wanted = LEVEL
             self._enter(Phase.STANDING, now_ns)
 

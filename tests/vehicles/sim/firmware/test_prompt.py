@@ -7,11 +7,12 @@ import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 from skyloop.vehicles.sim.firmware.betaflight import Betaflight
-from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, become_prompt, hasten
+from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, become_prompt
 
 
 @pytest.fixture
@@ -53,20 +54,43 @@ def test_elsewhere_nothing_happens(asked: list[tuple[object, ...]], monkeypatch:
 
 def test_the_simulation_of_firmware_that_keeps_the_clock_goes_before_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside eight busy programs its firmware was on time and the simulation at half of it: it rose, and fell."""
-    niceness = dict.fromkeys((str(thread) for thread in (11, 12)), 3)
-    monkeypatch.setattr(sys, "platform", "linux")
-    monkeypatch.setattr(Path, "iterdir", lambda _: iter([Path("/proc/self/task/11"), Path("/proc/self/task/12")]))
-    monkeypatch.setattr(os, "getpriority", lambda _, thread: niceness[str(thread)])
-    monkeypatch.setattr(os, "setpriority", lambda _, thread, value: niceness.update({str(thread): value}))
+    niceness = threads(monkeypatch, least=-20)
+    first, second = Betaflight(print), Betaflight(print)
+    first._open()
+    second._open()
+    assert niceness == {"11": 3 + NICENESS, "12": 5 + NICENESS}
+    niceness["13"] = 3 + NICENESS  # started meanwhile
+    first.close()
+    assert niceness["11"] == 3 + NICENESS, "the other still flies"
+    second.close()
+    second.close()
+    assert niceness == {"11": 3, "12": 5, "13": 5}
+
+
+def test_without_rights_it_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its closing made the whole process slower: it undid what had been refused."""
+    niceness = threads(monkeypatch, least=0)
     firmware = Betaflight(print)
-    monkeypatch.setattr("skyloop.vehicles.sim.firmware.betaflight.program_path", lambda: "betaflight")
     firmware._open()
-    assert set(niceness.values()) == {3 + NICENESS}
     firmware.close()
-    firmware.close()
-    assert set(niceness.values()) == {3}
+    assert niceness == {"11": 3, "12": 5}
 
 
-def test_without_rights_it_stays_as_it_is(asked: list[tuple[object, ...]]) -> None:
-    hasten(NICENESS)
-    assert asked
+def threads(monkeypatch: pytest.MonkeyPatch, *, least: int) -> dict[str, int]:
+    """Return the niceness of two threads of this process, which can't be lowered below ``least``."""
+    niceness = {"11": 3, "12": 5}
+
+    def change(_: int, thread: int, value: int) -> None:
+        if value < least:
+            raise PermissionError
+        niceness[str(thread)] = value
+
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(Path, "iterdir", lambda _: iter([Path("/proc/self/task") / thread for thread in niceness]))
+    monkeypatch.setattr(os, "getpriority", lambda _, thread: niceness[str(thread)])
+    monkeypatch.setattr(os, "setpriority", change)
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.betaflight.program_path", lambda: "betaflight")
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.betaflight.reserve_instance", lambda *_: 1)
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.betaflight.release_instance", lambda *_: None)
+    monkeypatch.setattr("skyloop.vehicles.sim.firmware.betaflight.bound", lambda *_: Mock())
+    return niceness

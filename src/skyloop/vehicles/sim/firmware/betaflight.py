@@ -49,7 +49,7 @@ from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.coupling import Commands, CoupledFirmware
-from skyloop.vehicles.sim.firmware.keeper import NICENESS, hasten
+from skyloop.vehicles.sim.firmware.keeper import hasten, relax
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, StartedInVainError, find_program
 
@@ -178,7 +178,7 @@ class Betaflight(CoupledFirmware):
         self._sent_s = 0.0
         self._begun_s = 0.0
         self._patience_s = ANSWER_S
-        self._hastened = 0
+        self._hastens = False
 
     @property
     def address(self) -> str:
@@ -191,7 +191,9 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        self._hasten(by=NICENESS)
+        if not self._hastens:  # its simulation has to keep pace with the firmware, whose clock doesn't wait
+            self._hastens = True
+            hasten()
         try:
             self._instance = reserve_instance(self.NAME, 1, _ports)
         except UsageError:
@@ -202,13 +204,10 @@ class Betaflight(CoupledFirmware):
         self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
         self._motors.setblocking(False)
 
-    def _hasten(self, *, by: int) -> None:
-        """Have the simulation go before others, as its firmware does, whose clock doesn't wait; by 0: no longer."""
-        hasten(by - self._hastened)
-        self._hastened = by
-
     def _close(self) -> None:
-        self._hasten(by=0)
+        if self._hastens:
+            self._hastens = False
+            relax()
         if self._motors is not None:
             self._motors.close()
             self._motors = None

@@ -13,6 +13,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -41,15 +42,40 @@ def become_prompt() -> None:
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 
-def hasten(by: int) -> None:
-    """Change the niceness of all threads of this process, and of those that they start, as far as permitted.
+def hasten() -> None:
+    """Prioritize all threads of this process, and those that they start, as far as permitted.
 
-    Only Linux keeps a niceness for each thread.
+    Only Linux keeps a niceness for each thread. :func:`relax`, called as often, restores it.
     """
-    if sys.platform == "linux":
-        for thread in [int(task.name) for task in Path("/proc/self/task").iterdir()]:
+    global _hasteners  # noqa: PLW0603  (of the whole process, as its niceness is)
+    with _haste:
+        _hasteners += 1
+        for thread in _threads() if _hasteners == 1 else ():
             with suppress(OSError):
-                os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + by)
+                niceness = os.getpriority(os.PRIO_PROCESS, thread)
+                os.setpriority(os.PRIO_PROCESS, thread, niceness + NICENESS)
+                _niceness[thread] = niceness
+
+
+def relax() -> None:
+    """Restore the niceness from before :func:`hasten`: threads started since get the least favoured one."""
+    global _hasteners  # noqa: PLW0603
+    with _haste:
+        _hasteners -= 1
+        for thread in _threads() if _niceness and not _hasteners else ():
+            with suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, thread, _niceness.get(thread, max(_niceness.values())))
+        if not _hasteners:
+            _niceness.clear()
+
+
+def _threads() -> list[int]:
+    return [int(task.name) for task in Path("/proc/self/task").iterdir()] if sys.platform == "linux" else []
+
+
+_haste: Final = threading.Lock()  # guards the two below
+_hasteners = 0
+_niceness: Final[dict[int, int]] = {}  # before, of each thread whose niceness could be changed
 
 
 TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
