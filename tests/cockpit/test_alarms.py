@@ -66,7 +66,7 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
         ),
         (
             (link(), flying(failsafe=Failsafe.HOVER), 0.1, {}),
-            [("failsafe", "warning", "failsafe: hovering, landing next unless someone takes control")],
+            [("failsafe", "warning", "failsafe: hovering, returning or landing next unless someone takes control")],
         ),
         ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), [("failsafe", "critical", "failsafe: landing")]),
         ((link(), flying(battery=0.19), 0.1, {}), [("battery", "warning", "battery low: 19%")]),

@@ -115,7 +115,7 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
         returns = feedback.return_phase in (ReturnPhase.CLIMBING, ReturnPhase.FLYING)
         yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'}")
     elif feedback.failsafe is not Failsafe.NONE:
-        end = "" if feedback.lease else ", landing next unless someone takes control"  # no lease: no pilot
+        end = "" if feedback.lease else ", returning or landing next unless someone takes control"  # no lease: no pilot
         yield _warning("failsafe", f"failsafe: hovering{end}")
     charge = feedback.battery
     if charge is not None and charge < thresholds.battery_critical:

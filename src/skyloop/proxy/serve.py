@@ -158,7 +158,7 @@ def run(
     overview = OverviewRegistry()
     for proxy in proxies:
         proxy.overview.share(overview)
-    within_s = 0.0
+    within_s = land_within_s  # a vehicle may be found in flight as soon as its proxy starts
     with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as around:
         if beside is not None:
             around.enter_context(beside(proxies))
@@ -171,8 +171,7 @@ def run(
             # No one restarts a private proxy, or could fly a vehicle that it leaves in the air.
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
-                land_within_s = max(land_within_s, ORPHAN_LANDS_WITHIN_S)
-        within_s = land_within_s  # from here on, something may be flying
+                within_s = max(within_s, ORPHAN_LANDS_WITHIN_S)
         lines = [_announced(proxy) for proxy in proxies]
         # Wakes now and then: the kernel may deliver a signal to any thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
