@@ -1,12 +1,12 @@
-"""Calibration boards, printed and detected in images, and the calibration of a camera from views of a board.
+"""Calibration boards, drawn for printing and detected in images, and camera calibration from views of a board.
 
 ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a partial view suffices
 (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
 Pattern Recognition 47(6), 2014; detection is OpenCV's). A plain chessboard must be entirely in view (Duda and Frese,
 "Accurate Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
 
-Calibration: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
-for both models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
+Method: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
+for both models. Outliers (views with a wrong corner, a blurred or bent board) are removed one by one, worst first.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from skyloop.vision.opencv import marker_dictionary, opencv
 Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
-_MARKER_SHARE = 0.74  # marker's side, as a share of a square's side
-_LEAST_CORNERS = 8  # corners of a ChArUco board needed in an image
+_MARKER_SHARE = 0.74  # marker's side as a fraction of the square's side
+_LEAST_CORNERS = 8  # minimum number of a ChArUco board's corners in an image
 Model = Literal["pinhole", "fisheye"]
 
-LEAST_VIEWS: Final = 6  #: needed for a calibration
+LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
 GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
 _WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
 _WORST_PX: Final = 0.3  # ... and above this
-_NEW_SHARE: Final = 0.08  # share of the image's width: a view is new only if its corners moved at least this far
+_NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The corners of a board in one image."""
+    """A board's corners in one image."""
 
-    points: Array  #: (n, 3) on the board [m]
-    pixels: Array  #: (n, 2) in the image
+    points: Array  #: corners on the board, (n, 3) [m]
+    pixels: Array  #: corners in the image, (n, 2) [px]
     name: str = ""  #: name of the image, for messages
 
     @property
