@@ -1,4 +1,4 @@
-"""Fly a swarm in formation by the world positions that its drones report."""
+"""Formation flight of a swarm, by the world positions that its drones report."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from skyloop.client import Swarm
     from skyloop.client.swarm import Tick
 
-MAX_AGE_S: Final = 1.0  #: greatest age of feedback used for steering
-SLACK_S: Final = 10.0  #: default allowance on top of a flight's planned time
-_PEAK: Final = 1.875  # peak speed over mean speed of a minimum-jerk trajectory
+MAX_AGE_S: Final = 1.0  #: maximum age of feedback used for steering
+SLACK_S: Final = 10.0  #: default time allowed beyond a flight's planned duration
+_PEAK: Final = 1.875  # ratio of peak to mean speed of a minimum-jerk trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,21 +36,21 @@ class FormationReport:
 
     seconds: float
     slots: dict[str, Vector]  #: planned final position of each drone, in world axes [m]
-    errors_m: dict[str, float]  #: each drone's distance from its slot
-    closest_m: float  #: smallest distance between any two drones; infinite for one drone
-    spread_s: float | None  #: longest time between the first and the last set-point of one tick
+    errors_m: dict[str, float]  #: distance of each drone from its slot
+    closest_m: float  #: smallest distance between any two drones; infinite for a single drone
+    spread_s: float | None  #: maximum time between the first and the last set-point of a tick
 
 
 class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
-    Each drone must be airborne and report position and yaw. Drones that fail on the way, for example with a position
-    unknown for half a second, are handled by the swarm's ``on_error`` policy. All others keep clear of them, and of
-    every drone of the swarm that this flight does not steer, at its last known position.
+    Each drone must be airborne and report position and yaw. The swarm's ``on_error`` policy handles drones that fail
+    during the flight, for example because their position is unknown for half a second. All other drones keep clear of a
+    failed drone's last known position, and of any drone in the swarm that this flight does not steer.
 
     Attributes:
         drones: The swarm.
-        apart_m: The smallest distance to keep between two drones.
+        apart_m: Minimum distance to keep between two drones.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class Formation:
         Args:
             drones: The swarm to fly.
             rate_hz: Rate of the set-points.
-            apart_m: The smallest distance between two drones: flights that would bring drones closer are refused, and
-                drones that come closer are steered apart.
-            settings: Gains, limits and acceptance radii; None are the defaults.
+            apart_m: Minimum distance between two drones: flights that would bring drones closer are refused, and drones
+                that come closer are steered apart.
+            settings: Gains, limits and acceptance radii; None for the defaults.
 
         Raises:
             UsageError: ``apart_m`` is negative or not finite.
@@ -80,7 +80,7 @@ class Formation:
         self._airframes = {name: Airframe(Part.POSITION, Part.YAW) for name in drones.names}
 
     def middle(self) -> Vector:
-        """Return the mean of the drones' positions, world axes [m].
+        """Return the mean of the drones' positions in world axes [m].
 
         Raises:
             UsageError: A drone does not report its position or is on the ground, or none is active.
@@ -90,21 +90,21 @@ class Formation:
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:
-        """Assign drones to slots and fly there in straight lines, leaving and arriving together; then hover.
+        """Assign drones to slots and fly there in straight lines, leaving and arriving together. Then hover.
 
         Args:
             slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
-            speed_m_s: Greatest speed of the drone with the longest path.
+            speed_m_s: Maximum speed of the drone with the longest path.
             yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Drones not at their slot by then have failed; None allows ten seconds more than planned.
+            timeout_s: Time after which drones not at their slot have failed; None allows ten seconds more than planned.
 
         Returns:
-            The drones' final positions, and how close they came to each other.
+            The drones' final positions, and how close they came to one another.
 
         Raises:
             UsageError: A drone can't be flown by its position, two would come closer than ``apart_m``, or no drone is
                 active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
             raise UsageError(f"speed_m_s is {speed_m_s!r} and must be above 0 m/s")
@@ -130,14 +130,14 @@ class Formation:
         return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
 
     def hold(self, seconds: float) -> FormationReport:
-        """Keep each drone at its current position; then hover.
+        """Keep each drone at its current position, then hover.
 
         Args:
             seconds: Duration.
 
         Raises:
             UsageError: A drone can't be flown by its position, or none is active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
         """
         here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
@@ -155,19 +155,20 @@ class Formation:
         lead: Callable[[Tick], AnyAction] | None = None,
         turn: bool = True,
     ) -> FormationReport:
-        """Keep followers at offsets from a leader, feeding its velocity forward; then hover.
+        """Keep followers at offsets from a leader, feeding its velocity forward, then hover.
 
         Args:
             leader: The leader's name.
-            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False``
-                east, north and up of it.
+            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader or, with
+                ``turn=False``, east, north and up of it.
             seconds: Duration.
-            lead: Returns the leader's action at each tick, sent together with the followers' set-points; None: another
+            lead: Returns the leader's action at each tick, which is sent together with the followers' set-points; None
+                if another client flies the leader.
                 client flies the leader.
             turn: Whether offsets and yaw turn with the leader.
 
         Raises:
-            UnknownNameError: The swarm has no drone of that name.
+            UnknownNameError: The swarm has no drone with that name.
             UsageError: The leader is among the followers, a drone can't be flown by its position, or none is active.
             SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
                 followers hover and this call returns.
