@@ -195,7 +195,7 @@ class Formation:
     # Internals -------------------------------------------------------------------------------------------------
 
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
-        """Return the newest state of the drones flown here, and the last known state of all others in the air.
+        """Return the newest state of the drones flown here, and the last known state of all other airborne drones.
 
         A drone flown here whose position is no longer known has failed and joins the others.
         """

@@ -1,9 +1,9 @@
-"""A PID controller of one number and a PI controller of a vector. Pure: the time step is an argument.
+"""A PID controller for a number and a PI controller for a vector. Pure: the time step is an argument.
 
-Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is filtered (section
-3.3); the part that a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains cause no
-jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's integral
-grows only as far as later limits let its output through (conditional integration, section 3.5).
+Both follow Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is
+filtered (section 3.3); what a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains
+cause no jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's
+integral grows only as far as later limits let its output through (conditional integration, section 3.5).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Gains of the error, its integral and its derivative, with their time constants.
+    """Gains for the error, its integral and its derivative, with their time constants.
 
     Raises:
         UsageError: A number is negative or not finite.
@@ -34,7 +34,7 @@ class Gains:
     i: float = 0.0  #: output per unit of error and second
     d: float = 0.0  #: output per change of the measurement per second
     derivative_filter_s: float = 0.05  #: time constant of the low pass before the derivative
-    #: Time constant with which the integral term follows a limited output; None: p/i, or at once without p.
+    #: Time constant of the integral term following a limited output; None uses p/i, or none without p.
     tracking_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -45,17 +45,17 @@ class Gains:
 
     @property
     def tracking_time_s(self) -> float:
-        """The effective time constant of back-calculation [s]."""
+        """Effective time constant of back-calculation [s]."""
         if self.tracking_s is not None:
             return self.tracking_s
         return self.p / self.i if self.i > 0.0 else 0.0
 
 
 class Pid:
-    """A PID loop of one number.
+    """A PID loop for a number.
 
     :attr:`gains` can be replaced in flight. With an integral gain the output does not jump, because the integral term
-    takes up the difference; without one it changes no faster than the rate limit allows.
+    absorbs the difference; without one the output changes no faster than the rate limit allows.
     """
 
     def __init__(
