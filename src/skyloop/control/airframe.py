@@ -6,10 +6,9 @@ may also have jumped after a gap (:attr:`Airframe.interruptions`). Times are on 
 
 A vehicle that holds its height but reports no velocity accelerates by gravity times the tangent of its tilt, minus air
 drag. Integrating the attitude therefore gives its velocity through the air, and drag makes old errors fade within about
-drag. Integrating the attitude therefore gives its velocity through the air, and drag makes old errors fade within about
-two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences are still
-right, for example how much faster the vehicle is than its target. Holding a speed against the vehicle's own drag
-estimate also compensates for wind, as an integral term would, because that estimate is the averaged tilt.
+two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences are still right, such as
+how much faster the vehicle is than its target. Holding a speed against the vehicle's own drag estimate also compensates
+for wind, as an integral term would, because that estimate is the averaged tilt.
 """
 
 from __future__ import annotations

@@ -38,8 +38,7 @@ class Behaviour(Controller):
     when :meth:`run` is called. If frames stop for more than :data:`BLIND_S`, or a part of the vehicle's motion that the
     law needs is unknown, the vehicle hovers and an event reports why.
 
-    Subclasses define :meth:`look` and :attr:`phase`, and list in :attr:`losses` the phases in which the target is out
-    of sight.
+    Subclasses define :meth:`look` and :attr:`phase`, and list phases without sight of the target in :attr:`losses`.
 
     Attributes:
         name: Source of the annotations, and prefix of the events' text.

@@ -220,8 +220,7 @@ class ChaseLaw:
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
         """Return the angle to the left of the target's expected position to look at [rad], and the rate of that angle.
 
-        While hovering, sweep to both sides, first and furthest in the direction of the target's last motion; 0 in other
-        phases.
+        While hovering, sweep to both sides, first and furthest the way the target last moved; 0 in other phases.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -313,8 +312,7 @@ class ChaseLaw:
         """Return the velocity, (2,) [m/s], that keeps clear of another object.
 
         Consider the closest pass both at the vehicle's current velocity and at the one it is about to take up. If the
-        other object's position is uncertain, for example because it is out of view, stay further away and allow for it
-        to stop.
+        other object's position is uncertain, for example out of view, stay further away and allow for it to stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m

@@ -49,8 +49,7 @@ class ChaseSettings:
             is ahead of it, π behind, π/2 on its left. None: whichever side the vehicle is on.
         orbit_m_s: Speed around the target; positive for counter-clockwise as seen from above.
         leash_m: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
-            None for no leash. Uses the vehicle's position or, while that is unknown, its integrated velocity, which
-            drifts.
+            None for no leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
         height_m: Height above the ground; None for the height at the start.
         lowest_m: Minimum height above the ground.
         highest_m: Maximum height above the ground.

@@ -2,8 +2,7 @@
 
 The map gives the positions of gates and poles. The vehicle knows its own position only by odometry from its start. Each
 gate that it sees corrects the offset between map and odometry, and each pole is moved to where it is seen. The route to
-the next gate leads around poles and other gates to a point in front of the opening. From there it follows the gate's
-axis.
+the next gate leads around poles and other gates to a point in front of the opening, then along the gate's axis.
 """
 
 from __future__ import annotations

@@ -162,8 +162,8 @@ class Formation:
             offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader or, with
                 ``turn=False``, east, north and up of it.
             seconds: Duration.
-            lead: Returns the leader's action at each tick, which is sent together with the followers' set-points; None
-                if another client flies the leader.
+            lead: Returns the leader's action at each tick, sent with the followers' set-points; None if another client
+                flies the leader.
                 client flies the leader.
             turn: Whether offsets and yaw turn with the leader.
 

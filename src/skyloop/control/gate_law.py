@@ -126,8 +126,7 @@ class GateLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
 
-        It is ignored if the vehicle's attitude or motion is unknown, or if it is far from earlier sightings of the
-        gate.
+        It is ignored if the vehicle's attitude or motion is unknown, or if it is far from the gate's earlier sightings.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].

@@ -340,9 +340,8 @@ def _then(newest: Motion, ahead: Predicted) -> Motion:
 class SpiralSearch:
     """Flies an expanding square around its start. After the largest square it returns and starts over.
 
-    This is the expanding-square search used in sea rescue, with a camera that looks down: International Aeronautical
-    and Maritime Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes, each a quarter turn
-    on).
+    This is the expanding-square search of sea rescue, with a camera that looks down: International Aeronautical and
+    Maritime Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes with quarter turns).
     """
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:

@@ -45,9 +45,8 @@ class LandingSettings:
     cone_m: float = 0.06  #: radius at the marker of the cone outside which the vehicle does not descend
     cone: float = 0.2  #: growth of the cone's radius per metre of height
     view: float = 0.3  #: fraction of its height: the vehicle climbs to keep a marker in view that is further off
-    # : Below this height the vehicle descends by the filter, with or without sight of the marker, if it is over the :
-    # marker's centre, matches its speed, and the marker's motion agrees with the prediction from ``foresight_s``
-    # earlier.
+    #: Below this height the vehicle descends by the filter, with or without sight of the marker, if it is over the
+    #: marker's centre, matches its speed, and the marker's motion agrees with that predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
     commit_off_m: float = 0.08
     commit_m_s: float = 0.25
@@ -55,8 +54,8 @@ class LandingSettings:
     foresight_s: float = 0.7
     foreseen_m: float = 0.08
     final_descent_m_s: float = 0.65
-    # : Abort a touch-down that would miss by more than this, or if the marker is out of sight for longer than
-    # ``blind_s``. : Just above the marker (``nearly_m``), abort only if the touch-down would miss the platform.
+    #: Abort a touch-down that would miss by more than this, or if the marker is out of sight for over ``blind_s``. Just
+    #: above the marker (``nearly_m``), abort only if the touch-down would miss the platform.
     abort_off_m: float = 0.14
     blind_s: float = 1.3
     nearly_m: float = 0.1

@@ -100,8 +100,7 @@ class TargetState:
 
     Attributes:
         at_ns: Time of the state on the proxy's clock.
-        foot: Position of the target's foot, (3,) [m]: in odometry axes, except for the third, which is above the
-            ground.
+        foot: Position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground.
         velocity: Horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own.
         height_m: Height of the target.
         place_m: Standard deviation of the position: the root of the sum of the horizontal variances.

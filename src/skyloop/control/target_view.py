@@ -21,7 +21,7 @@ from skyloop.vision.tracking import Box
 
 Array = NDArray[np.float64]
 
-_CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off, also as a share of its size
+_CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off ...
 _CUT: Final = 0.07
 _BESIDE: Final = 0.75  # distance from the optical axis in image sizes; 0.5 is the edge
 _STEEPEST: Final = 0.15  # minimum cosine of the elevation; an object almost straight above or below has no azimuth

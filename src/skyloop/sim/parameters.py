@@ -175,8 +175,7 @@ class VehicleParameters:
     vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large
     # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. It is this
-    # angle times the square of the horizontal airspeed, up to 3 m/s, and is caused by blade flapping and wind on the
-    # hull.
+    # angle times the square of the horizontal airspeed, up to 3 m/s, caused by blade flapping and wind on the hull.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors

@@ -161,9 +161,8 @@ class Simulation:
             action: A set-point or an action.
 
         Returns:
-            The applied action: the action itself, a set-point clamped to the limits, or :class:`~skyloop.messages.Idle`
-            if the drone ignores it in its current state, as firmware does: set-points before hovering, a reset in the
-            air.
+            The applied action: the action itself, a clamped set-point, or :class:`~skyloop.messages.Idle` if the drone
+            ignores it in its current state, as firmware does: set-points before hovering, a reset in the air.
 
         Raises:
             UsageError: There is no such drone, firmware flies it, or a number is not finite.
@@ -342,9 +341,8 @@ class Simulation:
         """Return the motion of all drones as new arrays, for tasks with many drones.
 
         Returns:
-            True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up,
-            which are up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw, yaw within ±π, shape (n, 3)
-            [rad].
+            True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up
+            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()

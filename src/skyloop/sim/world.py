@@ -217,8 +217,7 @@ class CirclePath:
 class OvalPath:
     """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
-    It starts ``start_m`` along the track from the beginning of the southern straight or, if clockwise, the northern
-    one.
+    It starts ``start_m`` along the track from the beginning of the southern straight; if clockwise, the northern one.
     """
 
     centre_m: Vec3

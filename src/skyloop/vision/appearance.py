@@ -80,9 +80,8 @@ class LongTermTracker(Tracker):
     enough, and clearly more similar than any other place or known look-alike, is tracked on trial and returned after
     three images.
 
-    A target that was hidden next to an identical twin therefore stays lost, because nothing tells the two apart: start
-    again with a new box. The score is the similarity to the closest appearance; its confidence is calibrated on
-    simulated figures.
+    A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
+    new box. The score is the similarity to the closest appearance; its confidence is calibrated on simulated figures.
     """
 
     def __init__(self, tracker: Callable[[], Tracker] = CorrelationTracker) -> None:

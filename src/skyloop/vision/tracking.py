@@ -193,9 +193,8 @@ def features(cv: Any, pixels: Image) -> Floats:
     """Return a patch's features, (channels, height / CELL, width / CELL): 8 channels for grey, 10 for colour.
 
     Each cell has its gradient strength and the first harmonics of the gradient's direction, which carry the information
-    of a direction histogram in fewer numbers. Both are normalised by the local strength, so that light and contrast
-    don't matter. The remaining channels are brightness and, for a colour image, both colour components, relative to the
-    whole patch.
+    of a direction histogram in fewer numbers. Both are normalised by the local strength, so light and contrast don't
+    matter. The other channels are brightness and, for a colour image, both colour components relative to the patch's.
     """
     size = (pixels.shape[1] // CELL, pixels.shape[0] // CELL)
     if pixels.ndim == 3:

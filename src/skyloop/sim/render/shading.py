@@ -219,8 +219,7 @@ class Placed:
         box: First row that may show the shadow, row after the last, first column, column after the last.
         axes: Rotation from optical to world axes.
         numbers: Its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius
-            [m²]; strength of 255; tolerance of a pixel's distance from the plane: fraction of the depth, plus a
-            constant [m].
+            [m²]; strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m].
     """
 
     box: tuple[int, int, int, int]
