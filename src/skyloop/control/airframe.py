@@ -287,7 +287,7 @@ class AirframeLaw:
     """Base class for laws that fly by the vehicle's motion and hold the vehicle while a needed part of it is unknown.
 
     Attributes:
-        airframe: What is known of the vehicle's motion.
+        airframe: The known motion of the vehicle.
         problem: Why the law held the vehicle at the last step; empty if it is flying it.
     """
 
@@ -314,7 +314,7 @@ class AirframeLaw:
         self._last_ns = None
 
     def forget(self) -> None:
-        """Forget everything noted in odometry axes, because the motion was interrupted."""
+        """Forget everything stored in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
         """Return whether all needed parts are known; pause if not, or if the last set-point is too old."""

@@ -73,8 +73,8 @@ class ChaseLaw:
         self.held_by = ""
         self._heading: float | None = None  # heading of the target's last motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
-        self._previous_position: Array | None = None  # in odometry axes, at the last step
-        self._begin: Array | None = None  # start, in world axes; None until the position is known
+        self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes
+        self._begin: Array | None = None  # position at the start, in world axes; None until it is known
         self._height: float | None = None
         self._away = False  # whether the vehicle, while the range is unknown, is flying to the other height
         self._since_ns: int | None = None  # start of the search

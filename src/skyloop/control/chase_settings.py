@@ -15,7 +15,7 @@ from skyloop.messages import Value
 class FollowMode(StrEnum):
     """How to follow a target."""
 
-    FOLLOW = "follow"  #: keep a distance, and a side if one is given
+    FOLLOW = "follow"  #: keep a distance and, if given, a side
     ORBIT = "orbit"  #: circle the target, even while it moves
     LOOK = "look"  #: stay in place and turn towards the target
 
@@ -45,8 +45,8 @@ class ChaseSettings:
         distance_m: Horizontal distance between the centres of the vehicle and the target.
         nearest_m: Minimum distance to the target; the vehicle backs off from a target that comes closer.
         clear_m: Minimum distance to other objects that the detector sees.
-        bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion: 0
-            is ahead of it, π behind, π/2 on its left. None: whichever side the vehicle is on.
+        bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0
+            is in front of it, π behind it, π/2 on its left. None for the side that the vehicle is on.
         orbit_m_s: Speed around the target; positive for counter-clockwise as seen from above.
         leash_m: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
             None for no leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
@@ -57,7 +57,7 @@ class ChaseSettings:
             that may not be on the ground. None waits for the range without moving.
         steep_rad: Maximum elevation of the target's middle, up or down, at which the vehicle keeps its height.
         lead_s: Total delay of commands and feedback, from the decision until a command takes effect.
-        response_s: Time the vehicle takes to reach a commanded velocity, and to predict the target's velocity by.
+        response_s: Time to reach a commanded velocity, for which the target's velocity is predicted ahead.
         range_gain: [1/s]
         velocity_gain: Acceleration per unit of velocity error [1/s].
         yaw_gain: [1/s]

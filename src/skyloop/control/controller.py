@@ -40,7 +40,7 @@ class RunSummary:
     reason: Reason  #: why the run ended
     results: int = 0  #: number of ``on_result`` calls
     results_dropped: int = 0  #: results replaced by newer ones
-    results_expired: int = 0  #: results older than ``result_max_age_s`` when taken from the queue
+    results_expired: int = 0  #: number of results older than ``result_max_age_s`` when taken from the queue
     notes: tuple[str, ...] = ()  #: descriptions of likely mistakes: a forgotten take-off, a misspelt callback, …
 
     def __str__(self) -> str:
@@ -140,7 +140,7 @@ class Controller:
         self.stop()
 
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
-        """Call the callbacks until the time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
+        """Call the callbacks until time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
         An exception in a callback, Ctrl-C or ``sys.exit()`` makes an airborne vehicle hover, if this client flies it,
         and propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the run:

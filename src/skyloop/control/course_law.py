@@ -1,4 +1,4 @@
-"""A law that flies a course with a known map, corrected by what the camera sees. Pure: no clock, no thread.
+"""A law that flies a course with a known map, corrected by the camera's sightings. Pure: no clock, no thread.
 
 The map gives the positions of gates and poles. The vehicle knows its own position only by odometry from its start. Each
 gate that it sees corrects the offset between map and odometry, and each pole is moved to where it is seen. The route to
@@ -121,7 +121,7 @@ class CourseLaw(VelocityLaw):
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
         self._number = 0
-        self._lift: float | None = None  # altitude above the ground minus the odometry's
+        self._lift: float | None = None  # altitude above the ground minus the odometry's height
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
         self._view = 0  # index of the current viewpoint
@@ -186,7 +186,7 @@ class CourseLaw(VelocityLaw):
         across = across / max(1e-6, float(np.linalg.norm(across)))
         if float(across @ self._heading) < 0.0:  # a gate looks the same from behind
             across = -across
-        # The visible opening ends at the far edges of the bars, half their thickness behind the middle.
+        # The visible opening ends at the far edges of the bars, which are half their thickness behind the middle.
         seen = to_level @ position
         off = float(across @ seen[:2]) / max(distance, 1e-6) * self.settings.frame_m / 2
         middle = motion.position + seen - np.array([*(off * across), 0.0])

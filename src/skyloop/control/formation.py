@@ -1,7 +1,7 @@
 """Formation shapes, assignment of drones to positions, and a check of how close flying drones come. Pure.
 
 A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on their mean.
-:func:`placed` puts it into world axes (ROS REP 103).
+:func:`placed` converts it to world axes (ROS REP 103).
 """
 
 from __future__ import annotations

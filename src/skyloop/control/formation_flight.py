@@ -71,7 +71,7 @@ class Formation:
         """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
-        assignment("a formation", "control")  # load SciPy, or fail, now and not in flight
+        assignment("a formation", "control")  # load SciPy now, so that a failure does not happen in flight
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz
@@ -197,7 +197,7 @@ class Formation:
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
         """Return the newest state of the drones flown here, and the last known state of all other airborne drones.
 
-        A drone flown here whose position is no longer known has failed and joins the others.
+        A drone flown here whose position is no longer known has failed and is moved to the others.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -256,7 +256,7 @@ class Formation:
         *,
         also: Mapping[str, AnyAction] | None = None,
     ) -> None:
-        """Send each drone towards its goal, which moves by ``drift`` [m/s], and clear of the others."""
+        """Send each drone towards its goal, which moves by ``drift`` [m/s], while keeping clear of the others."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
         positions = _positions({**now, **others})
         wanted = [_in_world(towards[name], now[name]) + drift[name] for name in now]
@@ -282,7 +282,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """Wider acceptance radii, for drones that hover just after arrival."""
+        """Wider acceptance radii for drones that are hovering just after arrival."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -298,11 +298,11 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
     Args:
         leader: The leader's newest feedback.
-        offset: (3,) [m]: ahead, left and up of the leader, or with ``turn=False`` east, north and up.
+        offset: Offset (3,) [m]: ahead, left and up of the leader or, with ``turn=False``, east, north and up.
         turn: Whether the offset turns with the leader's yaw.
 
     Returns:
-        World axes [m], shape (3,).
+        The position in world axes [m], shape (3,).
 
     Raises:
         UsageError: The leader's position or yaw is unknown.
@@ -329,7 +329,7 @@ def _carried_on(airframe: Airframe) -> Feedback:
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
-    """Return distance and speed on a path of length 1 flown in time 1, at rest at both ends (Flash and Hogan 1985)."""
+    """Return distance and speed on a path of length 1 flown in time 1 from rest to rest (Flash and Hogan 1985)."""
     t = within(share, 0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
 

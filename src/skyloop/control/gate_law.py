@@ -44,7 +44,7 @@ class GatePhase(StrEnum):
     SEARCHING = "searching for the gate"  #: turning on the spot at a series of heights
     ALIGNING = "moving onto the gate's axis"  #: gate seen a moment ago
     RECOVERING = "lost the gate: holding position, turning towards it"
-    GOING = "flying to the gate"  #: by the map, or by a sighting
+    GOING = "flying to the gate"  #: flying by the map or by a sighting
     PASSING = "flying through"  #: aligned and close; the rest is flown by odometry
     PASSED = "through"
 

@@ -122,7 +122,7 @@ def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -
 class FlyThroughGates(Behaviour):
     """Flies through a series of gates of known colours and hovers behind the last one.
 
-    With a :class:`Course` it flies by the map, corrected by the camera's sightings: to the front of each gate, around
+    With a :class:`Course`, it flies by the map, corrected by the camera's sightings: to the front of each gate, around
     poles and other gates, and through in the gate's direction. If a gate stays out of sight, the vehicle hovers and the
     behaviour ends with a warning.
 

@@ -133,7 +133,7 @@ class ImageServoLaw(VelocityLaw):
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
-        # Averaging the depths now and at the goal keeps large motions straight (their equation 14).
+        # Averaging depths now and at the goal keeps large motions straight (Chaumette and Hutchinson, equation 14).
         now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))
         depths = np.full(len(level), (now_m + self._depth_m) / 2)
         self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
@@ -356,7 +356,7 @@ class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, using a camera that looks down.
 
     Needs the vehicle's attitude and height, uses nothing else from its feedback, and flies by attitude. Without sight
-    of the ground, the vehicle hovers on its own, possibly drifting, and a warning event is published. The behaviour
+    of the ground, the vehicle hovers by itself and may drift, and a warning event is published. The behaviour
     then holds the position at which it sees the ground again.
     """
 

@@ -182,7 +182,7 @@ class _Filter(ABC, Generic[_E]):
 
     @abstractmethod
     def _corrected(self, before: _E, measured: Array, noise: Array, at_ns: int) -> _E | None:
-        """Return the estimate after a measurement; None if it is outside the gate."""
+        """Return the estimate after a measurement; None if the measurement is outside the gate."""
 
     @abstractmethod
     def _moved(self, last: _E, dt: float) -> _E: ...

@@ -42,9 +42,9 @@ class LandingSettings:
     sight_s: float = 0.01  #: possible delay between attitude and frame, whose errors grow with the turn rate
 
     descent_m_s: float = 0.45
-    cone_m: float = 0.06  #: radius at the marker of the cone outside which the vehicle does not descend
+    cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
     cone: float = 0.2  #: growth of the cone's radius per metre of height
-    view: float = 0.3  #: fraction of its height: the vehicle climbs to keep a marker in view that is further off
+    view: float = 0.3  #: offset as a fraction of the height beyond which the vehicle climbs to see the marker
     #: Below this height the vehicle descends by the filter, with or without sight of the marker, if it is over the
     #: marker's centre, matches its speed, and the marker's motion agrees with that predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
@@ -103,7 +103,7 @@ class LandingSettings:
                 ``drone.config``; a missing one sets no limit.
 
         Raises:
-            UsageError: The drone may not fly high enough to search.
+            UsageError: The drone's limits don't allow the height needed for the search.
         """
         climb = lowered(self.climb_m_s, limits, "limits.climb")
         return replace(

@@ -20,7 +20,7 @@ from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError, UsageError
 
 LOOK_S: Final = 0.1  #: interval at which the files are polled
-Stamp = tuple[int, int, int]  #: changes when a file is saved: time [ns], size, inode
+Stamp = tuple[int, int, int]  #: value that changes when a file is saved: time [ns], size, inode
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:

@@ -196,7 +196,7 @@ class PathLaw:
         self._last = None
 
     def there(self, fix: Fix) -> bool:
-        """Return whether the path is over and the vehicle is at its end, at the wanted yaw."""
+        """Return whether the path is over and the vehicle is at its end with the wanted yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad

@@ -206,7 +206,7 @@ class VectorPi:
 
         Args:
             asked: The whole set-point that contains the last output, (n,).
-            applied: That set-point after the limits, (n,).
+            applied: The same set-point after the limits, (n,).
         """
         wound_up = (applied - asked) * (self.integral - self._before) < 0.0
         self.integral = np.where(wound_up, self._before, self.integral)

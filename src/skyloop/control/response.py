@@ -30,7 +30,7 @@ from skyloop.messages.geometry import rotation_from_euler
 Array = NDArray[np.float64]
 
 _STEP_S = 0.01  # time step of the prediction
-_LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion in between is unknown
+_LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion during it is unknown
 _LONGEST_PREDICTION_S = 0.5  # maximum prediction beyond the last feedback
 _KEPT_SETPOINTS = 64  # number of newest set-points to keep
 
@@ -48,8 +48,8 @@ class ResponseSettings:
     delay_s: float = 0.05  #: time from sending a set-point until the loop uses it
     tilt_rad: float = 0.5  #: maximum lean that the loop demands; see also ``LandingSettings.within``
     push_m_s3: float = 1.5  #: change of the air's push within a second [m/s² in √s]
-    velocity_noise_m_s: float = 0.05  #: noise of the velocity in feedback
-    trim_s: float = 0.3  #: time constant with which the trim is learned
+    velocity_noise_m_s: float = 0.05  #: noise of the velocity reported in feedback
+    trim_s: float = 0.3  #: time constant for learning the trim
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:

@@ -150,7 +150,7 @@ class RouteLaw:
         return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
 
     def pause(self, why: str = "") -> list[Effect]:
-        """Hover until :meth:`resume`; ``why`` is the reason if nobody requested it."""
+        """Hover until :meth:`resume`; ``why`` is the reason for a pause that was not requested."""
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
@@ -219,7 +219,7 @@ class RouteLaw:
         return [*arrived, *self._act(feedback, now_ns)]
 
     def _act(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Perform the waypoint's actions one after the other."""
+        """Perform the waypoint's actions in sequence."""
         effects: list[Effect] = []
         while self._step < len(self._actions):
             action = self._actions[self._step]

@@ -30,11 +30,11 @@ _POINTED_AT: Final = 0.3  # overlap between the user's box and the detection tha
 _TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges, a fraction of the box height; a detector's are sharper
 _BESIDE_LATE: Final = 0.25  # the same while late detections give the size, on which the tracker drifts
 _TAKEN: Final = 0.5  # fraction of the tracker's box that is inside another object's detection
-_FITS: Final = 12.0  # squared Mahalanobis distance per measurement up to which a box can be the target's
+_FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
 _DOUBT: Final = 6  # number of consecutive images with the tracker's box where the target can't be
 _LATELY_S: Final = 1.0  # time to keep clear of others after they were last seen
 _DORMANT_S: Final = 1.0  # time out of sight after which the target must be recognised again
-_SIMILAR: Final = 1.6  # mean colour unlikeness up to which a newcomer may be the target
+_SIMILAR: Final = 1.6  # maximum mean colour unlikeness of a newcomer that may be the target
 _LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
 _LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to know its motion
 _LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
@@ -124,7 +124,7 @@ class TargetFinder:
         """Find the target in the next image.
 
         Args:
-            image: A :class:`skyloop.Frame` or an array, as for trackers.
+            image: A :class:`skyloop.Frame` or an array like those for trackers.
             camera: The camera that took the image.
             captured_ns: Capture time of the image on the proxy's clock.
             ground: Whether the camera's height above the ground is known.
@@ -383,7 +383,7 @@ class TargetFinder:
         if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
-            return  # they can't be distinguished
+            return  # they can't be told from each other
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
         # When an object reappears, its first boxes also show the occluder, so keep the old colours.

@@ -34,7 +34,7 @@ _WORST: Final = 50.0  # maximum cost of a single box for a hypothesis
 _LEAST: Final = 1e-3  # minimum probability of a hypothesis; less likely ones are dropped
 _KNOWN: Final = 0.2  # relative deviation below which the range becomes known
 _UNKNOWN: Final = 0.4  # relative deviation above which it becomes unknown again
-_STIRRED_M: Final = 0.1  # offset from its recent position from which a box counts in full
+_STIRRED_M: Final = 0.1  # offset from the vehicle's recent position from which a box has its full weight
 _OF_LATE_S: Final = 2.0  # averaging time of the recent position
 _BASELINE: Final = 0.015  # offset per range that the vehicle must have reached before the range is known
 _JUMP_M: Final = 0.15  # maximum change of the vehicle's height at once, ...
@@ -224,7 +224,7 @@ class RangeEstimator(TargetEstimator):
         return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
     def _stir(self, camera: Camera, since_s: float) -> float:
-        """Return the vehicle's distance from its recent position, across the first line of sight [m]."""
+        """Return the vehicle's distance from its recent position, measured across the first line of sight [m]."""
         self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
         x, y, z = (camera.position - self._about).tolist()
         off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)

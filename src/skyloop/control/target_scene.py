@@ -1,7 +1,7 @@
 """Match detections to objects, which keep their identity while they cross, hide and return. Pure.
 
 Detections are matched with filters of where the objects are now, not with their positions in the last image, so that
-the vehicle's own motion does no harm and look-alikes are told apart by position and motion. The pairs are the most
+the vehicle's own motion does no harm and look-alikes are distinguished by position and motion. The pairs are the most
 likely assignment overall (SciPy's ``linear_sum_assignment``). A detection that another object could explain nearly as
 well updates neither object: both continue on their predicted motion until they are apart.
 """
@@ -61,7 +61,7 @@ class SceneObject:
         estimator: Filter for the motion.
         detection: The last detection.
         looks: Colours, (6,): see :func:`skyloop.vision.appearance.colours`.
-        places: Colours of the last detection that the image did not cut off, (n, 6).
+        places: Colours of the last detection that was not cut off by the image, (n, 6).
         whole: Whether the last detection was of the whole object.
         hits: Number of detections.
         first_ns: Time of the first detection.
@@ -183,7 +183,7 @@ class Scene:
 
         Args:
             relative: Whether the vehicle does not know its own velocity.
-            traits: Traits by class, instead of :data:`~.target_estimate.TRAITS`.
+            traits: Traits by class to use instead of :data:`~.target_estimate.TRAITS`.
 
         Raises:
             MissingExtraError: SciPy is not installed.

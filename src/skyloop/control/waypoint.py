@@ -107,7 +107,7 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Return whether the vehicle is within the acceptance radius and nearly at rest.
+    """Return whether the vehicle is within the acceptance radius and almost at rest.
 
     Args:
         goal: The waypoint.

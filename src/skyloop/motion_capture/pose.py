@@ -84,7 +84,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
-    """Convert from axes with y up (x right, y up, z backward, as Motive streams by default) to axes with z up.
+    """Convert from axes with y up (x right, y up, z backward, Motive's streaming default) to axes with z up.
 
     Rotates both world and body a quarter turn about x, so that an upright body stays upright.
 

@@ -151,7 +151,7 @@ def _port(address: str, options: dict[str, str]) -> str | None:
 
 LENGTH: Final = struct.Struct("<I")
 MAX_FRAME: Final = 1 << 20  #: maximum size of a frame in bytes; enough for thousands of bodies
-MISSING: Final = 3  #: exit code if the package is missing
+MISSING: Final = 3  #: exit code for a missing package
 
 Seen = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 

@@ -199,7 +199,7 @@ class SensorSelection:
             UsageError: Two names refer to the same sensor.
         """
         self._bodies: dict[tuple[str, int], str] = {}
-        self._unnamed: set[str] = set()  # trackers without a named sensor
+        self._unnamed: set[str] = set()  # trackers whose sensor is not named
         self._reported: dict[str, tuple[int, set[int]]] = {}  # their first report and the sensors seen
         for name in names:
             tracker, named = split_name(name)

@@ -112,7 +112,7 @@ def end_with_parent(stop: Callable[[], None]) -> None:
     def end() -> None:
         stop()
         time.sleep(GRACE_S / 2)
-        os._exit(1)  # the user's code hangs, and the parent can no longer end this process
+        os._exit(1)  # the user's code is hanging, and the parent can no longer end this process
 
     on_parent_end(end)
 

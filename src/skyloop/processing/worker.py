@@ -57,7 +57,7 @@ class Settings:
     """
 
     name: str  #: name of the processor and of its results
-    code: str  #: identifies the code, the same for all workers
+    code: str  #: identifier of the code, the same for all workers
     camera: str | None = None  #: name of the camera; None for the vehicle's first one
     shared: bool = True  #: whether each frame goes to only one worker, instead of to all
     max_age_s: float | None = 1.0  #: skip frames older than this when their turn comes; None skips none
@@ -117,7 +117,7 @@ class Worker:
             seconds: Maximum duration [s]; None for no limit.
 
         Raises:
-            NameTakenError: Other code took the name in the meantime, which is possible while the proxy is away.
+            NameTakenError: Different code has taken the name since, which is possible while the proxy is away.
             RefusedError: The proxy refuses this worker for a different reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
@@ -334,7 +334,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 def together(found: Iterable[Status]) -> Status | None:
     """Combine the statistics of several workers of one processor; None if there are none.
 
-    Counts and rates are summed; ages are the worst.
+    Counts and rates are sums; ages are the worst ones.
     """
     each = list(found)
     if len(each) < 2:

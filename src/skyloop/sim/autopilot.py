@@ -152,7 +152,7 @@ class Autopilot:
         self._stood_s = [0.0 for _ in parameters]  # time when each drone was last supported from below
         self._rising: dict[int, float] = {}  # drones that are taking off, with the altitude at which the take-off ends
         self._warned: set[int] = set()
-        self.handed_over: set[int] = set()  #: drones flown by firmware
+        self.handed_over: set[int] = set()  #: numbers of drones flown by firmware
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
@@ -187,7 +187,7 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Hover at a flying drone's new position, without any estimate of the wind there."""
+        """Hover at a flying drone's new position without any estimate of the wind there."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 

@@ -182,7 +182,7 @@ class CameraPipeline(_Frames):
     def _run(self) -> None:
         try:
             renderer = make_renderer(self._world, self._drones, self._quality)
-        except Exception as error:  # noqa: BLE001  reported to the drivers: no frames will follow
+        except Exception as error:  # noqa: BLE001  reported to the drivers, because no more frames will follow
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
             for screen in screens:

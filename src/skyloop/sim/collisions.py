@@ -55,10 +55,10 @@ class _Near:
         across: The square of the sum of the pair's radii.
         upright: The square of the sum of the pair's half heights.
         solids: The solids within reach, by drone; drones that are only near a wall or the ceiling have none.
-        who: The drone of each pair of a drone and a solid.
-        what: The solid of each pair of a drone and a solid.
+        who: Number of the drone in each pair of a drone and a solid.
+        what: Number of the solid in each of these pairs.
         sizes: Sizes of the solids; see :meth:`Solids.sizes`.
-        moving: Whether one of these solids moves.
+        moving: Whether one of these solids is moving.
         walled: Drones that can reach a wall or the ceiling.
         room_low: Minimum coordinates of the centres of those drones, (3, walled).
         room_high: Maximum coordinates.
@@ -281,7 +281,7 @@ class Collisions:
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
     def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
-        """Remove the velocity into the surface, and apply friction.
+        """Remove the velocity into the surface and apply friction.
 
         Returns:
             The velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
@@ -309,7 +309,7 @@ class Collisions:
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
         """Make a turning surface take the drone on it along, by friction over the whole contact disk.
 
-        With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
+        With pressure p = F / πR², the torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
         most = self._friction[drone] * impulse_m_s * (4 / 3) / self._radii[drone]
         self._bodies.turn(drone, clamped(spin_rad_s - float(self._bodies.rates[2, drone]), most))

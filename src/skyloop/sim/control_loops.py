@@ -20,13 +20,13 @@ _REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehic
 _HELD_M = 0.25  # distance behind its descent from which a landing drone counts as held
 _HELD_CLIMB_M_S = 0.15  # maximum climb rate of a held drone; a faster one is still on its way
 _HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
-_HELD_REGAIN = 4.0  # factor by which it counts as free again faster; otherwise it would drop when released
+_HELD_REGAIN = 4.0  # factor by which it recovers faster; otherwise it would drop when released
 _INTEGRATED_ERROR_M_S = 0.25  # limit of the integrated error: braking must not wind up the integral
 _MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, in case a wall holds the drone
 
 
 _ROWS = 15  # rows of the table: set-points, limits and the loops' state
-_STATE = 11  # first row of the state
+_STATE = 11  # first row of the loops' state
 _LANDING = 10  # row that is greater than 0 while landing
 
 

@@ -147,7 +147,7 @@ class SimHost:
 
     @property
     def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
-        """Observer and cameras by drone."""
+        """Observers and cameras by drone."""
         return self._observers
 
     def _make_stepper(self) -> Stepper:

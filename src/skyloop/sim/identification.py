@@ -196,7 +196,7 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
     Args:
         command: The command, positive for nose down.
         vehicles: The vehicles, at least one.
-        duration_s: Length of the flight.
+        duration_s: Duration of the flight.
 
     Raises:
         UsageError: There are no vehicles, or more than fit into the world.

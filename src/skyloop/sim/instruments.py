@@ -155,7 +155,7 @@ class Instruments:
         vehicle: The drone, with rotors.
         drone: The drone's number.
         seed: The simulation's seed.
-        ranging: Measures distances to the surroundings.
+        ranging: Function that measures distances to the surroundings.
     """
 
     def __init__(self, vehicle: VehicleParameters, drone: int, seed: int, ranging: Ranging) -> None:

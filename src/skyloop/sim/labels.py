@@ -35,7 +35,7 @@ class TargetBox:
     """An object's box in an image.
 
     Attributes:
-        name: Name of the target or box in its world.
+        name: Name of the target or box in the world.
         class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
         box: x, y of the upper left corner, width and height [px] of the object's whole extent within the image.
         visible: Fraction of the object's pixels within the image that are not occluded, 0 to 1.

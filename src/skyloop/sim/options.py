@@ -80,7 +80,7 @@ class SimOptions:
         return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
 
     def vehicle(self) -> VehicleParameters:
-        """Return the vehicle, with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
+        """Return the vehicle with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
         return with_scaled_flaws(self.parameters, self.noise)
 
 

@@ -78,7 +78,7 @@ class RotorParameters:
     Attributes:
         places_m: Positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
         inertia_kg_m2: Moments of inertia about the body's axes.
-        thrust_n_s2: Thrust per square of the speed.
+        thrust_n_s2: Thrust per speed squared.
         torque_m: Torque per thrust.
         idle_speed_rad_s: Lowest speed of a running rotor.
         full_speed_rad_s: Speed at full command.
@@ -87,7 +87,7 @@ class RotorParameters:
         rotor_drag_kg: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors'
             speeds. Its causes are blade flapping and the blades' asymmetric drag.
         rotor_inflow_kg: The same along the rotors' axes, where air from above reduces the thrust.
-        body_drag_kg_m: Force per square of the airspeed, along the body's axes.
+        body_drag_kg_m: Force per airspeed squared, along the body's axes.
         rotor_inertia_kg_m2: Inertia of a rotor about its axis: an accelerating rotor turns the body the other way.
         efficiency: Fraction of the battery's power that reaches the air as the shafts' torque times speed.
         instruments: Errors of the instruments.

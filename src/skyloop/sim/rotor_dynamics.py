@@ -28,7 +28,7 @@ PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
 _LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant of slow rotors, which the mixer commands beyond their target
+_ROTOR_RESPONSE_S = 0.02  # time constant that slower rotors get because the mixer commands them beyond their target
 _YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
@@ -264,7 +264,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # The legs push with the supporting force, at arm's length at most.
+        # The legs push with the supporting force, on a lever arm of at most the hull's radius.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
@@ -355,7 +355,7 @@ def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tup
         voltage: Previous voltage [V].
     """
     current = power / do.most(voltage, 1.0)
-    # A battery's power has its maximum at half its voltage.
+    # A battery delivers its maximum power at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current
 
 

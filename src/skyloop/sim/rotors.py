@@ -283,7 +283,7 @@ class _Pilot:
     def exchange(self) -> None:
         bodies, drone = self._bodies, self._drone
         w, x, y, z = bodies.quaternion[:, drone].tolist()
-        # The ground supports a drone only at the end of each simulation step; in between, the drone falls.
+        # The ground supports a drone only at the end of each simulation step; between these, it falls.
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,

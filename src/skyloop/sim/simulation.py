@@ -338,7 +338,7 @@ class Simulation:
             return self._bodies.position.T.copy(), self._bodies.rotations()
 
     def motions(self) -> tuple[Floats, Floats, Floats]:
-        """Return the motion of all drones as new arrays, for tasks with many drones.
+        """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
         Returns:
             True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up

@@ -221,7 +221,7 @@ class Solids:
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
         if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
-            axis = 2  # a platform lifts everything on it, whatever its motion is
+            axis = 2  # a platform lifts everything on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
         if axis == 2:

@@ -32,7 +32,7 @@ class Purpose(IntEnum):
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
     """Return the stream for a purpose and a number (of a drone, target, camera or step). This takes some 15 µs.
 
-    The same arguments give the same stream in every version.
+    The same arguments give the same stream in all versions.
     """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), index)))
 

@@ -5,11 +5,11 @@ Parameters not given here have their defaults. A table in ``docs/rotors.md`` lis
 Sources: [A] Agilicious, P. Foehn et al., "Agilicious: Open-source and open-hardware agile quadrotor for vision-based
 flight", Science Robotics 7(67), 2022: thrust and torque fit, rotor speeds and lag in its library's ``Quadrotor``. [L]
 The simulator of "Learning on the Fly", Robotics and Perception Group, University of Zurich, 2025: its default
-quadrotor, and for drag a comment in its example of a vehicle. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic
+quadrotor, and, for drag, a comment in its example of a vehicle. [N] L. Bauersfeld et al., "NeuroBEM: Hybrid Aerodynamic
 Quadrotor Model", RSS 2021: the same racer's 5.1-inch propellers. [R] F. Furrer, M. Burri, M. Achtelik, R. Siegwart,
 "RotorS - A Modular Gazebo MAV Simulator Framework", 2016: ``iris.xacro``. [F] J. Förster, "System Identification of
 the Crazyflie 2.0 Nano Quadrocopter", ETH Zurich, 2015. [E] J. Eschmann, D. Albani, G. Loianno, "Data-Driven System
-Identification of Quadrotors Subject to Motor Delays", 2024, as RotorPy 3.0.0 has it. [D] drone-models 0.1.0, Learning
+Identification of Quadrotors Subject to Motor Delays", 2024, as used in RotorPy 3.0.0. [D] drone-models 0.1.0, Learning
 Systems and Robotics Lab, 2026: attitude responses of three Crazyflies, identified from flights. [B] Bitcraze,
 Crazyflie 2.1 data sheet.
 """
@@ -59,7 +59,7 @@ RACER = VehicleParameters(
         speed_down_s=0.033,
         rotor_drag_kg=6.2e-5,  # 0.26 and 0.28 N per m/s forward and left [L], at the sum of speeds in hover, 4340 rad/s
         rotor_inflow_kg=9.7e-5,  # 0.42 N per m/s up [L]
-        body_drag_kg_m=(0.006, 0.006, 0.015),  # 100 and 250 cm² with a drag coefficient of 1, estimate
+        body_drag_kg_m=(0.006, 0.006, 0.015),  # 100 and 250 cm² with a drag coefficient of 1; estimate
         efficiency=0.6,  # estimate
         rotor_inertia_kg_m2=5.64e-6,  # [L]
     ),
@@ -78,7 +78,7 @@ IRIS = VehicleParameters(
     attitude_damping=0.8,
     most_angular_acceleration_rad_s2=30.0,  # estimate
     yaw_time_constant_s=0.2,  # estimate
-    battery_charge_c=18360.0,  # 5100 mAh, 3 cells, estimate
+    battery_charge_c=18360.0,  # 5100 mAh, 3 cells; estimate
     battery_full_v=12.6,
     battery_empty_v=9.9,
     battery_resistance_ohm=0.015,  # estimate
@@ -93,8 +93,8 @@ IRIS = VehicleParameters(
         speed_down_s=0.025,  # [R]
         rotor_drag_kg=8.06428e-5,  # [R]
         rotor_inflow_kg=8.06428e-5,  # estimate: same as the drag across
-        body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1, estimate
-        efficiency=0.8,  # estimate: some 20 minutes in the air
+        body_drag_kg_m=(0.03, 0.03, 0.06),  # 500 and 1000 cm² with a drag coefficient of 1; estimate
+        efficiency=0.8,  # estimate for some 20 minutes in the air
     ),
 )
 
@@ -128,7 +128,7 @@ CRAZYFLIE = VehicleParameters(
         rotor_drag_kg=9.1785e-7,  # [F]
         rotor_inflow_kg=10.311e-7,  # [F]
         body_drag_kg_m=(0.0, 0.0, 0.0),  # [F]: all of it grows with the rotors' speed
-        efficiency=0.5,  # estimate: 7 minutes in the air [B]
+        efficiency=0.5,  # estimate for 7 minutes in the air [B]
     ),
 )
 

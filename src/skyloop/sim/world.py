@@ -101,7 +101,7 @@ class Box:
     size_m: Vec3
     yaw_rad: float = 0.0
     texture: str = "crate"
-    colour: Rgb | None = None  # a plain colour instead of the texture
+    colour: Rgb | None = None  # plain colour that replaces the texture
 
     def corners(self) -> NDArray[np.float64]:
         """Return the corners in world axes, shape (8, 3). Bits 0, 1 and 2 of the row number select +x, +y and +z."""
@@ -266,7 +266,7 @@ class RingWalkPath:
 
 @dataclass(frozen=True, slots=True)
 class StillPath:
-    """A fixed point: a parked car, a waiting person."""
+    """A fixed point, for a parked car or a waiting person."""
 
     position_m: Vec3
 

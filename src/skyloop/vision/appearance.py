@@ -37,7 +37,7 @@ _SURE: Final = 0.6  # the appearance is learned from this similarity
 _FOUND: Final = 0.55  # a lost target is tried at places of at least this similarity
 _UNLIKE_OTHERS: Final = 0.15  # required lead in similarity over all other places and known look-alikes
 _LOOK_ALIKE: Final = 0.4  # anything near the target with this similarity is remembered as a look-alike
-_PATIENCE: Final = 10  # images without verification before the whole image is searched
+_PATIENCE: Final = 10  # number of images without verification before the whole image is searched
 _TRIAL: Final = 3  # number of images in which a found place must be verified
 _LEARN_EACH: Final = 5  # minimum number of images between updates of the memory
 _LOOK_AROUND_EACH: Final = 15  # number of images between searches for look-alikes
@@ -45,14 +45,14 @@ _SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # multiples of the target's l
 
 # Score, and fraction of such boxes that overlap the target by at least half: `python -m benchmarks.tracking_street`.
 _CONFIDENCE: Final = ((0.45, 0.857), (0.55, 0.946), (0.65, 0.974), (0.75, 0.986), (0.85, 0.986), (0.95, 0.989))
-_PLACES: Final = 5  # strips across a box in which its colours are sampled
+_PLACES: Final = 5  # number of strips across a box in which its colours are sampled
 _ASIDE: Final = 0.12  # offset between neighbouring strips, as a fraction of the box's width
 _HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as fractions of the height
-_SIZE: Final = (24, 24)  # stored patch, regardless of the target's shape
-_GRADIENTS: Final = 7  # the first channels of the features
+_SIZE: Final = (24, 24)  # size of the stored patch, whatever the target's shape [px]
+_GRADIENTS: Final = 7  # number of gradient channels, which come first in the features
 _COLOUR_WEIGHT: Final = 1.2  # decay of the similarity with the colour distance
 _KEPT: Final = 12  # maximum number of appearances, and of look-alikes
-_NEW_BELOW: Final = 0.9  # an appearance more similar to a known one is not added
+_NEW_BELOW: Final = 0.9  # appearances more similar to a known one than this are not added
 _SEARCHED_PX: Final = 16.0  # side of the target in the shrunk search image
 _LEAST_MATCH: Final = 0.35  # correlation from which a place is examined
 _WORTH_NUDGING: Final = 0.2  # refine places from this similarity; a match exceeds it even a fifth of the size off

@@ -53,8 +53,8 @@ Outputs = Mapping[str, Array]
 class Found:
     """Rows of a network's output: candidate detections."""
 
-    corners: Floats  #: (n, 4) left, top, right, bottom, in pixels of the network's input
-    scores: Floats  #: (n,) 0 to 1
+    corners: Floats  #: left, top, right, bottom in pixels of the network's input, (n, 4)
+    scores: Floats  #: scores, 0 to 1, (n,)
     classes: NDArray[np.int64]  #: (n,)
 
 
@@ -141,7 +141,7 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
         height: Height of the network's input [px].
 
     Raises:
-        FileFormatError: The outputs don't have the shapes of this layout.
+        FileFormatError: The shapes of the outputs don't match the layout.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # hostile numbers become infinite and are dropped later
         if layout is Layout.LISTS:

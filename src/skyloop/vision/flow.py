@@ -25,10 +25,10 @@ Array = NDArray[np.float64]
 
 _MOST: Final = 80  # maximum number of tracked corners
 _ENOUGH: Final = 8  # minimum number of corners for a position
-_REFILL: Final = 50  # detect new corners when fewer remain
+_REFILL: Final = 50  # number of corners below which new ones are detected
 _APART_PX: Final = 12  # minimum distance between corners
-_RETURN_PX: Final = 0.7  # a corner tracked forward and back must return within this distance
-_LOWEST_M: Final = 0.15  # minimum height: closer to the ground there is nothing to track
+_RETURN_PX: Final = 0.7  # maximum distance between a corner and where it returns after tracking forward and back
+_LOWEST_M: Final = 0.15  # minimum height; any closer to the ground, the image has no corners to track
 
 
 class GroundTracker:

@@ -196,7 +196,7 @@ def _bent(points: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return the viewing directions of a fisheye's pixels, by Newton's method on the angle to the axis."""
+    """Return the viewing directions of a fisheye's pixels, using Newton's method on the angle to the axis."""
     flat = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     radius = np.hypot(flat[:, 0], flat[:, 1])
     angle = np.minimum(radius, np.pi)

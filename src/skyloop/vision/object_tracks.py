@@ -105,7 +105,7 @@ class TrackedObject:
 
     id: int  #: number of the object, from 1; never reused
     detection: Detection  #: the last detection, including its box
-    box: Box  #: x, y, width, height [px], filtered; predicted while the object is not seen
+    box: Box  #: x, y, width, height [px], filtered, and predicted while the object is not seen
     velocity: tuple[float, float]  #: velocity of the box's centre to the right and down [px/s]
     seen: bool  #: whether the object was detected in this image
     age_s: float  #: time since the first detection [s]
@@ -144,7 +144,7 @@ class ObjectTracks:
             overlap: Minimum overlap of an object's predicted box with a confident detection, 0 to 1.
             overlap_unsure: Minimum overlap with an uncertain detection, 0 to 1.
             confirm: Number of detections after which an object is returned; 1 or more.
-            keep_s: How long an undetected object is remembered [s].
+            keep_s: Time for which an undetected object is remembered [s].
 
         Raises:
             UsageError: An argument is out of its range.

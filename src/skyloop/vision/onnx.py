@@ -34,11 +34,11 @@ def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exc
         purpose: The feature that needs it; a noun phrase for the error message.
 
     Returns:
-        The exceptions that running it raises, and ONNX Runtime's session.
+        The exceptions that running the network can raise, and ONNX Runtime's session.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
-        FileFormatError: It is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
+        FileFormatError: The file is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
     """
     try:
         import onnxruntime
@@ -70,7 +70,7 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
         tracker: Name of the OpenCV tracker that the weights are for; empty to load the file in ONNX Runtime.
 
     Raises:
-        FileFormatError: It can't be loaded within the limits.
+        FileFormatError: The network can't be loaded within the limits.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
@@ -91,7 +91,7 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
 
 
 def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
-    """Load a network and run it on zeros within limits; the main function of the child process."""
+    """Load a network and run it on zeros within limits. This is the main function of the child process."""
     if sys.platform != "win32":
         import resource
 

@@ -115,7 +115,7 @@ class PlanarPose:
 
 
 def rectangle(width_m: float, height_m: float) -> Array:
-    """Return the corners of a rectangle in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
+    """Return a rectangle's corners in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
     x, y = width_m / 2, height_m / 2
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
 

@@ -34,12 +34,12 @@ from skyloop.vision.tracking import CELL, Box, Floats, Image, Tracker, TrackResu
 Spectrum = NDArray[np.complex64]
 
 _AREA_PX: Final = 128.0**2  # area of the sampled patch around the target
-_CONTEXT: Final = 1.5  # margin added to the width and the height, times the square root of the target's area
+_CONTEXT: Final = 1.5  # margin added to width and height, as a multiple of the square root of the target's area
 _RATE: Final = 0.02  # learning rate per image
 _SCALE_RATE: Final = 0.02  # learning rate of the size filter per image
 _REGULARISATION: Final = 0.02  # as a fraction of the spectrum's mean energy
 _SPREAD: Final = 0.08  # width of the peak as a fraction of the target's size
-_SCALES: Final = 17  # sizes tried per image
+_SCALES: Final = 17  # number of sizes tried per image
 _SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
 _SCALE_SPREAD: Final = 1.0  # width of the size filter's peak, in steps of the size
 _SCALE_AREA_PX: Final = 32.0**2  # area of the sampled patch for each size
@@ -325,7 +325,7 @@ class LearnedTracker(Tracker):
             MissingExtraError: OpenCV is not installed.
             UnsupportedError: This OpenCV was built without that tracker.
             UsageError: A file does not exist.
-            FileFormatError: A file is not the weights of that tracker, or exceeds the limits of loading (tested in a
+            FileFormatError: A file has no weights for that tracker, or exceeds the limits for loading (tested in a
                 child process, as in :func:`skyloop.vision.onnx.load_network`).
         """
         self._cv: Any = opencv("tracking")

@@ -160,7 +160,7 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box of an image; pixels outside the image repeat its edge.
+    """Sample a box of an image. Pixels outside the image repeat its edge.
 
     Args:
         cv: The module ``cv2``.
@@ -182,7 +182,7 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
         part = cv.resize(part, wanted, interpolation=cv.INTER_AREA)
     shrink_x, shrink_y = part.shape[1] / wide, part.shape[0] / high
     step_x, step_y = width / size[0] * shrink_x, height / size[1] * shrink_y
-    first_x = (x - left) * shrink_x + step_x / 2 - 0.5  # centres of pixels, not their edges
+    first_x = (x - left) * shrink_x + step_x / 2 - 0.5  # pixel centres, not pixel edges
     first_y = (y - top) * shrink_y + step_y / 2 - 0.5
     turn = np.array([[step_x, 0.0, first_x], [0.0, step_y, first_y]])
     flags = cv.INTER_LINEAR | cv.WARP_INVERSE_MAP

@@ -44,7 +44,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels; see :class:`Painter`.
+    """Draws with kernels. See :class:`Painter`.
 
     Args:
         raster: See :class:`Painter`.
@@ -91,7 +91,7 @@ class CompiledPainter(Painter):
         )
         edges, planes, box = np.empty((n, 4, 3)), np.empty((n, 3)), np.empty((n, 4), np.int64)
         table = np.empty((13, n + 1), np.float32)
-        # Contiguous arrays: Numba would recompile the function for another layout.
+        # Contiguous arrays, because Numba would recompile the function for a different layout.
         whole = [np.ascontiguousarray(part) for part in scene]
         count = self._do.prepare(*whole, _CONSTANTS, self._grid, self.pixel_area, edges, planes, box, table)
         raster, pixels = self.raster, picture.shape[0] * picture.shape[1]
@@ -127,7 +127,7 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
     """Return the number of grid rows needed for each row of the image, and how many of the last ones to keep."""
     height, width = raster.rays.x.shape
     row = raster.lookup.reshape(height, width) // raster.grid.width
-    # Include the row below, used to find out whether its samples differ.
+    # Include the row below, for its samples and to find out whether they differ from those above.
     rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
     at_once = -(-kernels.BLOCK // width) + 1  # rows of the image
     first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]

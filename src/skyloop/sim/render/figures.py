@@ -1,4 +1,4 @@
-"""Dummies of people and cars, made of textured boxes. Origin on the ground, x ahead, y left, z up."""
+"""Dummies of people and cars made from textured boxes. Origin on the ground, x ahead, y left, z up."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def prepare(
     """Select the quads that may be visible, like ``visible_quads`` and ``sampling_table``.
 
     Args:
-        vectors: See ``Quads``, as for the following ones.
+        vectors: See ``Quads``, also for the next three.
         starts: See ``Quads``.
         two_sided: See ``Quads``.
         lit: See ``Quads``.

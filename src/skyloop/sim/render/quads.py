@@ -34,10 +34,10 @@ class Atlas:
     """All textures in one image.
 
     Attributes:
-        image: BGRA (OpenCV samples four channels twice as fast as three).
+        image: The image, BGRA (OpenCV samples four channels twice as fast as three).
         x0: Column where each texture's level 0 starts; float64, shape (number of textures,).
         y0: Row where each texture's level 0 starts, likewise.
-        span: Twice each texture's padded width.
+        span: Twice the padded width of each texture.
     """
 
     image: NDArray[np.uint8]

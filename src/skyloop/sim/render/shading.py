@@ -40,7 +40,7 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     c = view.inverse_depth
     u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
     texture = quads.texture[k]
-    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0, see ``Atlas``.
+    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0 (see ``Atlas``).
     under_u = dot(u_slope, pose.position_m) + quads.u_start[k] - atlas.span[texture]
     under_v = dot(v_slope, pose.position_m) + quads.v_start[k]
     table = np.zeros((13, len(k) + 1))

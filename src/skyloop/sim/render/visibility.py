@@ -60,7 +60,7 @@ def dot(a: Floats, b: Floats) -> Floats:
 
 
 def turned(vectors: Floats, rotation: Floats) -> Floats:
-    """Return vectors, shape (…, 3), times a rotation from the right, with the sums of :func:`dot`."""
+    """Return vectors, shape (…, 3), multiplied by a rotation from the right, with sums as in :func:`dot`."""
     return np.stack([dot(vectors, rotation[:, axis]) for axis in range(3)], axis=-1)
 
 
