@@ -218,8 +218,8 @@ class LandOnMarker(Behaviour):
     If the marker is lost during the approach, the vehicle climbs where it expects the marker to be, then searches. Low
     over the marker, where the image no longer shows all of it, the vehicle descends by the marker's predicted motion;
     if it would miss, it aborts and tries again. After too many aborted attempts, or too long, it climbs to a safe
-    height and hovers, and :meth:`run` returns with :attr:`landed` false, as it does if another client lands it. It must
-    be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
+    height and hovers, and :meth:`run` returns with :attr:`landed` false, also if another client lands it. The vehicle
+    must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
 
     Attributes:
         marker_id: Id of the marker.

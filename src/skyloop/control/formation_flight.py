@@ -164,7 +164,6 @@ class Formation:
             seconds: Duration.
             lead: Returns the leader's action at each tick, sent with the followers' set-points; None if another client
                 flies the leader.
-                client flies the leader.
             turn: Whether offsets and yaw turn with the leader.
 
         Raises:

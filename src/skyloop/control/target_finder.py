@@ -3,7 +3,7 @@
 It has no drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows
 the target's appearance, and the scene (:mod:`.target_scene`) knows where everything is and how it moves. Each finds the
 target where the other fails, and neither may mistake another object for it: the tracker's box must be where the target
-can be, and an object that appears after a loss must be where the target can be, look like it, and be the only such one.
+can be, and an object that appears after a loss must be where the target can be, look like it, and be the only one to.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ would be wrongly sure of it. Being on the ground is therefore one of several hyp
 near to far, with a filter each (T. R. Kronhamn, "Bearings-only target motion analysis based on a multihypothesis Kalman
 filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995).
 While the vehicle is at rest, all hypotheses fit. Once it has moved, above all up or down, where targets hardly move,
-wrong range no longer fit.
+those at a wrong range no longer fit.
 An altimeter over rising ground, or one that drifts, reports motion that did not happen. For a target that may be off
 the ground, the camera's height therefore follows the vehicle's own climb, and the altimeter only slowly.
 """

@@ -174,7 +174,7 @@ def fix_of(feedback: Feedback) -> Fix | None:
 
 
 class DeadReckoning:
-    """Position source for a vehicle that reports no position, which integrates its velocity.
+    """Position source that integrates the velocity of a vehicle that reports no position.
 
     The position drifts with the error of the velocity. The height is the vehicle's altitude, if it reports one.
     Feedback is handled on the thread that receives it.
