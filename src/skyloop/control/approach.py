@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
-_LONGEST_STEP_S = 0.2  # maximum time step of the station on its arc, even after a longer gap between frames
+_LONGEST_STEP_S = 0.2  # longest time that moves the station along its arc after a gap between frames
 _LOOKING: Colour = (120, 190, 255)
 _SEEN: Colour = (64, 220, 100)
 

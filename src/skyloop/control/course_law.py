@@ -425,7 +425,7 @@ class _Spot:
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:
-    """Return how much further than required a position is from the nearest wall [m]; negative if too close."""
+    """Return a position's distance to the nearest wall minus the required one [m]; negative if too close."""
     return min((math.dist(place, _nearest(place, wall)) - wall.reach_m for wall in walls), default=math.inf)
 
 

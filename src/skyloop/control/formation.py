@@ -152,7 +152,7 @@ def places(values: ArrayLike) -> Places:
 
 
 def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
-    """Return, for each start, the index of its slot, minimising the sum of the squared distances.
+    """Return the slot index of each start for the assignment with the smallest sum of squared distances.
 
     With this assignment, the straight paths of drones that leave and arrive together do not cross. The drones stay
     apart by at least 1/√2 of the smallest distance between two starts or two slots (Turpin, Michael and Kumar, "CAPT",

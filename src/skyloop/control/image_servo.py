@@ -356,7 +356,7 @@ class FlowHover(Behaviour):
     """Holds the position, height and yaw at which it first saw the ground, using a camera that looks down.
 
     Needs the vehicle's attitude and height, uses nothing else from its feedback, and flies by attitude. Without sight
-    of the ground, the vehicle hovers by itself and may drift, and a warning event is published. The behaviour
+    of the ground, the vehicle only hovers and may drift, and a warning event is published. The behaviour
     then holds the position at which it sees the ground again.
     """
 

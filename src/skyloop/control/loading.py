@@ -237,7 +237,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None while the file is missing, as when an editor replaces it."""
+    """Return a stamp that changes with each save; None while the file is missing, such as during its replacement."""
     try:
         found = file.stat()
     except OSError:

@@ -102,7 +102,7 @@ class PathSettings:
     #: velocity loop responds sooner, and gusts push it less far.
     velocity_gain: float = 1.0
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.25  #: response time to a set-point, by which the velocity is fed forward
+    lead_s: float = 0.25  #: response time to a set-point; the velocity is fed forward this far ahead
     limits: SetpointLimits = field(
         default_factory=lambda: SetpointLimits(
             speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0

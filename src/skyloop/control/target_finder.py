@@ -383,7 +383,7 @@ class TargetFinder:
         if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
-            return  # they can't be told from each other
+            return  # they are indistinguishable
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
         # When an object reappears, its first boxes also show the occluder, so keep the old colours.

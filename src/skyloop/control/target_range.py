@@ -1,4 +1,4 @@
-"""The range of a target that may not be on the ground: hypotheses between which the bearings decide. Pure.
+"""The range of a target that may not be on the ground: bearings decide between several hypotheses. Pure.
 
 A box drawn by a person may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
 only for a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and the filter

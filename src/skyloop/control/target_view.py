@@ -121,7 +121,7 @@ class BoxView:
         below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None.
         above: If the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None.
         azimuth_rad: Standard deviation of the azimuth.
-        edge: Standard deviation of each edge on its own.
+        edge: Standard deviation of each edge, independent of the other.
         tilt: Standard deviation common to both edges.
     """
 

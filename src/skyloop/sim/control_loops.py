@@ -166,7 +166,7 @@ class ControlLoops:
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Roll and pitch for the horizontal velocity. The integral is in world axes, where wind stays in turns.
+        # Roll and pitch for the horizontal velocity. The integral is in world axes, where turning leaves wind as is.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S

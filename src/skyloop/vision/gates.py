@@ -24,7 +24,7 @@ from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, re
 Rgb = tuple[int, int, int]
 
 _HUE_DEG: Final = 16.0  # tolerance on either side of the colour's hue
-_SATURATION: Final = 0.5  # minimum, as a fraction of the colour's own: covers paint in light and in shade
+_SATURATION: Final = 0.5  # minimum saturation as a fraction of the colour's own; covers paint in light and shade
 _LEAST_SATURATION: Final = 80  # 0 to 255: a less saturated colour is too grey to distinguish
 _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
 _LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance

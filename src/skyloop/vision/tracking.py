@@ -108,11 +108,11 @@ class Tracker(ABC):
 
     @abstractmethod
     def _start(self, image: Image, box: Box) -> None:
-        """Start with an image and box that were checked."""
+        """Start with a checked image and box."""
 
     @abstractmethod
     def _update(self, image: Image) -> TrackResult:
-        """Track in an image that was checked."""
+        """Track the target in a checked image."""
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:

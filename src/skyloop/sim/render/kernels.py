@@ -204,7 +204,7 @@ def draw(
             from its neighbours to the right and below. Holds the last processed grid rows, as many as the image needs
             at a time; a power of two. (rows, columns).
         pairs: The atlas: each texel and the next one, BGRA each, in one number.
-        atlas_size: Numbers of rows and columns of the atlas.
+        atlas_size: Number of rows and columns of the atlas.
         gap: Gap between two levels of a texture in the atlas [texels].
         farthest: 1/z to assume for a ray beyond a quad's horizon [1/m].
         boxes: Box of each shadow: first row, row after the last, first column, column after the last, (s, 4).

@@ -19,7 +19,7 @@ from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import BoardTarget, Box, FigureTarget, PlatformTarget, Room, World
 
-_FADES_AT_M = 4.0  # height above a surface from which a drone's shadow is invisible
+_FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
