@@ -1,14 +1,14 @@
-"""Track a vehicle's motion, its age and its gaps; base classes of the laws that fly by it. Pure.
+"""A vehicle's motion, its age and its gaps, with base classes for the laws that fly by it. Pure.
 
 Motion is in *odometry axes*: levelled, x along yaw 0, z up, origin at the first sample. The origin drifts with the
-error of the reported velocity. That does no harm here, because the laws use only differences over about a second. After
-a gap it may have jumped (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
+error of the reported velocity. That does no harm because the laws use only differences over about a second. The origin
+may also have jumped after a gap (:attr:`Airframe.interruptions`). Times are on the proxy's clock.
 
 A vehicle that holds its height but reports no velocity accelerates by gravity times the tangent of its tilt, minus air
 drag. Integrating the attitude therefore gives its velocity through the air, and drag makes old errors fade within about
-two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences, such as how much faster
-than its target the vehicle is, are right. Flying at a speed against the vehicle's own drag estimate also holds it
-against the wind, as an integral term would: that estimate is the averaged tilt.
+two seconds. Wind and a wrong drag constant leave an error that changes slowly, so differences are still right, such as
+how much faster the vehicle is than its target. Holding a speed against the vehicle's own drag estimate also compensates
+for wind, as an integral term would, because that estimate is the averaged tilt.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 Array = NDArray[np.float64]
 
-STALE_S: Final = 0.5  #: older values count as unknown; after a longer gap the odometry may have jumped
-#: Drag of a small quadrotor at a few metres a second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
+STALE_S: Final = 0.5  #: maximum age of a known value; after a longer gap the odometry may have jumped
+#: Drag on a small quadrotor at some metres per second [1/s]. Identified: 0.58 for an AR.Drone 2 (J. Engel, J. Sturm, D.
 #: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
-_HISTORY_S: Final = 3.0  # how much motion to keep
-_SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples, whose yaw differences say little
-_EXTRAPOLATE_S: Final = 0.3  # longest extrapolation of a motion
+_HISTORY_S: Final = 3.0  # duration of the motion to keep
+_SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates
+_EXTRAPOLATE_S: Final = 0.3  # maximum time to extrapolate a motion
 _TILTING_S: Final = 0.3  # time over which the tilt rate is measured
-_STEEPEST: Final = 0.5  # cosine of the tilt; a vehicle tilted further does not hold its height
+_STEEPEST: Final = 0.5  # minimum cosine of the tilt; a vehicle that tilts more does not hold its height
 
 
 def not_ahead(seen_ns: int | None, now_ns: int) -> int | None:
-    """Return the time of a sighting; None if it lies ahead of now, because it would count as fresh until then."""
+    """Return a sighting's time; None if it is later than now, because the sighting would count as fresh until then."""
     return None if seen_ns is not None and seconds(seen_ns - now_ns) > STALE_S else seen_ns
 
 
@@ -58,10 +58,10 @@ class Part(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """The vehicle's motion at one time, in odometry axes.
+    """The vehicle's motion at a point in time, in odometry axes.
 
     Attributes:
-        at_ns: On the proxy's clock.
+        at_ns: Time of the motion on the proxy's clock.
         position: Shape (3,) [m].
         velocity: Shape (3,) [m/s].
         yaw: [rad]
@@ -81,50 +81,50 @@ class Motion:
         return Motion(at_ns, self.position + self.velocity * dt, self.velocity, yaw, self.yaw_rate)
 
     def to_body(self, horizontal: Array) -> tuple[float, float]:
-        """Turn a horizontal vector (2,) from odometry axes into forward and left of the levelled body."""
+        """Convert a horizontal vector (2,) from odometry axes to forward and left of the levelled body."""
         return turned(float(horizontal[0]), float(horizontal[1]), -self.yaw)
 
     def stiffened(self, wanted: Array, share: float) -> Array:
-        """Add a share of the current velocity error to a wanted velocity.
+        """Add a fraction of the current velocity error to a wanted velocity.
 
         Args:
             wanted: Shape (3,) in odometry axes [m/s].
-            share: Fraction of the difference between wanted and current velocity; 0 or more.
+            share: Fraction of the difference between the wanted and the current velocity; 0 or more.
         """
         return wanted + share * (wanted - self.velocity)
 
 
 class Airframe:
-    """A vehicle's motion over the last three seconds, and the age of each part of its state.
+    """A vehicle's motion over the last three seconds and the age of each part of its state.
 
     Attributes:
-        feedback: The newest sample, without values that were not finite; None before the first.
+        feedback: The newest sample, with non-finite values removed; None before the first sample.
         by_tilt: The vehicle reports no velocity; :class:`TiltVelocity` estimates it from the attitude.
-        interruptions: How often the motion was unknown for longer than :data:`STALE_S`. Positions noted in odometry
-            axes before such a gap are off by the distance flown during it.
+        interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
+            axes from before a gap are off by the distance flown during it.
     """
 
     def __init__(self, *needs: Part) -> None:
         """Initialise the airframe.
 
         Args:
-            *needs: Parts that the caller can't fly without; see :meth:`missing`.
+            *needs: Parts of the state that the caller can't fly without; see :meth:`missing`.
         """
         self.feedback: Feedback | None = None
         self.by_tilt = False
         self.interruptions = 0
         self._needs = needs
-        self._known: dict[Part, tuple[int, Any]] = {}  # time and value
+        self._known: dict[Part, tuple[int, Any]] = {}  # time and value of each part
         self._history: deque[Motion] = deque()
         self._reckoning = TiltVelocity()
         self._tilts: deque[tuple[int, float, float]] = deque()
 
     def add(self, feedback: Feedback) -> None:
-        """Update with the next sample; ignore one that is not newer than the last.
+        """Update with the next sample; ignore it if it is not newer than the last one.
 
         Args:
-            feedback: Values that are not finite count as missing. A sample older by seconds restarts the history: the
-                one before it was stamped ahead, or the proxy's clock was set back.
+            feedback: Non-finite values count as missing. A sample that is older by seconds restarts the history,
+                because the previous one was stamped ahead or the proxy's clock was set back.
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
@@ -151,22 +151,22 @@ class Airframe:
             self._known[Part.POSITION] = at_ns, feedback.position_m
 
     def age_s(self, part: Part, now_ns: int) -> float:
-        """Return the age of a part of the state [s]; infinite if it never was."""
+        """Return the age of a part of the state [s]; infinite if it was never known."""
         known = self._known.get(part)
         return math.inf if known is None else seconds(now_ns - known[0])
 
     def missing(self, now_ns: int) -> str:
-        """Return a sentence that names the needed parts that are unknown now; empty if none is."""
+        """Return a sentence that names the needed parts of the state that are unknown now; empty if there are none."""
         old = [part.value for part in self._needs if abs(self.age_s(part, now_ns)) > STALE_S]
         return f"the vehicle's {' and '.join(old)} {'is' if len(old) == 1 else 'are'} not known" if old else ""
 
     def altitude_m(self, now_ns: int) -> float | None:
-        """Return the newest height above the ground [m]; None while unknown."""
+        """Return the newest height above the ground [m]; None if it is unknown."""
         altitude: float | None = self._newest(Part.HEIGHT, now_ns)
         return altitude
 
     def yaw_rad(self, now_ns: int) -> float | None:
-        """Return the newest yaw [rad]; None while unknown."""
+        """Return the newest yaw [rad]; None if it is unknown."""
         yaw: float | None = self._newest(Part.YAW, now_ns)
         return yaw
 
@@ -177,11 +177,11 @@ class Airframe:
 
     @property
     def newest(self) -> Motion | None:
-        """The motion of the last sample that reported it, whatever its age; None before the first."""
+        """Motion from the last sample that reported it, whatever its age; None before the first one."""
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """Return the motion at a time [ns], extrapolated from the nearest sample; None while unknown."""
+        """Return the motion at a time [ns], extrapolated from the nearest sample; None if it is unknown."""
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -192,15 +192,15 @@ class Airframe:
         return nearest.moved_to(at_ns) if abs(seconds(nearest.at_ns - at_ns)) <= STALE_S else None
 
     def at_capture(self, frame: Feedback, captured_ns: int, *seen: Array) -> tuple[Motion, Array] | None:
-        """Return the motion at the capture of a frame and the rotation (3, 3) from the body to odometry axes.
+        """Return the motion when a frame was captured, and the rotation (3, 3) from the body to odometry axes.
 
         Args:
-            frame: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            frame: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
             *seen: Measurements made in the frame.
 
         Returns:
-            None while motion or attitude is unknown, and if a measurement is not finite.
+            None if the motion or attitude is unknown or a measurement is not finite.
         """
         motion, frame = self.at(captured_ns), _finite(frame)
         if motion is None or frame.roll_rad is None or frame.pitch_rad is None or frame.yaw_rad is None:
@@ -209,9 +209,9 @@ class Airframe:
 
     @property
     def tilt_rate_rad_s(self) -> float:
-        """The recent tilt rate by differences, for vehicles whose feedback has no gyroscope.
+        """Recent tilt rate, computed from differences for vehicles whose feedback has no gyroscope.
 
-        The largest difference of roll and pitch within the last 0.3 s, per 0.15 s [rad/s].
+        The largest difference in roll or pitch over the last 0.3 s, divided by 0.15 s [rad/s].
         """
         if not self._tilts:
             return 0.0
@@ -222,7 +222,7 @@ class Airframe:
         return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
 
     def _begin_anew(self, at_ns: int) -> None:
-        """Restart the history at the last known position: the vehicle is still somewhere near it."""
+        """Restart the history at the last known position, because the vehicle is still somewhere near it."""
         self._known.clear()
         self._tilts.clear()
         self._reckoning = TiltVelocity()
@@ -254,17 +254,17 @@ class TiltVelocity:
             drag_per_s: Deceleration per unit of speed [1/s].
         """
         self.drag_per_s = drag_per_s
-        self._velocity = np.zeros(2)  # horizontal, along yaw 0 and to its left
+        self._velocity = np.zeros(2)  # horizontal: along yaw 0 and to the left
         self._last_ns: int | None = None
 
     def step(self, feedback: Feedback) -> tuple[float, float, float] | None:
         """Integrate the next sample.
 
         Args:
-            feedback: The vehicle's newest state; a landed vehicle is at rest.
+            feedback: The vehicle's newest state; a landed vehicle counts as at rest.
 
         Returns:
-            The velocity forward, left and up (always 0), in the levelled body's axes [m/s]; None while the attitude is
+            The velocity forward, left and up (always 0) in the levelled body's axes [m/s]; None if the attitude is
             unknown.
         """
         roll, pitch, yaw = feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad
@@ -284,22 +284,22 @@ class TiltVelocity:
 
 
 class AirframeLaw:
-    """The base of laws that fly by the vehicle's motion and hold the vehicle while a part that they need is unknown.
+    """Base class for laws that fly by the vehicle's motion and hold the vehicle while a needed part of it is unknown.
 
     Attributes:
-        airframe: The vehicle's known motion.
-        problem: Why the law holds the vehicle, as of the last step; empty while it flies.
+        airframe: The known motion of the vehicle.
+        problem: Why the law held the vehicle at the last step; empty if it is flying it.
     """
 
     def __init__(self, *needs: Part) -> None:
         """Initialise the law.
 
         Args:
-            *needs: Parts that the law can't fly without.
+            *needs: Parts of the state that the law can't fly without.
         """
         self.airframe = Airframe(*needs)
         self.problem = ""
-        self._altitude: float | None = None  # as of the last step; None: unknown
+        self._altitude: float | None = None  # at the last step; None if unknown
         self._last_ns: int | None = None  # time of the last step
 
     def feedback(self, feedback: Feedback) -> None:
@@ -314,10 +314,10 @@ class AirframeLaw:
         self._last_ns = None
 
     def forget(self) -> None:
-        """Forget everything noted in odometry axes, because the motion was interrupted."""
+        """Forget everything stored in odometry axes, because the motion was interrupted."""
 
     def _ready(self, now_ns: int) -> bool:
-        """Return whether all needed parts are known; pause if not, or if the last set-point is old."""
+        """Return whether all needed parts are known; pause if not, or if the last set-point is too old."""
         self.problem = self.airframe.missing(now_ns)
         self._altitude = self.airframe.altitude_m(now_ns)
         if self.problem or (self._last_ns is not None and seconds(now_ns - self._last_ns) > STALE_S):
@@ -330,43 +330,43 @@ class AirframeLaw:
         return 0.0 if last_ns is None else max(0.0, seconds(now_ns - last_ns))
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the motion at a time; the caller has checked that it is known."""
+        """Return the motion at a time. The caller has checked that it is known."""
         motion = self.airframe.at(at_ns)
         assert motion is not None, "a law without its motion is not ready"
         return motion
 
 
 class VelocityLaw(AirframeLaw):
-    """The base of laws whose set-points are velocities, with limits."""
+    """Base class for laws whose set-points are velocities with limits."""
 
     def __init__(self, limits: SetpointLimits, *needs: Part) -> None:
         """Initialise the law.
 
         Args:
             limits: Limits of the set-points.
-            *needs: Parts that the law can't fly without.
+            *needs: Parts of the state that the law can't fly without.
         """
         super().__init__(*needs)
         self._limiter = SetpointLimiter(limits)
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now. All zero while a part that the law needs is unknown."""
+        """Compute the set-point for now. It is zero while a part of the state that the law needs is unknown."""
         if not self._ready(now_ns):
             return Velocity()
         return self._limiter.step(self._setpoint(now_ns), self._since_s(now_ns))
 
     def pause(self) -> None:
-        """Restart set-points from rest."""
+        """Restart the set-points from rest."""
         super().pause()
         self._limiter.reset(Velocity())
 
     def _setpoint(self, now_ns: int) -> Array:
-        """Return forward, left, up [m/s] and yaw rate [rad/s], (4,), before the limits."""
+        """Return forward, left, up [m/s] and yaw rate [rad/s], (4,), before limits are applied."""
         raise NotImplementedError
 
 
 def _yaw_rate(feedback: Feedback, yaw: float, last: Motion | None) -> float:
-    """Return the reported yaw rate, or else the one since the last sample (a Tello reports none)."""
+    """Return the reported yaw rate or, if there is none (as on a Tello), the rate since the last sample."""
     if feedback.angular_velocity_rad_s is not None:
         return feedback.angular_velocity_rad_s[2]
     if last is None:
@@ -382,14 +382,14 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "position_m")
 
 
 def _finite(feedback: Feedback) -> Feedback:
-    """Return feedback without values that are not finite: a driver or a position source may be faulty."""
+    """Return feedback with non-finite values removed, because a driver or a position source may be faulty."""
     wrong = [name for name in _NUMBERS if not math.isfinite(getattr(feedback, name) or 0.0)]
     wrong += [name for name in _VECTORS if not all(map(math.isfinite, getattr(feedback, name) or ()))]
     return msgspec.structs.replace(feedback, **dict.fromkeys(wrong)) if wrong else feedback
 
 
 class TurningSearch:
-    """A search with a forward camera: turn on the spot and change height after each full turn."""
+    """A search with a forward camera: turn on the spot and change the height after each full turn."""
 
     def __init__(
         self,
@@ -402,9 +402,9 @@ class TurningSearch:
 
         Args:
             turn_rad_s: Yaw rate.
-            heights_m: Height of each full turn, relative to the height at the start.
-            lowest_m: Least height above the ground.
-            highest_m: Greatest height above the ground.
+            heights_m: Height during each full turn, relative to the height at the start.
+            lowest_m: Minimum height above the ground.
+            highest_m: Maximum height above the ground.
         """
         self._rate = turn_rad_s
         self._heights = heights_m
@@ -415,10 +415,10 @@ class TurningSearch:
         self._base: float | None = None
 
     def restart(self, *, turning: float) -> None:
-        """Start the next search in the direction in which the vehicle is turning.
+        """Start the next search in the direction in which the vehicle is already turning.
 
         Args:
-            turning: Yaw rate [rad/s], counter-clockwise positive; below 0.05 the direction stays.
+            turning: Yaw rate [rad/s], counter-clockwise positive; below 0.05 the previous direction is kept.
         """
         if abs(turning) > 0.05:
             self._direction = math.copysign(1.0, turning)
@@ -429,7 +429,7 @@ class TurningSearch:
 
         Args:
             yaw: Yaw of the vehicle [rad].
-            altitude: Above the ground [m]; None keeps the height.
+            altitude: Height above the ground [m]; None keeps the current height.
 
         Returns:
             Forward, left, up [m/s] and yaw rate [rad/s], (4,).

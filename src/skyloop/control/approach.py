@@ -1,4 +1,4 @@
-"""Approach a marker and stop in front of it; swing around it; circle a position; land on a still or moving marker."""
+"""Behaviours that approach or orbit a marker, circle a position, or land on a still or moving marker."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import PositionSource
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
-_LONGEST_STEP_S = 0.2  # a longer gap between frames moves the station along the arc by no more
+_LONGEST_STEP_S = 0.2  # longest time that moves the station along its arc after a gap between frames
 _LOOKING: Colour = (120, 190, 255)
 _SEEN: Colour = (64, 220, 100)
 
 
 class ApproachMarker(FollowMarker):
-    """Finds a marker, flies to a point squarely in front of it and hovers there; then :meth:`run` returns.
+    """Finds a marker, flies to a point squarely in front of it and hovers there. Then :meth:`run` returns.
 
     The goal counts as reached once distance and height have stayed within ``near_m``, and the angle to the marker's
     normal within ``near_rad``, for ``hold_s``.
@@ -60,17 +60,17 @@ class ApproachMarker(FollowMarker):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             marker_id: Id of the marker.
-            distance_m: Distance at which to stop; replaces that of ``settings``.
-            near_m: Acceptance radius of distance and height together.
-            near_rad: Acceptance angle to each side of the marker's normal.
-            hold_s: How long the vehicle must stay within both.
+            distance_m: Distance at which to stop; overrides ``settings``.
+            near_m: Acceptance radius for distance and height together.
+            near_rad: Acceptance angle on either side of the marker's normal.
+            hold_s: How long the vehicle must stay within both limits.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.
+            camera: Camera to use; None for the vehicle's first camera.
+            settings: Settings of the law; None for the defaults with ``aside_rad`` 0.
 
         Raises:
-            UsageError: A number is not finite and above 0.
+            UsageError: A number is not finite and greater than 0.
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
@@ -81,7 +81,7 @@ class ApproachMarker(FollowMarker):
         self._there_ns: int | None = None
 
     def on_frame(self, frame: Frame) -> None:
-        """Follow the marker, and finish once the vehicle has stayed at the goal for ``hold_s``."""
+        """Follow the marker and finish once the vehicle has stayed at the goal for ``hold_s``."""
         super().on_frame(frame)
         law = self._follow_law
         there = (
@@ -100,12 +100,12 @@ class ApproachMarker(FollowMarker):
 
 
 class OrbitMarker(FollowMarker):
-    """Swings back and forth on an arc in front of a marker, facing it (a flat marker can't be seen from behind).
+    """Swings back and forth on an arc in front of a marker while facing it (a flat marker can't be seen from behind).
 
-    Starts on the side from which it sees the marker and runs until stopped.
+    It starts on the side from which it sees the marker, and runs until stopped.
 
     Attributes:
-        turns: Number of times that it reached an end of the arc.
+        turns: Number of times the vehicle has reached an end of the arc.
     """
 
     name = "orbit"
@@ -128,13 +128,13 @@ class OrbitMarker(FollowMarker):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             marker_id: Id of the marker.
-            radius_m: Distance from it; replaces that of ``settings``.
-            reach_rad: Half angle of the arc to each side of the marker's normal, at most 1.1.
+            radius_m: Distance from the marker; overrides ``settings``.
+            reach_rad: Half angle of the arc on either side of the marker's normal, at most 1.1.
             rate_rad_s: Angular rate around the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults, with ``aside_rad`` 0.05.
+            camera: Camera to use; None for the vehicle's first camera.
+            settings: Settings of the law; None for the defaults with ``aside_rad`` 0.05.
 
         Raises:
             UsageError: A number is out of its range.
@@ -151,14 +151,14 @@ class OrbitMarker(FollowMarker):
         self._last_ns: int | None = None
 
     def on_frame(self, frame: Frame) -> None:
-        """Move the station along the arc while the marker is seen, and follow the marker."""
+        """Move the station along the arc while the marker is in sight, and follow the marker."""
         law = self._follow_law
         dt_s = 0.0 if self._last_ns is None else min(_LONGEST_STEP_S, seconds(frame.captured_ns - self._last_ns))
         self._last_ns = frame.captured_ns
         going = self.mode is Mode.FOLLOWING and law.aside_rad is not None
         law.station_rate_rad_s = self._rate if going else 0.0
         if law.aside_rad is not None and not going:
-            law.station_rad = law.aside_rad  # from where the marker was found again
+            law.station_rad = law.aside_rad  # start from where the marker was found again
         if abs(law.station_rad) >= self._reach and law.station_rad * self._rate > 0.0:
             self._rate = -self._rate
             self.turns += 1
@@ -167,9 +167,9 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Circles a position, facing it or away from it; then hovers, and :meth:`run` returns.
+    """Circles a position, facing it or away from it, and then hovers; :meth:`run` returns.
 
-    Needs the vehicle's position: see :class:`FollowPath`.
+    Needs the vehicle's position, as described for :class:`FollowPath`.
     """
 
     def __init__(
@@ -188,13 +188,13 @@ class OrbitPlace(FollowPath):
 
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
-            centre: x, y and the height to fly at [m], world axes.
+            centre: x, y and the height to fly at, in world axes [m].
             radius_m: Radius of the circle.
-            look: Whether the vehicle faces ``"in"``, to the centre, or ``"out"``.
+            look: Direction the vehicle faces: ``"in"`` (towards the centre) or ``"out"``.
             speed_m_s: Speed along the circle.
             laps: Number of laps, counter-clockwise.
-            settings: Settings of the path law; None are the defaults.
-            source: Position source; None is the vehicle's own feedback.
+            settings: Settings of the path law; None for the defaults.
+            source: Position source; None for the vehicle's own feedback.
 
         Raises:
             UsageError: An argument is out of its range.
@@ -213,13 +213,13 @@ def _require_above_0(**values: float) -> None:
 
 
 class LandOnMarker(Behaviour):
-    """Searches for a marker on a spiral, flies over it, descends with it and stops the motors after landing.
+    """Searches for a marker on a spiral, flies over it, descends along with it and stops the motors after landing.
 
-    If the marker is lost on the way, the vehicle climbs where the marker should be, then searches. Low over the marker,
-    where it no longer fits into the image, the vehicle descends by the marker's predicted motion; if it would miss, it
-    aborts and tries again. After too many aborted attempts, or too long a time, it climbs to a safe height, hovers
-    there, and :meth:`run` returns with :attr:`landed` false; the same holds if another client lands the vehicle. The
-    vehicle must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
+    If the marker is lost during the approach, the vehicle climbs where it expects the marker to be, then searches. Low
+    over the marker, where the image no longer shows all of it, the vehicle descends by the marker's predicted motion;
+    if it would miss, it aborts and tries again. After too many aborted attempts, or too long, it climbs to a safe
+    height and hovers, and :meth:`run` returns with :attr:`landed` false, also if another client lands it. The vehicle
+    must be airborne when :meth:`run` is called; a :meth:`run` that ends early leaves it hovering where it is.
 
     Attributes:
         marker_id: Id of the marker.
@@ -246,7 +246,7 @@ class LandOnMarker(Behaviour):
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
             camera: A camera that looks down.
-            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
+            settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -269,11 +269,11 @@ class LandOnMarker(Behaviour):
 
     @property
     def landed(self) -> bool:
-        """Whether the vehicle stands on the marker."""
+        """Whether the vehicle has landed on the marker."""
         return self.done and self.phase is LandingPhase.DOWN
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the law and send its set-point; after touch-down wait until the vehicle reports that it has landed."""
+        """Update the law and send its set-point; after touch-down, wait until the vehicle reports a landing."""
         self._flew = self._flew or feedback.state.airborne
         down = self.phase is LandingPhase.DOWN
         if self._flew and feedback.state is FlightState.LANDED and not self.done:
@@ -282,14 +282,14 @@ class LandOnMarker(Behaviour):
             self.emit(text, Severity.INFO if down else Severity.WARNING)
             self._end()
         if down or self.done:
-            self._landing_law.feedback(feedback)  # another client may take over and fly it from here
+            self._landing_law.feedback(feedback)  # another client may take over and fly the vehicle from here
             return
         super().on_feedback(feedback)
         if self._frame_ns is not None and not self.blind and not self.done:
-            self.fly(self.drone.now_ns)  # on every sample, not only on frames, to answer gusts sooner
+            self.fly(self.drone.now_ns)  # on every sample rather than only on frames, to react to gusts sooner
 
     def on_frame(self, frame: Frame) -> None:
-        """Search the frame; end the behaviour if the law has given up."""
+        """Search the frame and end the behaviour if the law has given up."""
         super().on_frame(frame)
         if not self.done and self._landing_law.safe(frame.captured_ns):
             self.finish("gave up: hovering at a safe height", Severity.WARNING)
@@ -311,9 +311,9 @@ class LandOnMarker(Behaviour):
         return shapes
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
+        """Send velocities until the law is down, then have the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
-            # Requested at every step, so that a short loss of the link does not end the landing.
+            # Requested at every step, so that a brief loss of the link does not end the landing.
             let_go(self.drone, "it has touched down on its marker", land=True)
         else:
             super().steer(wanted)

@@ -1,4 +1,4 @@
-"""The base of ready-made behaviours: detection in images, a control law, and its velocity or attitude set-points."""
+"""The base class of ready-made behaviours, which detect something in images and follow a control law's set-points."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from skyloop.messages.relayed import Shape
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-BLIND_S = 0.5  #: the vehicle hovers after this long without a frame
+BLIND_S = 0.5  #: time without a frame after which the vehicle hovers
 
 
 class Law(Protocol):
-    """The control law of a behaviour. Pure: no clock and no thread; times are on the proxy's clock [ns]."""
+    """A behaviour's control law. Pure: no clock and no thread; times are on the proxy's clock [ns]."""
 
     def feedback(self, feedback: Feedback) -> None:
         """Update the law with the vehicle's newest state."""
@@ -31,24 +31,24 @@ class Law(Protocol):
 
 
 class Behaviour(Controller):
-    """A controller that detects something in the camera's frames and flies by it.
+    """A controller that detects something in the camera's frames and flies by what it detects.
 
     For each frame, :meth:`look` searches the image, the law computes a set-point, :meth:`steer` sends it, and the
     detections are drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne
-    when :meth:`run` is called. When frames stop for more than :data:`BLIND_S`, or when a part of the vehicle's motion
-    that the law needs is unknown, the vehicle hovers and an event reports it.
+    when :meth:`run` is called. If frames stop for more than :data:`BLIND_S`, or a part of the vehicle's motion that the
+    law needs is unknown, the vehicle hovers and an event reports why.
 
-    Subclasses define :meth:`look`, :attr:`phase`, and in :attr:`losses` the phases without sight of the target.
+    Subclasses define :meth:`look` and :attr:`phase`, and list phases without sight of the target in :attr:`losses`.
 
     Attributes:
         name: Source of the annotations, and prefix of the events' text.
-        done: Whether the behaviour reached its end.
+        done: Whether the behaviour has reached its end.
         blind: Whether the vehicle hovers because no frames arrive.
-        problem: The missing part of the vehicle's state for which it hovers; empty if there is none.
+        problem: The missing part of the vehicle's state that makes it hover; empty if nothing is missing.
     """
 
     name = "behaviour"  #: source of the annotations, and prefix of the events' text
-    losses: frozenset[StrEnum] = frozenset()  #: phases without sight of the target; entering one is a warning
+    losses: frozenset[StrEnum] = frozenset()  #: phases in which the target is out of sight; entering one is a warning
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
         """Initialise the behaviour.
@@ -56,19 +56,19 @@ class Behaviour(Controller):
         Args:
             drone: The drone to fly.
             law: Computes the set-points.
-            camera: Camera to use; None is the vehicle's first camera.
+            camera: Camera to use; None for the vehicle's first camera.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
         """
         super().__init__(drone)
         self.camera = camera
-        self.done = False  #: the behaviour reached its end
+        self.done = False  #: the behaviour has reached its end
         self.blind = False  #: the vehicle hovers because no frames arrive
-        self.problem = ""  #: missing part of the vehicle's state for which it hovers
+        self.problem = ""  #: missing part of the vehicle's state that makes it hover
         self._law = law
         self._mounting = camera_info(drone, camera)
-        self._frame_ns: int | None = None  # capture of the newest frame
+        self._frame_ns: int | None = None  # capture time of the newest frame
         self._reported: StrEnum | None = None
 
     @property
@@ -85,11 +85,11 @@ class Behaviour(Controller):
         raise NotImplementedError
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the law; hover when frames stop arriving."""
+        """Update the law, and hover if frames stop arriving."""
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
-        # abs(): a frame stamped ahead would otherwise hide that the frames have stopped.
+        # abs(), because a frame stamped ahead would otherwise hide that frames have stopped.
         if abs(feedback.captured_ns - self._frame_ns) > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
@@ -110,10 +110,10 @@ class Behaviour(Controller):
             self.drone.annotate(frame, shapes, source=self.name)
 
     def fly(self, now_ns: int) -> None:
-        """Compute the law's set-point and send it, and report a new phase.
+        """Compute the law's set-point, send it and report a change of phase.
 
         Args:
-            now_ns: On the proxy's clock.
+            now_ns: The current time on the proxy's clock.
         """
         law = self._law
         known = law.airframe.feedback if isinstance(law, AirframeLaw) else None
@@ -145,10 +145,10 @@ class Behaviour(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def finish(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """End the behaviour for good: publish an event, hover, and let :meth:`run` return.
+        """End the behaviour permanently: publish an event, hover, and let :meth:`run` return.
 
         Args:
-            text: The result; follows the behaviour's name in the event's text.
+            text: The result, added to the behaviour's name in the event's text.
             severity: Severity of the event.
         """
         self.done = True
@@ -157,10 +157,10 @@ class Behaviour(Controller):
         self._end()
 
     def emit(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """Emit an event to this application's event subscribers.
+        """Publish an event to this application's event subscribers.
 
         Args:
-            text: Follows the behaviour's name and a colon.
+            text: Text, added after the behaviour's name and a colon.
             severity: Severity of the event.
         """
         self.drone.emit(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
@@ -178,10 +178,10 @@ def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
 
     Args:
         drone: The drone whose capabilities to read.
-        camera: The camera's name; None is the vehicle's first.
+        camera: The camera's name; None for the vehicle's first one.
 
     Raises:
-        UnknownNameError: The vehicle has no such camera, or none at all.
+        UnknownNameError: The vehicle has no camera of this name, or none at all.
     """
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:

@@ -1,10 +1,10 @@
-"""Keep a target in view at a distance, or circle it. Pure: times are on the proxy's clock.
+"""A law that keeps a target in view at a distance, or circles it. Pure: times are on the proxy's clock.
 
-Yaw keeps the target in the middle of the image, distance is controlled along the line of sight, height and side
-separately. That is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied object
-tracking and following for unmanned aerial vehicles", SSRR 2013), applied to estimated metres, so that gains depend on
-neither lens nor target size, and with the target's velocity fed forward. A vehicle that reports no velocity is flown by
-attitude to the same velocity, which then comes from dead reckoning (:class:`.airframe.TiltVelocity`).
+Yaw keeps the target in the middle of the image, distance is controlled along the line of sight, and height and sideways
+motion separately. This is the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
+object tracking and following for unmanned aerial vehicles", SSRR 2013), applied to estimated metres, so that the gains
+depend on neither lens nor target size, and with the target's velocity fed forward. A vehicle that reports no velocity
+is flown to the same velocity by attitude, using dead reckoning instead (:class:`.airframe.TiltVelocity`).
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from skyloop.messages.geometry import wrap_angle
 Array = NDArray[np.float64]
 
 _SMOOTHING_S = 0.4  # time constant of the target's acceleration
-_SETPOINT_OVER = 1.5  # set-point limit, times the top speed: drag keeps a vehicle below its set-point
-_SETPOINT_AHEAD = 4.0  # limit of the set-point's change, times the vehicle's: a set-point must lead to have an effect
-_APPROACH_HORIZON_S = 3.0  # give way to a target that will pass sooner than this
-_CONFIDENT_SIGMA_M = 0.35  # a position with at most this deviation counts as certain
-_UNCERTAIN_M = 1.0  # largest extra clearance from a person whose position is uncertain
-_KEEP_SIDE_S = 1.0  # after giving way to one side, stay on that side for this long
-_HEAD_ON_SHARE = 0.2  # share of the clearance: within it a pass is head-on, and either side will do
-_SWEEP_BACK_SHARE = 0.4  # share of the sweep that goes away from the target's motion
-_HEIGHT_REACHED_M = 0.1  # this close to a parallax height, head for the other one
-_ALONG_M_S = 0.4  # a slower target has no direction of motion to be behind or beside of
+_SETPOINT_OVER = 1.5  # set-point limit as a multiple of the top speed: drag keeps a vehicle below its set-point
+_SETPOINT_AHEAD = 4.0  # limit of the set-point's change, as a multiple of the vehicle's: to act, it must lead
+_APPROACH_HORIZON_S = 3.0  # give way to a target that will pass within this time
+_CONFIDENT_SIGMA_M = 0.35  # maximum deviation of a position that counts as certain
+_UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
+_KEEP_SIDE_S = 1.0  # time to stay on the side of the last evasion
+_HEAD_ON_SHARE = 0.2  # as a fraction of the clearance: a closer pass is head-on, and either side will do
+_SWEEP_BACK_SHARE = 0.4  # fraction of the sweep on the side opposite to the target's motion
+_HEIGHT_REACHED_M = 0.1  # distance to a parallax height at which to head for the other one
+_ALONG_M_S = 0.4  # minimum speed of a target with a usable direction of motion
 
 
 class _Now(NamedTuple):
-    """The inputs of a set-point."""
+    """The inputs of a set-point computation."""
 
     own: Motion
-    ahead: Motion  #: when the set-point takes effect
-    predicted: Predicted | None  #: None: by attitude, or before the first feedback
+    ahead: Motion  #: motion when the set-point takes effect
+    predicted: Predicted | None  #: None when flying by attitude, or before the first feedback
     altitude_m: float | None
-    dt_s: float  #: since the last step
-    relative: bool  #: the set-point is an attitude
+    dt_s: float  #: time since the last step
+    relative: bool  #: whether the set-point is an attitude
 
 
 class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state.
 
     Attributes:
-        settings: Can be replaced in flight.
-        mode: Can be changed in flight.
-        phase: As of the last step.
-        off_m: Estimated minus wanted distance, as of the last step; None while the target is not seen.
-        held_by: The constraint that keeps the vehicle from its goal: "leash"; empty if there is none.
+        settings: Settings of the law; can be replaced in flight.
+        mode: Mode of the pursuit; can be changed in flight.
+        phase: Phase at the last step.
+        off_m: Estimated minus wanted distance at the last step; None while the target is not in sight.
+        held_by: The constraint that keeps the vehicle from its goal ("leash"); empty if there is none.
     """
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
@@ -73,19 +73,19 @@ class ChaseLaw:
         self.held_by = ""
         self._heading: float | None = None  # heading of the target's last motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
-        self._previous_position: Array | None = None  # in odometry axes, at the last step
-        self._begin: Array | None = None  # start, in world axes; None until the position is known
+        self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes
+        self._begin: Array | None = None  # position at the start, in world axes; None until it is known
         self._height: float | None = None
-        self._away = False  # while the range is unknown: whether the vehicle is flying to the other height
+        self._away = False  # whether the vehicle, while the range is unknown, is flying to the other height
         self._since_ns: int | None = None  # start of the search
         self._direction = 1.0
-        self._sweep_first = 0.0  # side of the first sweep, 1 is left; 0: not chosen yet
+        self._sweep_first = 0.0  # side of the first sweep: 1 for left, 0 if not chosen yet
         self._previous_velocity: tuple[int, Array] | None = None  # time and the target's velocity
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
         self._response = VelocityResponse(_response(self.settings))
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
-        self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and side
+        self._gave_way: tuple[int | None, Array] = (None, np.zeros(2))  # time and side of the last evasion
 
     def step(
         self,
@@ -103,16 +103,16 @@ class ChaseLaw:
         """Compute the set-point for now.
 
         Args:
-            now_ns: On the proxy's clock.
-            motion: The vehicle's newest motion; with ``relative`` by dead reckoning.
-            altitude_m: Height above the ground; None leaves the height alone.
+            now_ns: The current time on the proxy's clock.
+            motion: The vehicle's newest motion; from dead reckoning if ``relative``.
+            altitude_m: Height above the ground; None leaves the height unchanged.
             target: The target's filter; None before the first sighting.
-            seen_ns: The target's last certain or possible sighting; None: never.
+            seen_ns: Time of the target's last certain or possible sighting; None if there was none.
             others: Recently seen objects to keep clear of.
-            candidate: A possible match for the lost target; the vehicle turns to it.
+            candidate: A possible match for the lost target; the vehicle turns towards it.
             relative: The vehicle reports no velocity (see :class:`.airframe.TiltVelocity`), so the set-point is an
                 attitude.
-            position: The vehicle's position in world axes [m]; None if unknown: the leash integrates velocity.
+            position: The vehicle's position in world axes [m]; None if unknown: the leash then integrates velocity.
         """
         s = self.settings
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
@@ -142,11 +142,11 @@ class ChaseLaw:
         turn = self._turn(ahead, state, aside, sweeping)
         if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
             return self._steer(still, turn, state, now)
-        # Full speed for half of ``predict_s``, then slower and slower.
+        # Full speed for half of ``predict_s``, then decreasing.
         fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
         if state.range_known:
             horizontal = self._horizontal(ahead, state) * max(0.0, fade)
-        else:  # the target may be much nearer than it seems
+        else:  # the target may be much closer than it seems
             horizontal = still
             self.phase = self.phase if self.phase in LOSSES else TargetPhase.RANGING
         if self.phase is TargetPhase.PREDICTING:
@@ -157,7 +157,7 @@ class ChaseLaw:
         return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
-        """Update the model of the vehicle's response ; vehicles that report no velocity have none."""
+        """Update the model of the vehicle's response, except for vehicles that report no velocity and have no model."""
         self._response.add(feedback)
 
     def pause(self) -> None:
@@ -166,7 +166,7 @@ class ChaseLaw:
         self._response.pause()
 
     def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
-        """Return the vehicle's motion when a set-point sent now takes effect, given the set-points already sent."""
+        """Return the vehicle's motion when a set-point sent now takes effect, given those already sent."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
         if predicted is None:
@@ -187,7 +187,7 @@ class ChaseLaw:
         return self._by_velocity(velocity, up, turn, now)
 
     def _by_velocity(self, velocity: Array, up: float, turn: float, now: _Now) -> Velocity:
-        """Return the set-point that brings the vehicle to a velocity in spite of drag and wind."""
+        """Return the set-point that brings the vehicle to a velocity despite drag and wind."""
         s, own = self.settings, now.own
         assert self._limiter is not None
         if now.predicted is not None:
@@ -218,9 +218,9 @@ class ChaseLaw:
         }[self.mode]
 
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
-        """Return how far to the left of the target's expected position to look [rad], and that angle's rate [rad/s].
+        """Return the angle to the left of the target's expected position to look at [rad], and the rate of that angle.
 
-        While hovering, sweep to both sides, first and furthest towards the target's last motion; 0 in other phases.
+        While hovering, sweep to both sides, first and furthest the way the target last moved; 0 in other phases.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -256,14 +256,14 @@ class ChaseLaw:
         aside = np.array([-sight[1], sight[0]])
         near = max(0.3, across - state.margin_m)
         self.off_m = near - s.distance_m
-        # Approach no faster than the vehicle can stop; back off at the speed that the gain gives.
+        # Approach only as fast as the vehicle can stop; back off at the speed given by the gain.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
         moving = self._soon(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
             wanted = wanted - aside * s.orbit_m_s  # counter-clockwise from above, with the target on the left
         elif s.bearing_rad is None:
-            # No side is wanted: yaw alone follows the target's motion across the line of sight.
+            # No side was chosen, so yaw alone follows the target's motion across the line of sight.
             wanted = wanted - aside * float(moving @ aside)
         else:
             wanted = wanted + aside * self._round(state, sight, across)
@@ -271,7 +271,7 @@ class ChaseLaw:
         return self._kept_off(wanted, state, sight, near)
 
     def _soon(self, state: TargetState, at_ns: int) -> Array:
-        """Return the target's velocity, (2,) [m/s], predicted to when the vehicle has matched it."""
+        """Return the target's velocity, (2,) [m/s], predicted to the time when the vehicle has matched it."""
         s, velocity = self.settings, state.velocity
         if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
             dt_s = seconds(at_ns - self._previous_velocity[0])
@@ -284,18 +284,18 @@ class ChaseLaw:
         return velocity + s.response_s * change
 
     def _round(self, state: TargetState, sight: Array, across: float) -> float:
-        """Return the speed to the left of the line of sight that brings the vehicle to its side of the target."""
+        """Return the speed to the left of the line of sight that takes the vehicle to its side of the target."""
         s = self.settings
         if float(np.hypot(*state.velocity)) > _ALONG_M_S:
             self._heading = math.atan2(state.velocity[1], state.velocity[0])
         if self._heading is None or s.bearing_rad is None:
             return 0.0
-        here = math.atan2(-sight[1], -sight[0])  # the vehicle as seen from the target
+        here = math.atan2(-sight[1], -sight[0])  # direction of the vehicle as seen from the target
         off = wrap_angle(self._heading + s.bearing_rad - here)
         return -clamped(s.round_gain * off * across, 0.6 * s.speed_m_s)
 
     def _evading(self, own: Motion, state: TargetState) -> Array:
-        """Return the velocity, (2,) [m/s], that makes way for a target about to pass nearer than allowed."""
+        """Return the velocity, (2,) [m/s], that makes way for a target about to pass closer than allowed."""
         s, velocity = self.settings, state.velocity
         speed = float(np.hypot(*velocity))
         if speed < _ALONG_M_S:
@@ -311,8 +311,8 @@ class ChaseLaw:
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
         """Return the velocity, (2,) [m/s], that keeps clear of another object.
 
-        Take the closest pass at the vehicle's current velocity and at the one it is about to take up. If the other's
-        position is uncertain, for example out of view, stay further off and allow for it to stop.
+        Consider the closest pass both at the vehicle's current velocity and at the one it is about to take up. If the
+        other object's position is uncertain, for example out of view, stay further away and allow for it to stop.
         """
         uncertain_m = within(other.place_m - _CONFIDENT_SIGMA_M, 0.0, _UNCERTAIN_M)
         clear_m = self.settings.clear_m + uncertain_m
@@ -332,14 +332,14 @@ class ChaseLaw:
         return side * min(gap / max(0.5, in_s), 0.7 * self.settings.speed_m_s)
 
     def _kept_off(self, wanted: Array, state: TargetState, sight: Array, across: float) -> Array:
-        """Limit the closing speed so that the vehicle can stop before the nearest distance."""
+        """Limit the closing speed so that the vehicle can stop before it reaches the minimum distance."""
         closing = float((wanted - state.velocity) @ sight)
         gap = across - self.settings.nearest_m
         allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
     def _note_way(self, own: Motion, position: Vector | None) -> None:
-        """Track the offset from the start, by position if known: the velocity's integral drifts."""
+        """Track the offset from the start, by position if it is known, because the integral of the velocity drifts."""
         here = own.position[:2]
         self._out = self._out + (np.zeros(2) if self._previous_position is None else here - self._previous_position)
         self._previous_position = here
@@ -349,7 +349,7 @@ class ChaseLaw:
             self._out = known - self._begin
 
     def _leashed(self, out: Array, wanted: Array) -> Array:
-        """Limit the velocity to stay within the leash; ``out``, (2,) [m], is the offset from the start."""
+        """Limit the velocity to stay within the leash; ``out``, (2,) [m], is the vehicle's offset from the start."""
         leash = self.settings.leash_m
         if leash is None:
             return wanted
@@ -365,7 +365,7 @@ class ChaseLaw:
         return wanted - direction * (outwards - allowed)
 
     def _up(self, altitude_m: float | None, state: TargetState | None) -> float:
-        """Return the climb that keeps the height, or brings the target back towards the image's centre."""
+        """Return the climb rate that keeps the height or brings the target back towards the image's centre."""
         s = self.settings
         if altitude_m is None:
             return 0.0
@@ -380,7 +380,7 @@ class ChaseLaw:
         return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
 
     def _for_parallax(self, height: float, altitude_m: float) -> float:
-        """Return the next of the two heights that reveal the range; prefer to rise, as people may be below."""
+        """Return the next of the two heights that reveal the range, preferring to rise, because people may be below."""
         s = self.settings
         other = height = within(height, s.lowest_m, s.highest_m)
         if s.parallax_m is not None:
@@ -392,7 +392,7 @@ class ChaseLaw:
         return other if self._away else height
 
     def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
-        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s], and makes up for drag."""
+        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s], and compensates for drag."""
         s = self.settings
         push = s.tilt_gain * (wanted - own.velocity[:2]) + DRAG_PER_S * own.velocity[:2]
         forward, left = own.to_body(shortened(push, GRAVITY_M_S2 * math.tan(s.tilt_rad)))
@@ -401,7 +401,7 @@ class ChaseLaw:
         )
 
     def _limits(self, own: Motion) -> None:
-        """Apply the settings' limits; start the first set-point from the vehicle's own velocity."""
+        """Apply the settings' limits, and start the first set-point from the vehicle's own velocity."""
         s = self.settings
         # A set-point leads the velocity that it causes, so it may change faster than the vehicle does.
         limits = SetpointLimits(
@@ -422,8 +422,8 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
     """Return the distance of the closest pass [m], the time to it [s] and the unit vector to the side to pass on, (2,).
 
     Args:
-        here: Offset from the other to the vehicle, (2,) [m].
-        moving: The vehicle's velocity relative to the other's, (2,) [m/s].
+        here: Offset from the other object to the vehicle, (2,) [m].
+        moving: The vehicle's velocity relative to the other object, (2,) [m/s].
     """
     square = float(moving @ moving)
     in_s = clamped(-float(here @ moving) / square, _APPROACH_HORIZON_S) if square > 0.01 else 0.0
@@ -434,12 +434,12 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
-    """Return the speed [m/s] from which the vehicle, after its reaction time, stops within a gap; 0 if none."""
+    """Return the speed [m/s] from which the vehicle can stop within a gap after its reaction time; 0 without a gap."""
     react_s, brake = settings.react_s, settings.brake_m_s2
     return brake * (math.sqrt(react_s**2 + 2.0 * max(0.0, gap_m) / brake) - react_s)
 
 
 def _not_towards(velocity: Array, sight: Array) -> Array:
-    """Remove the component towards a hidden target: the obstacle that hides it may be in the way."""
+    """Remove the component towards a hidden target, because the obstacle that hides it may be in the way."""
     direction = sight / max(1e-6, float(np.hypot(*sight)))
     return velocity - direction * max(0.0, float(velocity @ direction))

@@ -1,4 +1,4 @@
-"""Goals, gains and limits of :class:`skyloop.control.chase_law.ChaseLaw`, and its phases."""
+"""Goals, gains, limits and phases of :class:`skyloop.control.chase_law.ChaseLaw`."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from skyloop.messages import Value
 class FollowMode(StrEnum):
     """How to follow a target."""
 
-    FOLLOW = "follow"  #: keep a distance, and a side if one is given
-    ORBIT = "orbit"  #: circle it, even while it moves
-    LOOK = "look"  #: stay in place and turn to it
+    FOLLOW = "follow"  #: keep a distance and, if given, a side
+    ORBIT = "orbit"  #: circle the target, even while it moves
+    LOOK = "look"  #: stay in place and turn towards the target
 
 
 class TargetPhase(StrEnum):
     """The phases of a pursuit."""
 
-    LOOKING = "looking for the target"  #: not seen yet: turning on the spot
-    RANGING = "range not yet known: turns only"  #: seen, but perhaps much nearer than it seems
+    LOOKING = "looking for the target"  #: target not seen yet: turning on the spot
+    RANGING = "range not yet known: turns only"  #: target seen, but perhaps much closer than it seems
     FOLLOWING = "following"
     ORBITING = "orbiting"
     WATCHING = "looking at it"
@@ -39,48 +39,48 @@ LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SE
 
 @dataclass(frozen=True, slots=True)
 class ChaseSettings:
-    """Goal, gains and limits of :class:`ChaseLaw`.
+    """Goals, gains and limits of :class:`ChaseLaw`.
 
     Attributes:
-        distance_m: Horizontal, from the vehicle's centre to the target's.
-        nearest_m: Never fly nearer, and back off from a target that comes nearer.
-        clear_m: The same for others that the detector sees.
-        bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion: 0
-            is ahead of it, π behind, π/2 on its left. None: whichever side the vehicle is on.
-        orbit_m_s: Speed around the target, counter-clockwise from above if positive.
-        leash_m: Farthest horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
-            None: no leash. Uses the vehicle's position, or, while unknown, its integrated velocity, which drifts.
-        height_m: Above the ground; None: the height at the start.
-        lowest_m: Above the ground.
-        highest_m: Above the ground.
-        parallax_m: How far to rise (or sink, if rising is not possible) and come back in order to learn the range of a
-            target that may not stand on the ground. None: wait for the range without such moves.
-        steep_rad: Largest elevation of the target's middle, up or down, at which the vehicle keeps its height.
-        lead_s: Delay from deciding a command until it takes effect: delays of commands and feedback together.
-        response_s: Time to reach a commanded velocity; the target's velocity is predicted this far ahead.
+        distance_m: Horizontal distance between the centres of the vehicle and the target.
+        nearest_m: Minimum distance to the target; the vehicle backs off from a target that comes closer.
+        clear_m: Minimum distance to other objects that the detector sees.
+        bearing_rad: Side of the target to stay on, as an angle counter-clockwise from its direction of motion: 0
+            is in front of it, π behind it, π/2 on its left. None for the side that the vehicle is on.
+        orbit_m_s: Speed around the target; positive for counter-clockwise as seen from above.
+        leash_m: Maximum horizontal distance from the start; at the leash the vehicle only turns, whoever approaches.
+            None for no leash. Uses the vehicle's position or, if unknown, its integrated velocity, which drifts.
+        height_m: Height above the ground; None for the height at the start.
+        lowest_m: Minimum height above the ground.
+        highest_m: Maximum height above the ground.
+        parallax_m: How far to rise (or sink, if it can't rise) and return in order to measure the range of a target
+            that may not be on the ground. None waits for the range without moving.
+        steep_rad: Maximum elevation of the target's middle, up or down, at which the vehicle keeps its height.
+        lead_s: Total delay of commands and feedback, from the decision until a command takes effect.
+        response_s: Time to reach a commanded velocity, for which the target's velocity is predicted ahead.
         range_gain: [1/s]
         velocity_gain: Acceleration per unit of velocity error [1/s].
         yaw_gain: [1/s]
         height_gain: [1/s]
-        round_gain: How fast to move around to ``bearing_rad`` [1/s].
-        speed_m_s: Greatest horizontal speed. The proxy's ``limits.speed`` applies as well.
-        climb_m_s: Greatest vertical speed.
-        turn_rad_s: Greatest yaw rate.
-        acceleration_m_s2: Horizontal limit of the set-point; harder acceleration tilts the camera off the target.
-        react_s: The vehicle's worst-case reaction time; limits the speed towards the target to one it can stop from.
+        round_gain: Gain of moving around to ``bearing_rad`` [1/s].
+        speed_m_s: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
+        climb_m_s: Maximum vertical speed.
+        turn_rad_s: Maximum yaw rate.
+        acceleration_m_s2: Limit of the horizontal set-point; more acceleration would tilt the camera off the target.
+        react_s: The vehicle's worst-case reaction time; limits the closing speed so that it can stop in time.
         brake_m_s2: Deceleration assumed for that stop.
-        tilt_rad: Greatest tilt of a vehicle flown by attitude.
-        tilt_gain: Acceleration per unit of velocity error of such a vehicle [1/s].
-        lean_rad: Greatest lean that the model expects of a vehicle flown by velocity.
-        seen_s: How long after the last sighting the target counts as seen.
-        predict_s: How long to follow the hidden target's predicted motion, slowing down.
-        hover_s: How long to hover after that, looking to both sides of the target's predicted position.
-        give_up_s: How long after the last sighting to give up.
-        search_rad_s: Yaw rate of the search.
-        sweep_rad: How far to look past the target's predicted position while hovering.
+        tilt_rad: Maximum tilt of a vehicle flown by attitude.
+        tilt_gain: Acceleration per unit of velocity error of a vehicle flown by attitude [1/s].
+        lean_rad: Maximum lean that the model expects of a vehicle flown by velocity.
+        seen_s: Time after the last sighting for which the target still counts as seen.
+        predict_s: Time to follow a hidden target's predicted motion while slowing down.
+        hover_s: Time to hover after that, looking to either side of the target's predicted position.
+        give_up_s: Time after the last sighting at which to give up.
+        search_rad_s: Yaw rate during the search.
+        sweep_rad: Angle to look past the target's predicted position while hovering.
 
     Raises:
-        UsageError: A number is out of its range, or ``distance_m`` is not above ``nearest_m``.
+        UsageError: A number is out of its range, or ``distance_m`` is not greater than ``nearest_m``.
     """
 
     distance_m: float = 4.0
@@ -135,11 +135,11 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
     def within(self, limits: Mapping[str, Value]) -> ChaseSettings:
-        """Return these settings within the limits of a drone, so that the law expects nothing beyond them.
+        """Return these settings clamped to a drone's limits, so that the law never expects more than they allow.
 
         Args:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
-                in ``drone.config``; a missing one limits nothing.
+                in ``drone.config``; a missing one sets no limit.
         """
         highest = lowered(self.highest_m, limits, "limits.altitude")
         return replace(

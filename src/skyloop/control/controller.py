@@ -1,4 +1,4 @@
-"""The base class of controllers, and the loop that calls its callbacks."""
+"""The base class for controllers, and the loop that calls its callbacks."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ if TYPE_CHECKING:
     from skyloop.messages import Event, Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
-_LOOK_S = 0.1  #: how often ``until`` is evaluated while no sample arrives
+_LOOK_S = 0.1  #: interval at which ``until`` is evaluated while no sample arrives
 _SAMPLES: Final = ("on_feedback", "on_frame", "on_result")
 _CALLBACKS: Final = (*_SAMPLES, "on_authority", "on_reload")
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """Counts of one :meth:`Controller.run`, and why it ended."""
+    """Counts from one :meth:`Controller.run`, and why it ended."""
 
-    frames: int  #: calls of ``on_frame``
-    feedback: int  #: calls of ``on_feedback``
-    frames_dropped: int  #: frames that newer ones replaced while a callback was running
+    frames: int  #: number of ``on_frame`` calls
+    feedback: int  #: number of ``on_feedback`` calls
+    frames_dropped: int  #: frames replaced by newer ones while a callback was running
     feedback_dropped: int
-    overruns: int  #: callbacks during which at least one sample was dropped
+    overruns: int  #: number of callbacks during which at least one sample was dropped
     seconds: float
     reason: Reason  #: why the run ended
-    results: int = 0  #: calls of ``on_result``
-    results_dropped: int = 0  #: results that newer ones replaced
-    results_expired: int = 0  #: results older than ``result_max_age_s`` when taken from the queue
-    notes: tuple[str, ...] = ()  #: likely mistakes, in words: a forgotten take-off, a misspelt callback, …
+    results: int = 0  #: number of ``on_result`` calls
+    results_dropped: int = 0  #: results replaced by newer ones
+    results_expired: int = 0  #: number of results older than ``result_max_age_s`` when taken from the queue
+    notes: tuple[str, ...] = ()  #: descriptions of likely mistakes: a forgotten take-off, a misspelt callback, …
 
     def __str__(self) -> str:
         return "\n".join((self._counts(), *(f"note: {note}" for note in self.notes)))
@@ -60,16 +60,16 @@ class RunSummary:
 
 
 class Controller:
-    """The base class of an application's control loop.
+    """The base class for an application's control loop.
 
-    Override one or several of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`. Each
+    Override one or more of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`. Each
     callback gets the newest sample, one call at a time, on the thread that called :meth:`run`; a sample that arrives
-    while a callback runs replaces the one that is waiting.
+    while a callback is running replaces the one that is waiting.
 
     Attributes:
-        camera: Camera of :meth:`on_frame`; None is the vehicle's first camera.
-        processors: Processors of :meth:`on_result`; None is all.
-        result_max_age_s: Results older than this are skipped; None skips none.
+        camera: Camera for :meth:`on_frame`; None for the vehicle's first camera.
+        processors: Processors for :meth:`on_result`; None for all.
+        result_max_age_s: Maximum age of results; older ones are skipped. None skips none.
         drone: The drone to fly.
     """
 
@@ -81,7 +81,7 @@ class Controller:
         """Store the drone; callbacks start with :meth:`run`."""
         self.drone = drone
         self._stopped = threading.Event()
-        self._ended = False  # for good
+        self._ended = False  # permanently
         self._inbox: Mailboxes | None = None
         self._checks: _Checks | None = None  # checks of the newest run
 
@@ -101,7 +101,7 @@ class Controller:
         """Handle the newest result of a processor.
 
         Args:
-            result: ``result.age_s`` is the time since the capture of its frame.
+            result: The result; ``result.age_s`` is the time since its frame was captured.
         """
 
     def on_authority(self, status: AuthorityStatus) -> None:
@@ -112,13 +112,13 @@ class Controller:
         """
 
     def on_reload(self, before: Controller) -> None:
-        """Take over the state of the controller that this one replaces in flight.
+        """Take over the state from the controller that this one replaces in flight.
 
-        Called once before the first sample when ``skyloop fly --reload`` loads a saved file again. Copy the older
+        Called once before the first sample when ``skyloop fly --reload`` reloads a saved file. Copy the previous
         controller's state here, for example ``self.target = before.target``.
 
         Args:
-            before: The controller that ran until now.
+            before: The controller that was running until now.
         """
 
     # Methods to call ----------------------------------------------------------------------------------------------
@@ -131,28 +131,28 @@ class Controller:
             inbox.notifier.notify()
 
     def _is_overruled(self, feedback: Feedback) -> bool:
-        """Return whether set-points have no effect: another client, controller or failsafe has the vehicle."""
+        """Return whether another client, another controller or a failsafe has the vehicle, so set-points do nothing."""
         return self.drone.authority.state != "held" or bool(feedback.others) or feedback.failsafe is not Failsafe.NONE
 
     def _end(self) -> None:
-        """Stop for good: a later :meth:`run` returns at once."""
+        """Stop permanently: a later :meth:`run` returns at once."""
         self._ended = True
         self.stop()
 
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
-        """Call the callbacks until the time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
+        """Call the callbacks until time is up, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
         An exception in a callback, Ctrl-C or ``sys.exit()`` makes an airborne vehicle hover, if this client flies it,
-        and propagates. An :class:`AuthorityError` because another client took over does not end the run:
-        :meth:`on_authority` is called instead. A ready-made controller that has reached its end does not fly again: its
-        next run returns at once.
+        and propagates. If another client takes over, the resulting :class:`AuthorityError` does not end the run:
+        instead, :meth:`on_authority` is called. A ready-made controller that has reached its end does not fly again:
+        its next run returns at once.
 
         Args:
-            seconds: How long to run, 0 or more; None sets no limit.
-            until: Evaluated before each round of callbacks, and every 0.1 s while no sample arrives.
+            seconds: How long to run, 0 or more; None for no limit.
+            until: Function that is called before each round of callbacks, and every 0.1 s while no sample arrives.
 
         Returns:
-            Counts of calls and drops, why the run ended, and likely mistakes.
+            Counts of calls and drops, the reason why the run ended, and likely mistakes.
 
         Raises:
             UsageError: ``seconds`` is negative or NaN.
@@ -187,7 +187,7 @@ class Controller:
 
 
 def misspelt(own: type[Controller]) -> Iterator[str]:
-    """Describe methods whose names look like misspelt callbacks, and controllers without any callback.
+    """Describe methods whose names look like misspelt callbacks, and controllers without a callback.
 
     Args:
         own: The controller's class.
@@ -221,14 +221,14 @@ class _Checks:
         self._flew = self._steered = False
 
     def look(self) -> None:
-        """Note whether the vehicle is airborne and gets set-points; called throughout the run."""
+        """Note whether the vehicle is airborne and receives set-points. Called throughout the run."""
         newest = self.known.newest
         self._flew = self._flew or (newest is not None and newest.state.airborne)
         if not self._steered and self._commands.intent > self._first_intent:
             self._steered = isinstance(self._commands.newest, SET_POINTS)
 
     def notes(self) -> Iterator[str]:
-        """Yield the mistakes found, in words."""
+        """Yield descriptions of the mistakes found."""
         yield from misspelt(type(self._controller))
         if self._steered and not self._flew:
             yield "the drone never took off, so its set-points had no effect: call drone.takeoff() first"
@@ -253,7 +253,7 @@ class _Checks:
                 yield why.__get__(value)
 
     def _events(self) -> list[Event]:
-        """Return the events since the run's start that concern this application."""
+        """Return the events that concern this application, since the start of the run."""
         events = self._controller.drone.recent_events()
         if self._last_event in events:
             del events[: events.index(self._last_event) + 1]
@@ -273,7 +273,7 @@ class _Run:
         self._feedback = 0
         self._results = 0
         self._overruns = 0
-        self._lost = False  # another client took over, and on_authority was called
+        self._lost = False  # whether another client took over and on_authority was called
 
     def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
         started_ns = self._inbox.clock()
@@ -312,11 +312,11 @@ class _Run:
         return "until" if until is not None and until() else None
 
     def _ended(self) -> bool:
-        """Return whether the vehicle closed its link on purpose, as a replay does, and all samples are handled."""
+        """Return whether the vehicle closed its link deliberately, like a replay, and all samples were handled."""
         return self._drone.link.vehicle is LinkState.CLOSED and not self._inbox.waiting
 
     def _serve(self) -> None:
-        """Call one callback per kind of waiting sample; feedback first, so that frames meet the newer state."""
+        """Call one callback per kind of waiting sample, feedback first, so that frames meet the newer state."""
         feedback = self._inbox.feedback.take()
         if feedback is not None:
             self._feedback += 1

@@ -1,8 +1,8 @@
-"""Fly a course with a known map, corrected by the camera's sightings. Pure: no clock, no thread.
+"""A law that flies a course with a known map, corrected by the camera's sightings. Pure: no clock, no thread.
 
-The map gives the places of gates and poles. The vehicle knows its own position by odometry only, from its start. Each
-gate that it sees corrects the offset between map and odometry; each pole moves to where it is seen. The route to the
-next gate leads around poles and other gates to a point in front of the opening; from there it follows the gate's axis.
+The map gives the positions of gates and poles. The vehicle knows its own position only by odometry from its start. Each
+gate that it sees corrects the offset between map and odometry, and each pole is moved to where it is seen. The route to
+the next gate leads around poles and other gates to a point in front of the opening, then along the gate's axis.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
 Array = NDArray[np.float64]
-_SURE = 3.0  # standard deviations within which a sighting belongs to a pole
-_TILT_RAD = 0.012  # standard deviation of an elevation: errors of the attitude and of a pole's top in the image
-_REPEATED = 3.0  # inflates the noise: errors repeat from one sighting to the next
-_SIDES = 3  # viewing directions: along a gate's axis and from both sides of it
+_SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
+_TILT_RAD = 0.012  # standard deviation of an elevation, from errors of the attitude and of a pole's top in the image
+_REPEATED = 3.0  # factor on the noise, because errors repeat from one sighting to the next
+_SIDES = 3  # number of viewing directions: along a gate's axis and from either side of it
 
 
 class GatePlace(NamedTuple):
-    """Where a gate is on the map: the centre of its opening [m], and the heading of the way through it [rad]."""
+    """A gate's position on the map: the centre of its opening [m], and the heading for flying through it [rad]."""
 
     x_m: float
     y_m: float
@@ -56,8 +56,8 @@ class CourseSettings:
     The defaults suit a vehicle half a metre across and openings of 1.2 m.
     """
 
-    lead_s: float = 0.12  #: from deciding a command until it takes effect
-    velocity_gain: float = 1.0  #: share of the velocity error added to the set-point
+    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
+    velocity_gain: float = 1.0  #: fraction of the velocity error added to the set-point
     cruise_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.4
@@ -66,17 +66,17 @@ class CourseSettings:
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
     body_m: float = 0.27  #: the vehicle's radius
-    clearance_m: float = 0.2  #: kept beyond the radius
+    clearance_m: float = 0.2  #: clearance in addition to the radius
     frame_m: float = 0.12  #: thickness of a gate's bars, ahead and across
     before_m: tuple[float, ...] = (1.2, 0.9, 0.65)  #: distances in front of the opening; the first free one is used
-    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances of a gate not seen yet
+    views_m: tuple[float, ...] = (3.0, 2.5, 3.8)  #: viewing distances for a gate that was not seen yet
     beyond_m: float = 0.45  #: distance behind the gate at which it counts as passed
-    aligned_m: float = 0.12  #: largest offset from the axis, sideways and in height
+    aligned_m: float = 0.12  #: maximum offset from the axis, sideways and in height
     map_m: float = 0.05  #: standard deviation of the map, horizontally and in height
     start_m: float = 0.2  #: standard deviation of the start position
-    sightings: int = 3  #: sightings of a gate needed before flying through it
-    waiting_s: float = 2.5  #: at each viewpoint; if the gate is seen from none, the law is stuck
-    braking_per_s: float = 1.3  #: speed towards an obstacle per metre of room beyond half the clearance
+    sightings: int = 3  #: number of sightings of a gate needed before flying through it
+    waiting_s: float = 2.5  #: waiting time at each viewpoint; if the gate can't be seen from any, the law is stuck
+    braking_per_s: float = 1.3  #: speed towards an obstacle per metre of space beyond half the clearance
     plan_s: float = 0.4  #: interval between route plans
 
 
@@ -84,8 +84,8 @@ class CourseLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
-        phase: As of the last step.
-        axis: The vehicle's position in the gate's axes, as of the last step.
+        phase: Phase at the last step.
+        axis: The vehicle's position in the gate's axes at the last step.
         way: The points of the route, in odometry axes.
         stuck: Why the vehicle can't continue; None while it can.
     """
@@ -102,10 +102,10 @@ class CourseLaw(VelocityLaw):
 
         Args:
             gates: Gates in order.
-            widths_m: Widths of their openings.
+            widths_m: Widths of the gates' openings.
             poles: Other obstacles.
-            start: The vehicle's map position at the first feedback; its yaw is the map's.
-            settings: None are the defaults.
+            start: The vehicle's map position at the first feedback; its yaw at that time is the map's.
+            settings: Settings of the law; None for the defaults.
         """
         self.settings = s = settings or CourseSettings()
         super().__init__(
@@ -121,7 +121,7 @@ class CourseLaw(VelocityLaw):
         self._shift_m = s.start_m
         self._poles = [_Spot(np.array(pole[:2]) + self._shift[:2], pole, s) for pole in poles]
         self._number = 0
-        self._lift: float | None = None  # altitude above the ground minus the odometry's
+        self._lift: float | None = None  # altitude above the ground minus the odometry's height
         self._planned_ns: int | None = None
         self._waiting_ns: int | None = None
         self._view = 0  # index of the current viewpoint
@@ -129,11 +129,11 @@ class CourseLaw(VelocityLaw):
 
     @property
     def number(self) -> int:
-        """The number of the next gate, from 0."""
+        """Number of the next gate, from 0."""
         return self._number
 
     def next_gate(self) -> None:
-        """Advance to the next gate; the last one's measured place corrects the others."""
+        """Advance to the next gate. The measured position of the last one corrects the others."""
         if self._seen >= self.settings.sightings:
             learnt = self._gate_at(self._number) - self._nominal(self._number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
@@ -153,7 +153,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Trust the map no more than at the start, and look at the gate again."""
+        """Trust the map only as much as at the start, and look at the gate again."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self._number)
@@ -168,13 +168,13 @@ class CourseLaw(VelocityLaw):
         self._lift = lift if self._lift is None else self._lift + 0.1 * (lift - self._lift)
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting of the next gate; ignore it if that gate can't be there.
+        """Update with a sighting of the next gate; ignore it if the gate can't be there.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].
             normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            at_capture: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
             trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
@@ -186,7 +186,7 @@ class CourseLaw(VelocityLaw):
         across = across / max(1e-6, float(np.linalg.norm(across)))
         if float(across @ self._heading) < 0.0:  # a gate looks the same from behind
             across = -across
-        # The visible opening ends at the far edges of the bars, half their thickness behind the middle.
+        # The visible opening ends at the far edges of the bars, which are half their thickness behind the middle.
         seen = to_level @ position
         off = float(across @ seen[:2]) / max(distance, 1e-6) * self.settings.frame_m / 2
         middle = motion.position + seen - np.array([*(off * across), 0.0])
@@ -201,12 +201,12 @@ class CourseLaw(VelocityLaw):
         self._seen += 1
 
     def see_pole(self, top: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting of a pole; ignore one where no pole can be.
+        """Update with a sighting of a pole; ignore it if no pole can be there.
 
         Args:
-            top: Direction of its top in body axes, (3,), of any length.
-            at_capture: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            top: Direction of the pole's top in body axes, (3,), of any length.
+            at_capture: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, top)
         if found is None or self._lift is None or not self._poles:
@@ -222,7 +222,7 @@ class CourseLaw(VelocityLaw):
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:
-        """Return the vehicle's motion, with its height above the ground."""
+        """Return the vehicle's motion, including its height above the ground."""
         motion = super()._motion(at_ns)
         return replace(motion, position=motion.position + np.array([0.0, 0.0, self._lift or 0.0]))
 
@@ -305,7 +305,7 @@ class CourseLaw(VelocityLaw):
         return np.array([*own.to_body(velocity[:2]), velocity[2], turn])
 
     def _along(self, place: Array) -> Array:
-        """Return the horizontal velocity along the way."""
+        """Return the horizontal velocity along the route."""
         while len(self.way) > 1 and math.dist(self.way[0], place) < 0.2:
             del self.way[0]
         aim = np.array(self.way[0]) - place
@@ -317,7 +317,7 @@ class CourseLaw(VelocityLaw):
         return aim * (speed / max(far, 1e-6))
 
     def _plan(self, own: Motion, walls: Sequence[Wall], now_ns: int) -> None:
-        """Plan the route to the point in front of the gate, at most every ``plan_s``."""
+        """Plan the route to the point in front of the gate, at most once every ``plan_s``."""
         s = self.settings
         if self._planned_ns is not None and seconds(now_ns - self._planned_ns) < s.plan_s:
             return
@@ -341,7 +341,7 @@ class CourseLaw(VelocityLaw):
         self.way = []
 
     def _hides(self, place: Array, gate: Array, ahead: Array) -> bool:
-        """Return whether a pole stands between a place and the gate's opening."""
+        """Return whether a pole is between a position and the gate's opening."""
         half = np.array([-ahead[1], ahead[0]]) * (self._widths[self._number] / 2 + self.settings.frame_m)
         corners = [place, gate - half, gate + half]
         edges = [
@@ -385,13 +385,13 @@ class CourseLaw(VelocityLaw):
 
 
 class _Sighting(NamedTuple):
-    miss: Array  #: offset from the pole's estimated place, (2,) [m]
+    miss: Array  #: offset from the pole's estimated position, (2,) [m]
     noise: Array  #: covariance of the sighting, (2, 2) [m²]
-    deviations: float  #: that offset in standard deviations
+    deviations: float  #: the offset in standard deviations
 
 
 class _Spot:
-    """A pole's estimated place and its covariance: a Kalman filter of a fixed point in two dimensions."""
+    """A pole's estimated position and its covariance: a Kalman filter for a fixed point in two dimensions."""
 
     def __init__(self, place: Array, pole: Pole, settings: CourseSettings) -> None:
         self.place, self.radius_m, self._height = place, pole.radius_m, pole.height_m
@@ -399,14 +399,14 @@ class _Spot:
 
     @property
     def spread_m(self) -> float:
-        """The standard deviation in the least certain direction."""
+        """Standard deviation in the least certain direction."""
         return float(math.sqrt(np.linalg.eigvalsh(self._covariance)[-1]))
 
     def move(self, by: Array) -> None:
         self.place = self.place + by
 
     def sighting(self, own: Array, ahead: Array, rise: float) -> _Sighting:
-        """Compare the bearing and slope of a top with this pole's estimate: a higher top is nearer."""
+        """Compare the bearing and slope of a pole's top with this estimate: a higher top is closer."""
         height = self._height - float(own[2])
         if rise * height <= 0.01 or abs(height) < 0.2:
             return _Sighting(np.zeros(2), np.eye(2), math.inf)
@@ -425,12 +425,12 @@ class _Spot:
 
 
 def _room(place: Array, walls: Sequence[Wall]) -> float:
-    """Return a place's distance from the nearest wall beyond the required one [m]; negative if too near."""
+    """Return a position's distance to the nearest wall minus the required one [m]; negative if too close."""
     return min((math.dist(place, _nearest(place, wall)) - wall.reach_m for wall in walls), default=math.inf)
 
 
 def _nearest(place: Array, wall: Wall) -> Point:
-    """Return the point of a wall nearest to a place."""
+    """Return the point of a wall nearest to a position."""
     (x, y), (u, v) = wall.begin, wall.end
     along, aside = u - x, v - y
     share = ((float(place[0]) - x) * along + (float(place[1]) - y) * aside) / max(along**2 + aside**2, 1e-12)

@@ -1,4 +1,4 @@
-"""Filters of signals sampled at uneven times: low pass, complementary, median. Pure: the time step is an argument."""
+"""Filters for signals sampled at uneven times: low pass, complementary, median. Pure: the time step is an argument."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Signal = TypeVar("Signal", float, NDArray[np.float64])
 
 
 class LowPass(Generic[Signal]):
-    """First-order low pass of a number or an array, exact for a signal held constant between samples.
+    """First-order low pass for a number or an array, exact for a signal that is constant between samples.
 
     From ``T·y' + y = x`` with ``x`` constant over a step ``dt``: ``y ← y + (1 − exp(−dt/T))·(x − y)`` (zero-order
     hold; Åström and Wittenmark, "Computer-Controlled Systems", 1997, section 2.3).
 
     Attributes:
-        time_constant_s: Can be changed at any time; 0 passes every sample unchanged.
+        time_constant_s: Time constant; can be changed at any time. 0 passes every sample unchanged.
         value: The filtered value; None before the first sample, which passes unchanged.
     """
 
@@ -30,21 +30,21 @@ class LowPass(Generic[Signal]):
         """Initialise the filter.
 
         Args:
-            time_constant_s: 0 or more.
+            time_constant_s: Time constant, 0 or more.
             value: Initial value; None starts from the first sample.
 
         Raises:
             UsageError: The time constant is negative or not finite.
         """
         self.time_constant_s = _time_constant(time_constant_s)
-        self.value: Signal | None = value  #: None before the first sample, which passes unchanged
+        self.value: Signal | None = value  #: the filtered value; None before the first sample, which passes unchanged
 
     @classmethod
     def from_cutoff(cls, frequency_hz: float) -> LowPass[Signal]:
-        """Create a low pass from its cutoff (−3 dB) frequency: ``T = 1 / (2π·f)``.
+        """Create a low pass from its cutoff frequency (−3 dB): ``T = 1 / (2π·f)``.
 
         Raises:
-            UsageError: The frequency is not above 0.
+            UsageError: The frequency is not greater than 0.
         """
         if not frequency_hz > 0.0:
             raise UsageError(f"frequency_hz is {frequency_hz!r} and must be above 0")
@@ -54,7 +54,7 @@ class LowPass(Generic[Signal]):
         """Update with the next sample.
 
         Args:
-            sample: A number, or an array whose shape stays the same.
+            sample: A number, or an array that always has the same shape.
             dt_s: Time since the last sample.
 
         Returns:
@@ -72,34 +72,34 @@ class LowPass(Generic[Signal]):
 
 
 class Complementary:
-    """Fuses an angle's rate, which responds at once but drifts, with its measurement, which is right in the long run.
+    """Fuses an angle's rate, which responds at once but drifts, with its measurement, which is correct in the long run.
 
     The rate passes a high pass and the angle a low pass with the same time constant; the two add up to one (Higgins, "A
     Comparison of Complementary and Kalman Filtering", IEEE Trans. AES 11(3), 1975). Angles [rad] are wrapped, so that
-    crossing ±π is a small step.
+    crossing ±π counts as a small step.
 
     Attributes:
-        angle: Within [-π, π); None before the first measurement.
+        angle: The filtered angle in [-π, π); None before the first measurement.
     """
 
     def __init__(self, time_constant_s: float, angle: float | None = None) -> None:
         """Initialise the filter.
 
         Args:
-            time_constant_s: Over times shorter than this the rate dominates, over longer ones the measured angle.
+            time_constant_s: The rate dominates over shorter times than this, the measured angle over longer ones.
             angle: Initial angle; None starts from the first measurement.
 
         Raises:
             UsageError: The time constant is negative or not finite.
         """
         self._time_constant_s = _time_constant(time_constant_s)
-        self.angle = angle  #: within [-π, π); None before the first measurement
+        self.angle = angle  #: the filtered angle in [-π, π); None before the first measurement
 
     def step(self, rate: float, measured: float | None, dt_s: float) -> float | None:
         """Update with the next sample.
 
         Args:
-            rate: Over the last ``dt_s`` [rad/s].
+            rate: Rate over the last ``dt_s`` [rad/s].
             measured: The angle at the end of ``dt_s`` [rad]; None if not measured.
             dt_s: Time since the last sample.
 
@@ -117,9 +117,9 @@ class Complementary:
 
 
 class Median:
-    """The median of the last samples of a number: removes single outliers and keeps edges sharp.
+    """The median of a number's last samples, which removes single outliers and keeps edges sharp.
 
-    For an even number of samples it is the lower of the two in the middle, so the result is always a sample.
+    For an even number of samples it is the lower of the two middle ones, so the result is always one of the samples.
     """
 
     def __init__(self, length: int = 5) -> None:
@@ -129,20 +129,20 @@ class Median:
             length: Number of samples to keep; 1 or more.
 
         Raises:
-            UsageError: The length is not a whole number of at least 1.
+            UsageError: The length is not an integer of at least 1.
         """
         if isinstance(length, bool) or not isinstance(length, int) or length < 1:
             raise UsageError(f"length is {length!r} and must be a whole number of at least 1")
         self._samples: deque[float] = deque(maxlen=length)
 
     def step(self, sample: float) -> float:
-        """Add the next sample and return the median of those kept."""
+        """Add the next sample and return the median of the samples kept."""
         self._samples.append(sample)
         return sorted(self._samples)[(len(self._samples) - 1) // 2]
 
 
 def gain(time_constant_s: float, dt_s: float) -> float:
-    """Return the share of a step that a first-order filter follows within ``dt_s``: ``1 − exp(−dt/T)``."""
+    """Return the fraction of a step that a first-order filter follows within ``dt_s``: ``1 − exp(−dt/T)``."""
     if dt_s <= 0.0:
         return 0.0
     return -math.expm1(-dt_s / time_constant_s) if time_constant_s > 0.0 else 1.0

@@ -1,10 +1,10 @@
-"""Follow a marker at a distance, squarely in front of it, by camera; search for it while it is out of view.
+"""Follow a marker by camera at a distance, squarely in front of it, and search for it while it is out of view.
 
-The law is pure: sightings and feedback in, velocities out. Position-based visual servoing (Chaumette and Hutchinson,
-"Visual servo control, part I", IEEE RAM 13(4), 2006): the marker's pose is levelled by the attitude at the image's
-capture and placed by the vehicle's position at that time; a filter predicts it to when the command takes effect.
-The vehicle keeps its height and its distance along the line of sight, and moves around the marker when it sees it too
-much from the side.
+The law is pure and turns sightings and feedback into velocities. It is position-based visual servoing (Chaumette and
+Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006): the marker's pose is levelled by the attitude when
+the image was captured and placed using the vehicle's position at that time. A filter predicts it to the time when the
+command takes effect. The vehicle keeps its height and its distance along the line of sight, and moves around the
+marker if it sees it from too far to the side.
 """
 
 from __future__ import annotations
@@ -37,31 +37,31 @@ class Mode(StrEnum):
     """The phases of :class:`FollowLaw`."""
 
     SEARCHING = "searching"  #: turning on the spot at a series of heights
-    FOLLOWING = "following"  #: the marker was seen a moment ago
-    RECOVERING = "recovering"  #: lost: turning to the marker's predicted position
+    FOLLOWING = "following"  #: marker seen a moment ago
+    RECOVERING = "recovering"  #: marker lost: turning to its predicted position
 
 
 @dataclass(frozen=True, slots=True)
 class FollowSettings:
-    """Goal, gains and limits of :class:`FollowLaw`. The defaults suit a small indoor vehicle with velocity control."""
+    """Goals, gains and limits of :class:`FollowLaw`. The defaults suit a small indoor vehicle with velocity control."""
 
     distance_m: float = 1.5
-    lead_s: float = 0.12  #: from deciding a command until it takes effect
+    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
     range_gain: float = 1.1  #: [1/s]
     height_gain: float = 1.2  #: [1/s]
     yaw_gain: float = 2.2  #: [1/s]
-    #: Share of the velocity error added to the set-point: stiffens a soft velocity loop against gusts.
+    #: Fraction of the velocity error added to the set-point, which stiffens a soft velocity loop against gusts.
     velocity_gain: float = 0.7
-    aside_gain: float = 1.2  #: how fast to move around to the marker's front [1/s]
-    aside_rad: float = 0.3  #: closer to its station than this, the vehicle stays
-    speed_m_s: float = 1.2  #: greatest horizontal speed
+    aside_gain: float = 1.2  #: gain of moving around to the marker's front [1/s]
+    aside_rad: float = 0.3  #: the vehicle stays in place within this angle of its station
+    speed_m_s: float = 1.2  #: maximum horizontal speed
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
-    acceleration_m_s2: float = 2.0  #: limit of the set-point; harder acceleration tilts the camera off the marker
-    following_s: float = 0.35  #: counts as following for this long after the last sighting
+    acceleration_m_s2: float = 2.0  #: limit of the set-point; more acceleration would tilt the camera off the marker
+    following_s: float = 0.35  #: time after the last sighting that still counts as following
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
-    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: relative to the first, one per full turn
+    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: heights relative to the first one, one per full turn
     lowest_m: float = 0.6
     highest_m: float = 2.2
 
@@ -70,11 +70,11 @@ class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
-        mode: As of the last step.
-        station_rad: Wanted angle around the marker, from its normal, counter-clockwise from above.
+        mode: Phase at the last step.
+        station_rad: Wanted angle around the marker from its normal, counter-clockwise as seen from above.
         station_rate_rad_s: Rate of that angle.
-        off_m: Error of distance and height together, as of the last step; None while searching.
-        aside_rad: The vehicle's actual angle, as ``station_rad``; None while the marker's normal is unknown.
+        off_m: Combined error of distance and height at the last step; None while searching.
+        aside_rad: The vehicle's actual angle, measured like ``station_rad``; None while the marker's normal is unknown.
     """
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
@@ -83,13 +83,13 @@ class FollowLaw(VelocityLaw):
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
         self.mode = Mode.SEARCHING
-        #: Wanted angle around the marker, from its normal, counter-clockwise from above [rad], and its rate [rad/s].
+        #: Wanted angle around the marker from its normal, counter-clockwise from above [rad], and its rate [rad/s].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0
-        self.off_m: float | None = None  #: error of distance and height, as of the last step; None while searching
+        self.off_m: float | None = None  #: error of distance and height at the last step; None while searching
         self.aside_rad: float | None = None  #: the actual angle; None while the normal is unknown
         self._target = TargetFilter()
-        self._face: Array | None = None  # the marker's normal, horizontal part, odometry axes
+        self._face: Array | None = None  # horizontal part of the marker's normal, in odometry axes
         self._seen_ns: int | None = None
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
 
@@ -98,13 +98,13 @@ class FollowLaw(VelocityLaw):
         self._target, self._seen_ns = TargetFilter(), None
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting; ignore it while the vehicle's attitude or motion is unknown.
+        """Update with a sighting; ignore it if the vehicle's attitude or motion is unknown.
 
         Args:
-            position: The marker's centre in body axes at the capture, (3,) [m].
-            normal: Normal of its face in the same axes, (3,).
-            at_capture: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            position: The marker's centre in body axes at the time of capture, (3,) [m].
+            normal: Normal of the marker's face in the same axes, (3,).
+            at_capture: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
             trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
@@ -112,7 +112,7 @@ class FollowLaw(VelocityLaw):
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        # A corner error of a fixed fraction of a pixel causes a range error that grows with the range squared.
+        # A constant corner error in pixels causes a range error that grows with the square of the range.
         self._target.see(motion.position + to_level @ position, 0.015 + 0.01 * distance**2, captured_ns)
         face = (to_level @ normal)[:2]
         weight = 0.25 * trust
@@ -132,9 +132,9 @@ class FollowLaw(VelocityLaw):
         return wanted
 
     def _follow(self, own: Motion, unseen_s: float) -> Array:
-        """Return wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
+        """Return the wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
-        # Translation fades out within a second after the marker is lost; turning continues.
+        # Once the marker is lost, translation fades out within a second while turning continues.
         fade = within(1.0 - (unseen_s - s.following_s), 0.0, 1.0)
         place, speed = self._target.at(own.at_ns)
         speed = speed * fade
@@ -155,12 +155,12 @@ class FollowLaw(VelocityLaw):
         return np.array([*own.to_body(velocity[:2]), up, clamped(turn, s.turn_rad_s)])
 
     def _come_round(self, sight: Array, across: float) -> float:
-        """Return the speed [m/s] left of the line of sight that brings the vehicle to its station."""
+        """Return the speed [m/s] to the left of the line of sight that takes the vehicle to its station."""
         s = self.settings
-        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # faces up or down, or its estimate averaged out
+        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # faces up or down, or estimates averaged out
             self.aside_rad = None
             return 0.0
-        # From the direction marker-to-vehicle to the marker's normal, counter-clockwise.
+        # Angle from the marker-to-vehicle direction to the marker's normal, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)
@@ -176,16 +176,16 @@ class FollowLaw(VelocityLaw):
 
 
 class TargetFilter:
-    """Filter of the position and velocity of a point seen intermittently; restarts after a jump."""
+    """Filters the position and velocity of a point seen intermittently, and restarts after a jump."""
 
     def __init__(self) -> None:
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        """Update with a measured position; ignore one older than the last.
+        """Update with a measured position; ignore it if it is older than the last one.
 
-        The filter restarts after two seconds without a sighting, or when the target is more than a metre (and five
-        deviations) off.
+        The filter restarts after two seconds without a sighting, or if the target is more than a metre (and five
+        standard deviations) away from its prediction.
 
         Args:
             position: Shape (3,) [m].
@@ -203,13 +203,13 @@ class TargetFilter:
 
         Args:
             at_ns: The time to predict for.
-            longest_s: Longest extrapolation of the last estimate.
+            longest_s: Maximum time to extrapolate the last estimate.
 
         Returns:
             Position (3,) [m] and velocity (3,) [m/s].
 
         Raises:
-            UsageError: The target was never seen.
+            UsageError: The target has never been seen.
         """
         estimate = self._filter.at(at_ns, longest_s=longest_s)
         return estimate.position, estimate.velocity
@@ -232,21 +232,21 @@ _OTHER: Colour = (150, 150, 150)
 
 @dataclass(slots=True)
 class FollowScore:
-    """Quality of a pursuit, counted from the first sighting. Ranges are estimates, from the vehicle's centre."""
+    """Quality of a pursuit from the first sighting on. Ranges are estimates measured from the vehicle's centre."""
 
-    frames: int = 0  #: since the first sighting, inclusive
-    in_view: int = 0  #: those that showed the marker
-    frames_before: int = 0  #: before the first sighting
-    first_seen_ns: int | None = None  #: capture of the first frame that showed it
-    ranges: list[tuple[int, float]] = field(default_factory=list)  #: one per sighting: capture [ns], error [m]
+    frames: int = 0  #: number of frames since the first sighting, inclusive
+    in_view: int = 0  #: number of these frames that showed the marker
+    frames_before: int = 0  #: number of frames before the first sighting
+    first_seen_ns: int | None = None  #: capture time of the first frame that showed the marker
+    ranges: list[tuple[int, float]] = field(default_factory=list)  #: capture time [ns] and error [m] of each sighting
 
     @property
     def share_in_view(self) -> float | None:
-        """Share of the frames that showed the marker, 0 to 1; None if it was never seen."""
+        """Fraction of the frames that showed the marker, 0 to 1; None if it was never seen."""
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Return estimated minus wanted distance of each sighting, starting ``after_s`` after the first."""
+        """Return estimated minus wanted distance for each sighting, starting ``after_s`` after the first one."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
@@ -254,8 +254,8 @@ class FollowScore:
         """Count a frame.
 
         Args:
-            captured_ns: Capture of the frame.
-            range_error_m: Estimated minus wanted distance; None if the marker was not in the frame.
+            captured_ns: Capture time of the frame.
+            range_error_m: Estimated minus wanted distance; None if the frame did not show the marker.
         """
         if range_error_m is not None:
             if self.first_seen_ns is None:
@@ -271,7 +271,7 @@ class FollowScore:
 class FollowMarker(Behaviour):
     """Finds a marker and follows it. The vehicle must be airborne when :meth:`run` is called.
 
-    Annotates every frame with the markers seen.
+    Every frame is annotated with the markers in it.
 
     Attributes:
         marker_id: Id of the followed marker.
@@ -298,8 +298,8 @@ class FollowMarker(Behaviour):
             marker_id: Id of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults.
+            camera: Camera to use; None for the vehicle's first camera.
+            settings: Settings of the law; None for the defaults.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -318,12 +318,12 @@ class FollowMarker(Behaviour):
 
     @property
     def phase(self) -> Mode:
-        """The same as :attr:`mode`, under the name that all behaviours use."""
+        """Same as :attr:`mode`, under the name that all behaviours use."""
         return self.mode
 
     @property
     def distance_m(self) -> float:
-        """The wanted distance from the marker [m]."""
+        """Wanted distance from the marker [m]."""
         return self._follow_law.settings.distance_m
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -334,7 +334,7 @@ class FollowMarker(Behaviour):
         return self._drawing(frame, seen, mine)
 
     def _use(self, sighting: MarkerSighting, frame: Frame) -> float:
-        """Update the law; return estimated minus wanted distance [m]."""
+        """Update the law and return the estimated minus the wanted distance [m]."""
         place = sighting.position_in_body(self._mounting)
         if frame.feedback is not None:
             normal = sighting.normal_in_body(self._mounting)

@@ -1,7 +1,7 @@
-"""Formation shapes, the assignment of drones to positions, and a check of how far their flights stay apart. Pure.
+"""Formation shapes, assignment of drones to positions, and a check of how close flying drones come. Pure.
 
 A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on their mean.
-:func:`placed` puts it into world axes (ROS REP 103).
+:func:`placed` converts it to world axes (ROS REP 103).
 """
 
 from __future__ import annotations
@@ -20,60 +20,60 @@ from skyloop.messages.geometry import rotation_from_euler
 #: Positions of n drones, shape (n, 3), float64 [m].
 Places = NDArray[np.float64]
 
-MOST: Final = 200  #: largest number of positions for :func:`assign`
+MOST: Final = 200  #: maximum number of positions for :func:`assign`
 
 
 class Approach(NamedTuple):
-    """The closest approach of several drones.
+    """The closest approach between any two of several drones.
 
     Attributes:
-        distance_m: Distance of the two closest drones; infinite for fewer than two drones.
-        first: Index of one of them.
-        second: Index of the other.
+        distance_m: Distance between the two closest drones; infinite if there are fewer than two.
+        first: Index of one of the two drones.
+        second: Index of the other one.
     """
 
-    distance_m: float  #: infinite for fewer than two drones
+    distance_m: float  #: infinite if there are fewer than two drones
     first: int
     second: int
 
 
 def line(n: int, spacing_m: float) -> Places:
-    """Return a line abreast, the first drone at the left end.
+    """Return a line abreast with the first drone at the left end.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours.
 
     Raises:
-        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number greater than 0.
     """
     _check(n, spacing_m=spacing_m)
     return _centred([(0.0, -spacing_m * k, 0.0) for k in range(n)])
 
 
 def column(n: int, spacing_m: float) -> Places:
-    """Return a column, one drone behind the other, the first ahead.
+    """Return a column of drones behind one another, the first at the front.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours.
 
     Raises:
-        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number greater than 0.
     """
     _check(n, spacing_m=spacing_m)
     return _centred([(-spacing_m * k, 0.0, 0.0) for k in range(n)])
 
 
 def circle(n: int, spacing_m: float) -> Places:
-    """Return a circle, the first drone ahead and the others counter-clockwise after it.
+    """Return a circle with the first drone ahead and the others following counter-clockwise.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours, along the chord.
 
     Raises:
-        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number greater than 0.
     """
     _check(n, spacing_m=spacing_m)
     radius = spacing_m / (2 * math.sin(math.pi / n)) if n > 1 else 0.0
@@ -82,12 +82,12 @@ def circle(n: int, spacing_m: float) -> Places:
 
 
 def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
-    """Return a V like that of geese: the first drone ahead, the others behind it, alternately left and right.
+    """Return a V like that of geese: the first drone in front, the others behind it, alternately left and right.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours on one leg.
-        angle: Angle between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
+        angle: Angle between the legs [rad], π/3 to π; a smaller angle would bring the legs closer than the spacing.
 
     Raises:
         UsageError: An argument is out of its range.
@@ -101,12 +101,12 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
 
 
 def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
-    """Return a grid of rows, the first drone ahead and left.
+    """Return a grid of rows with the first drone in front on the left.
 
     Args:
         n: Number of drones.
         spacing_m: Distance between neighbours in a row and between rows.
-        columns: Drones in a row; None makes the grid as square as possible.
+        columns: Number of drones in a row; None makes the grid as square as possible.
 
     Raises:
         UsageError: An argument is out of its range.
@@ -123,8 +123,8 @@ def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
 
     Args:
         shape: Shape (n, 3) [m].
-        at: Position of its middle, (3,) in world axes [m].
-        yaw: Counter-clockwise about z [rad].
+        at: Position for the shape's middle, (3,) in world axes [m].
+        yaw: Rotation about z, counter-clockwise [rad].
 
     Raises:
         UsageError: The shape, the position or the yaw is not finite or has a wrong shape.
@@ -152,9 +152,9 @@ def places(values: ArrayLike) -> Places:
 
 
 def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
-    """Return the slot index of each start that minimises the sum of the squared distances.
+    """Return the slot index of each start for the assignment with the smallest sum of squared distances.
 
-    With that assignment, the straight paths of drones that leave and arrive together do not cross. The drones stay
+    With this assignment, the straight paths of drones that leave and arrive together do not cross. The drones stay
     apart by at least 1/√2 of the smallest distance between two starts or two slots (Turpin, Michael and Kumar, "CAPT",
     International Journal of Robotics Research 33, 2014).
 
@@ -163,7 +163,7 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
         slots: Shape (m, 3) [m], with m from n to :data:`MOST`.
 
     Raises:
-        UsageError: There are fewer slots than starts, too many slots, or coordinates that are not finite.
+        UsageError: There are fewer slots than starts, too many slots, or non-finite coordinates.
         MissingExtraError: SciPy is not installed (extra ``control``).
     """
     a, b = places(starts), places(slots)
@@ -202,18 +202,18 @@ def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
 def kept_apart(
     velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain: float = 1.0, *, fixed: int = 0
 ) -> Places:
-    """Change velocities so that drones closer than ``apart_m`` separate.
+    """Change velocities so that drones closer together than ``apart_m`` separate.
 
-    Along the line between two drones the distance is made to grow by ``gain`` times what is missing; each drone yields
-    half. A drone that meets one that does not yield makes the whole change, and approaches no faster than ``gain``
-    times the distance beyond ``apart_m``. Components across that line stay unchanged.
+    The distance between two such drones is made to grow by ``gain`` times the missing distance, with each drone
+    contributing half. A drone that meets one that doesn't yield makes the whole change, and approaches at no more than
+    ``gain`` times the distance beyond ``apart_m``. Components across the line between the drones are unchanged.
 
     Args:
         velocities: Shape (n, 3), world axes [m/s].
         positions: Shape (n, 3), world axes [m].
-        apart_m: The smallest allowed distance.
+        apart_m: The minimum allowed distance.
         gain: [1/s]
-        fixed: Number of drones at the end of the list that do not yield, because others fly them.
+        fixed: Number of drones at the end of the list that don't yield because others fly them.
 
     Returns:
         The changed velocities, shape (n, 3).
@@ -223,7 +223,7 @@ def kept_apart(
     """
     changed, at = places(velocities).copy(), places(positions)
     free = len(at) - fixed
-    # Drones that do not yield come last, so that no later change undoes the separation from them.
+    # Drones that do not yield come last, so that no later change can undo the separation from them.
     for j in range(1, len(at)):
         for i in range(min(j, free)):
             between = at[i] - at[j]

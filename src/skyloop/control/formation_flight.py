@@ -1,4 +1,4 @@
-"""Fly a swarm in formation by the world positions that its drones report."""
+"""Formation flight of a swarm, by the world positions that its drones report."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from skyloop.client import Swarm
     from skyloop.client.swarm import Tick
 
-MAX_AGE_S: Final = 1.0  #: greatest age of feedback used for steering
-SLACK_S: Final = 10.0  #: default allowance on top of a flight's planned time
-_PEAK: Final = 1.875  # peak speed over mean speed of a minimum-jerk trajectory
+MAX_AGE_S: Final = 1.0  #: maximum age of feedback used for steering
+SLACK_S: Final = 10.0  #: default time allowed beyond a flight's planned duration
+_PEAK: Final = 1.875  # ratio of peak to mean speed of a minimum-jerk trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,21 +36,21 @@ class FormationReport:
 
     seconds: float
     slots: dict[str, Vector]  #: planned final position of each drone, in world axes [m]
-    errors_m: dict[str, float]  #: each drone's distance from its slot
-    closest_m: float  #: smallest distance between any two drones; infinite for one drone
-    spread_s: float | None  #: longest time between the first and the last set-point of one tick
+    errors_m: dict[str, float]  #: distance of each drone from its slot
+    closest_m: float  #: smallest distance between any two drones; infinite for a single drone
+    spread_s: float | None  #: maximum time between the first and the last set-point of a tick
 
 
 class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
-    Each drone must be airborne and report position and yaw. Drones that fail on the way, for example with a position
-    unknown for half a second, are handled by the swarm's ``on_error`` policy. All others keep clear of them, and of
-    every drone of the swarm that this flight does not steer, at its last known position.
+    Each drone must be airborne and report position and yaw. The swarm's ``on_error`` policy handles drones that fail
+    during the flight, for example because their position is unknown for half a second. All other drones keep clear of a
+    failed drone's last known position, and of any drone in the swarm that this flight does not steer.
 
     Attributes:
         drones: The swarm.
-        apart_m: The smallest distance to keep between two drones.
+        apart_m: Minimum distance to keep between two drones.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class Formation:
         Args:
             drones: The swarm to fly.
             rate_hz: Rate of the set-points.
-            apart_m: The smallest distance between two drones: flights that would bring drones closer are refused, and
-                drones that come closer are steered apart.
-            settings: Gains, limits and acceptance radii; None are the defaults.
+            apart_m: Minimum distance between two drones: flights that would bring drones closer are refused, and drones
+                that come closer are steered apart.
+            settings: Gains, limits and acceptance radii; None for the defaults.
 
         Raises:
             UsageError: ``apart_m`` is negative or not finite.
@@ -71,7 +71,7 @@ class Formation:
         """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
-        assignment("a formation", "control")  # load SciPy, or fail, now and not in flight
+        assignment("a formation", "control")  # load SciPy now, so that a failure does not happen in flight
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz
@@ -80,7 +80,7 @@ class Formation:
         self._airframes = {name: Airframe(Part.POSITION, Part.YAW) for name in drones.names}
 
     def middle(self) -> Vector:
-        """Return the mean of the drones' positions, world axes [m].
+        """Return the mean of the drones' positions in world axes [m].
 
         Raises:
             UsageError: A drone does not report its position or is on the ground, or none is active.
@@ -90,21 +90,21 @@ class Formation:
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:
-        """Assign drones to slots and fly there in straight lines, leaving and arriving together; then hover.
+        """Assign drones to slots and fly there in straight lines, leaving and arriving together. Then hover.
 
         Args:
             slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
-            speed_m_s: Greatest speed of the drone with the longest path.
+            speed_m_s: Maximum speed of the drone with the longest path.
             yaw: Yaw of all drones [rad]; None leaves it free.
-            timeout_s: Drones not at their slot by then have failed; None allows ten seconds more than planned.
+            timeout_s: Time after which drones not at their slot have failed; None allows ten seconds more than planned.
 
         Returns:
-            The drones' final positions, and how close they came to each other.
+            The drones' final positions, and how close they came to one another.
 
         Raises:
             UsageError: A drone can't be flown by its position, two would come closer than ``apart_m``, or no drone is
                 active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
             raise UsageError(f"speed_m_s is {speed_m_s!r} and must be above 0 m/s")
@@ -130,14 +130,14 @@ class Formation:
         return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
 
     def hold(self, seconds: float) -> FormationReport:
-        """Keep each drone at its current position; then hover.
+        """Keep each drone at its current position, then hover.
 
         Args:
             seconds: Duration.
 
         Raises:
             UsageError: A drone can't be flown by its position, or none is active.
-            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
+            SwarmError: A drone failed, and the swarm's ``on_error`` is not to continue.
         """
         here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
@@ -155,19 +155,19 @@ class Formation:
         lead: Callable[[Tick], AnyAction] | None = None,
         turn: bool = True,
     ) -> FormationReport:
-        """Keep followers at offsets from a leader, feeding its velocity forward; then hover.
+        """Keep followers at offsets from a leader, feeding its velocity forward, then hover.
 
         Args:
             leader: The leader's name.
-            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False``
-                east, north and up of it.
+            offsets: Offset of each follower by name, (3,) [m]: ahead, left and up of the leader or, with
+                ``turn=False``, east, north and up of it.
             seconds: Duration.
-            lead: Returns the leader's action at each tick, sent together with the followers' set-points; None: another
-                client flies the leader.
+            lead: Returns the leader's action at each tick, sent with the followers' set-points; None if another client
+                flies the leader.
             turn: Whether offsets and yaw turn with the leader.
 
         Raises:
-            UnknownNameError: The swarm has no drone of that name.
+            UnknownNameError: The swarm has no drone with that name.
             UsageError: The leader is among the followers, a drone can't be flown by its position, or none is active.
             SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
                 followers hover and this call returns.
@@ -194,9 +194,9 @@ class Formation:
     # Internals -------------------------------------------------------------------------------------------------
 
     def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
-        """Return the newest state of the drones flown here, and the last known state of all others in the air.
+        """Return the newest state of the drones flown here, and the last known state of all other airborne drones.
 
-        A drone flown here whose position is no longer known has failed and joins the others.
+        A drone flown here whose position is no longer known has failed and is moved to the others.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -255,7 +255,7 @@ class Formation:
         *,
         also: Mapping[str, AnyAction] | None = None,
     ) -> None:
-        """Send each drone towards its goal, which moves by ``drift`` [m/s], and clear of the others."""
+        """Send each drone towards its goal, which moves by ``drift`` [m/s], while keeping clear of the others."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
         positions = _positions({**now, **others})
         wanted = [_in_world(towards[name], now[name]) + drift[name] for name in now]
@@ -281,7 +281,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """Wider acceptance radii, for drones that hover just after arrival."""
+        """Wider acceptance radii for drones that are hovering just after arrival."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -297,11 +297,11 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
     Args:
         leader: The leader's newest feedback.
-        offset: (3,) [m]: ahead, left and up of the leader, or with ``turn=False`` east, north and up.
+        offset: Offset (3,) [m]: ahead, left and up of the leader or, with ``turn=False``, east, north and up.
         turn: Whether the offset turns with the leader's yaw.
 
     Returns:
-        World axes [m], shape (3,).
+        The position in world axes [m], shape (3,).
 
     Raises:
         UsageError: The leader's position or yaw is unknown.
@@ -328,7 +328,7 @@ def _carried_on(airframe: Airframe) -> Feedback:
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
-    """Return distance and speed on a path of length 1 flown in time 1, at rest at both ends (Flash and Hogan 1985)."""
+    """Return distance and speed on a path of length 1 flown in time 1 from rest to rest (Flash and Hogan 1985)."""
     t = within(share, 0.0, 1.0)
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
 

@@ -1,10 +1,10 @@
-"""Fly through a gate, and find the shortest way around posts and gates. Pure: no clock, no thread.
+"""A law that flies through a gate, and the shortest way around posts and gates. Pure: no clock, no thread.
 
-Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006):
-sightings and feedback in, velocities out. The gate's position and axis are kept in odometry axes, where only the
-odometry's drift moves them. The vehicle moves onto the gate's axis while facing the opening, comes nearer as it gets
-better aligned, and flies through. It flies the last metre and a half by odometry, because there the gate is larger than
-the image.
+The law is position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4),
+2006) and turns sightings and feedback into velocities. The gate's position and axis are kept in odometry axes, where
+only the odometry's drift moves them. The vehicle moves onto the gate's axis while facing the opening, gets closer as it
+gets better aligned, and flies through. It flies the last metre and a half by odometry, because the gate is larger than
+the image there.
 
 The way around obstacles comes from a visibility graph of the ground plan (Lozano-Pérez and Wesley, "An algorithm for
 planning collision-free paths among polyhedral obstacles", Communications of the ACM 22(10), 1979) over points around
@@ -33,19 +33,19 @@ from skyloop.messages.geometry import wrap_angle
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 
-_AROUND = 8  # graph points around each end of a wall
-_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor at which the lines between those points stay clear
-_WITHIN_M = 0.02  # how much nearer to a wall than the start the way may come
+_AROUND = 8  # number of graph points around each end of a wall
+_OUTSIDE = 1.0 / math.cos(math.pi / _AROUND) + 0.01  # radius factor that keeps the lines between these points clear
+_WITHIN_M = 0.02  # margin by which the way may come closer to a wall than its start
 
 
 class GatePhase(StrEnum):
     """The phases of :class:`GateLaw`."""
 
     SEARCHING = "searching for the gate"  #: turning on the spot at a series of heights
-    ALIGNING = "moving onto the gate's axis"  #: the gate was seen a moment ago
+    ALIGNING = "moving onto the gate's axis"  #: gate seen a moment ago
     RECOVERING = "lost the gate: holding position, turning towards it"
-    GOING = "flying to the gate"  #: by the map, or by a sighting
-    PASSING = "flying through"  #: aligned and near; the rest is flown by odometry
+    GOING = "flying to the gate"  #: flying by the map or by a sighting
+    PASSING = "flying through"  #: aligned and close; the rest is flown by odometry
     PASSED = "through"
 
 
@@ -56,11 +56,11 @@ class GateSettings:
     The defaults suit a small indoor vehicle and openings of about a metre.
     """
 
-    lead_s: float = 0.12  #: from deciding a command until it takes effect
-    #: Share of the velocity error added to the set-point: stiffens a soft velocity loop against gusts.
+    lead_s: float = 0.12  #: time from deciding on a command until it takes effect
+    #: Fraction of the velocity error added to the set-point, which stiffens a soft velocity loop against gusts.
     velocity_gain: float = 1.0
-    speed_m_s: float = 1.1  #: greatest horizontal speed
-    cruise_m_s: float = 0.8  #: speed through the gate, and greatest speed towards it
+    speed_m_s: float = 1.1  #: maximum horizontal speed
+    cruise_m_s: float = 0.8  #: speed through the gate, and maximum speed towards it
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.4
     acceleration_m_s2: float = 2.0
@@ -68,11 +68,11 @@ class GateSettings:
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
     stand_m: float = 1.7  #: distance in front of the gate at which the vehicle must be aligned
-    aligned_m: float = 0.15  #: largest offset from the axis, sideways and in height
-    aligned_rad: float = 0.25  #: largest heading error
-    cone: float = 0.3  #: additional offset allowed per metre in front of that
+    aligned_m: float = 0.15  #: maximum offset from the axis, sideways and in height
+    aligned_rad: float = 0.25  #: maximum heading error
+    cone: float = 0.3  #: additional offset allowed per metre in front of `stand_m`
     beyond_m: float = 0.7  #: distance behind the gate at which it counts as passed
-    fresh_s: float = 0.4  #: continue without a sighting for this long
+    fresh_s: float = 0.4  #: time to continue without a sighting
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
     search_heights_m: tuple[float, ...] = (0.0, 0.5, -0.4)
@@ -83,8 +83,8 @@ class GateSettings:
 class Axis(NamedTuple):
     """The vehicle's position in the gate's axes."""
 
-    along_m: float  #: in the direction of flight; negative in front of the gate
-    aside_m: float  #: to the left of the axis
+    along_m: float  #: position in the direction of flight; negative in front of the gate
+    aside_m: float  #: distance to the left of the axis
     above_m: float
 
 
@@ -92,8 +92,8 @@ class GateLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
 
     Attributes:
-        phase: As of the last step.
-        axis: The vehicle's position, as of the last step; None while the gate's is unknown.
+        phase: Phase at the last step.
+        axis: The vehicle's position at the last step; None while the gate's position is unknown.
     """
 
     def __init__(self, settings: GateSettings | None = None) -> None:
@@ -101,14 +101,14 @@ class GateLaw(VelocityLaw):
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = GatePhase.SEARCHING
-        self.axis: Axis | None = None  #: as of the last step
+        self.axis: Axis | None = None  #: the vehicle's position at the last step
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._gate = _new_filter()
         self._way: Array | None = None  # direction through the gate, horizontal unit vector
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
-        """Forget the gate and search for another.
+        """Forget the gate and search for the next one.
 
         Args:
             turning: Direction to search first; positive is counter-clockwise.
@@ -118,7 +118,7 @@ class GateLaw(VelocityLaw):
         self._search.restart(turning=turning)
 
     def forget(self) -> None:
-        """Forget where the gate is, unless it is passed."""
+        """Forget where the gate is, unless the vehicle has passed it."""
         if self.phase is not GatePhase.PASSED:
             self.phase = GatePhase.SEARCHING
         self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None
@@ -126,13 +126,13 @@ class GateLaw(VelocityLaw):
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
 
-        Ignore it while the vehicle's attitude or motion is unknown, or if it is far from earlier sightings of the gate.
+        It is ignored if the vehicle's attitude or motion is unknown, or if it is far from the gate's earlier sightings.
 
         Args:
             position: The opening's centre in body axes, (3,) [m].
             normal: Normal of the visible side, in body axes, (3,).
-            at_capture: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            at_capture: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
             trust: Confidence in the normal, 0 to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
@@ -186,7 +186,7 @@ class GateLaw(VelocityLaw):
         if self.phase is GatePhase.PASSED or axis.along_m > s.beyond_m:
             return GatePhase.PASSED
         if self.phase is GatePhase.PASSING:
-            # Odometry is only good for the few seconds that this takes.
+            # Odometry is only accurate for the few seconds that this takes.
             late = unseen_s > 2.0 * (s.stand_m + s.beyond_m) / s.cruise_m_s
             return GatePhase.RECOVERING if late else GatePhase.PASSING
         if unseen_s > s.recovering_s:
@@ -198,7 +198,7 @@ class GateLaw(VelocityLaw):
         return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
 
     def _approach(self, axis: Axis) -> float:
-        """Return the speed along the axis while aligning [m/s]: towards the gate only within the cone."""
+        """Return the speed along the axis while aligning [m/s], which is towards the gate only within the cone."""
         s = self.settings
         left_m = -s.stand_m - axis.along_m
         if left_m < 0.0:
@@ -209,12 +209,12 @@ class GateLaw(VelocityLaw):
 
 
 def _new_filter() -> ConstantVelocityFilter:
-    """Create a filter for a fixed point in axes that drift by some centimetres a second."""
+    """Create a filter for a point that is fixed in axes drifting by some centimetres per second."""
     return ConstantVelocityFilter(3, intensity_m2_s3=0.002, speed_m_s=0.03, gate=6.0)
 
 
 class Wall(NamedTuple):
-    """An obstacle: all points within ``reach_m`` of a line, or of a point if both ends are equal."""
+    """An obstacle: all points within ``reach_m`` of a line segment, or of a point if both ends are equal."""
 
     begin: Point
     end: Point
@@ -222,14 +222,14 @@ class Wall(NamedTuple):
 
 
 def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | None:
-    """Return the points of the shortest way, without the start but with the goal; None if there is none.
+    """Return the points of the shortest way, excluding the start but including the goal; None if there is no way.
 
-    A start or goal too near to a wall is allowed, but the way comes no nearer to that wall.
+    The start or goal may be too close to a wall, but the way comes no closer to that wall.
 
     Args:
         start: East, north [m].
         goal: East, north [m].
-        walls: At most a few dozen: the effort grows with the cube of the number.
+        walls: Obstacles, at most a few dozen, because the effort grows with the cube of their number.
     """
     ends = np.array([[wall.begin, wall.end] for wall in walls], dtype=np.float64).reshape(-1, 2, 2)
     reach = np.array([wall.reach_m for wall in walls], dtype=np.float64)
@@ -246,7 +246,7 @@ def detour(start: Point, goal: Point, walls: Sequence[Wall]) -> list[Point] | No
 
 
 def _corners(ends: Array, reach: Array) -> list[Array]:
-    """Return points around both ends of each wall, (n, 2) each."""
+    """Return the points around both ends of each wall, (n, 2) each."""
     turns = np.arange(_AROUND) * (2 * math.pi / _AROUND)
     circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
     corners = []
@@ -257,7 +257,7 @@ def _corners(ends: Array, reach: Array) -> list[Array]:
 
 
 def _shortest(points: Array, lengths: Array) -> list[Point] | None:
-    """Return the way from the first point to the second."""
+    """Return the shortest way from the first point to the second."""
     best, came = {0: 0.0}, {0: 0}
     queue = [(0.0, 0)]
     while queue:
@@ -278,7 +278,7 @@ def _shortest(points: Array, lengths: Array) -> list[Point] | None:
 
 
 def _distances(begin: Array, end: Array, walls: Array) -> Array:
-    """Return the distance of each segment (n, 2) to (n, 2) from each wall (m, 2, 2), shape (n, m)."""
+    """Return the distance between each segment, (n, 2) to (n, 2), and each wall, (m, 2, 2), as shape (n, m)."""
     a, b = begin[:, None], end[:, None]
     c, d = walls[None, :, 0], walls[None, :, 1]
     apart = np.minimum(

@@ -1,4 +1,4 @@
-"""Fly through a series of gates of known colours and sizes."""
+"""A behaviour that flies through a series of gates of known colours and sizes."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _SEEN: Colour = (64, 220, 100)
 
 @dataclass(frozen=True, slots=True)
 class GateKind:
-    """The appearance of one gate of a course."""
+    """The appearance of a gate on a course."""
 
     name: str
     colour: tuple[int, int, int]  #: red, green, blue, 0 to 255
     inner_size_m: tuple[float, float] = (1.2, 1.2)  #: width and height of the opening
-    turning: float = 1.0  #: which way to turn first if it is out of view: positive is left, negative is right
+    turning: float = 1.0  #: direction to turn first if the gate is out of view: positive for left, negative for right
 
 
 #: The course of the world ``gates``.
@@ -48,15 +48,15 @@ FIVE_GATES = (
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A course with a map of its gates and poles: x, y, z [m], yaw as the vehicle's own.
+    """A course with a map of its gates and poles: x, y, z [m], and yaw in the vehicle's own convention.
 
     Attributes:
         gates: Gates in order.
-        places: Places of the gates.
+        places: Positions of the gates.
         poles: Other obstacles.
         pole_colour: Red, green, blue, 0 to 255; None if the camera can't recognise poles by their colour.
         start: Take-off position, x and y.
-        map_m: Standard deviation of these places [m].
+        map_m: Standard deviation of the positions [m].
     """
 
     gates: tuple[GateKind, ...]
@@ -78,7 +78,7 @@ RACE_GATES = (
     GateKind("gate 3", (57, 181, 74)),
     GateKind("gate 4", (194, 63, 180)),
 )
-RACE_POLES = (208, 31, 31)  #: the colour of their poles
+RACE_POLES = (208, 31, 31)  #: colour of the poles in these worlds
 #: The track of the worlds ``race0`` and ``race1``. In ``race2`` everything is displaced by up to 0.45 m.
 RACE_TRACK = Course(
     RACE_GATES,
@@ -95,14 +95,14 @@ RACE_TRACK = Course(
 
 
 def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -> Course:
-    """Build a course from a simulated world's map: its gates by name, its first start, its poles.
+    """Build a course from a simulated world's map, from its gates by name, its first start and its poles.
 
     Args:
-        geometry: From a simulated drone's parameter ``world.geometry``.
-        gates: The gates of the course, in order, named as in the world.
+        geometry: The world's map, from a simulated drone's parameter ``world.geometry``.
+        gates: The gates of the course, in order, with the names they have in the world.
 
     Raises:
-        UsageError: The world has no such gate, or no start.
+        UsageError: The world lacks one of the gates, or has no start.
     """
     openings = {opening.name: opening for opening in geometry.gates}
     if missing := [gate.name for gate in gates if gate.name not in openings]:
@@ -120,14 +120,14 @@ def course_in(geometry: WorldGeometry, gates: Sequence[GateKind] = RACE_GATES) -
 
 
 class FlyThroughGates(Behaviour):
-    """Flies through a series of gates of known colours and hovers behind the last.
+    """Flies through a series of gates of known colours and hovers behind the last one.
 
-    With a :class:`Course` it flies by the map, corrected by the camera's sightings: to the front of each gate, around
-    poles and other gates, and through in the gate's direction. If a gate stays out of sight it hovers and ends with a
-    warning.
+    With a :class:`Course`, it flies by the map, corrected by the camera's sightings: to the front of each gate, around
+    poles and other gates, and through in the gate's direction. If a gate stays out of sight, the vehicle hovers and the
+    behaviour ends with a warning.
 
-    Gates are found by colour. After losing a gate, the vehicle holds its position, turns to the gate's expected
-    direction, then searches for it again. The vehicle must be airborne when :meth:`run` is called.
+    Gates are found by colour. After losing a gate, the vehicle holds its position, turns to where it expects the gate,
+    then searches for it again. The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         passed: Number of gates flown through.
@@ -149,11 +149,11 @@ class FlyThroughGates(Behaviour):
         Args:
             drone: The drone to fly.
             gates: The gates in order, or a course with a map.
-            camera: Camera to use; None is the vehicle's first camera.
-            settings: :class:`CourseSettings` with a map, else :class:`GateSettings`; None are the defaults.
+            camera: Camera to use; None for the vehicle's first camera.
+            settings: :class:`CourseSettings` with a map, otherwise :class:`GateSettings`; None for the defaults.
 
         Raises:
-            UsageError: There is no gate, a colour has no hue, or the settings belong to the other law.
+            UsageError: There are no gates, a colour has no hue, or the settings are for the other law.
             UnknownNameError: The vehicle has no such camera.
             MissingExtraError: OpenCV is not installed.
         """
@@ -184,11 +184,11 @@ class FlyThroughGates(Behaviour):
 
     @property
     def gate(self) -> GateKind | None:
-        """The next gate; None after the last."""
+        """The next gate; None after the last one."""
         return self._gates[self.passed] if self.passed < len(self._gates) else None
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the nearest gate of the next colour, and update the law."""
+        """Detect the nearest gate of the next colour and update the law."""
         if self.phase is GatePhase.PASSED:
             self._next()
         gate = self.gate

@@ -1,7 +1,7 @@
-"""Hold a position by images alone: in front of a marker, or over the ground without known position and velocity.
+"""Behaviours that hold a position by images alone: in front of a marker, or over the ground without other positioning.
 
-The marker is approached by image-based visual servoing (:mod:`skyloop.control.interaction`); over the ground, optical
-flow measures the drift, and attitude set-points counter it.
+The marker is approached by image-based visual servoing (:mod:`skyloop.control.interaction`). Over the ground, optical
+flow measures the drift, and attitude set-points counteract it.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ class ServoSettings:
     """Gain and limits of :class:`ImageServoLaw`.
 
     Raises:
-        UsageError: A number is not finite and above 0.
+        UsageError: A number is not finite and greater than 0.
     """
 
     gain: float = 0.8  #: [1/s]
-    #: Share of the velocity error, if the velocity is known, added to the set-point against gusts.
+    #: Fraction of the velocity error (if the velocity is known) that is added to the set-point against gusts.
     velocity_gain: float = 1.0
     speed_m_s: float = 0.8
     climb_m_s: float = 0.5
     turn_rad_s: float = 1.0
     acceleration_m_s2: float = 2.0
-    fresh_s: float = 0.3  #: continue without a sighting for this long
+    fresh_s: float = 0.3  #: time to continue without a sighting
     holding_s: float = 2.0
     search_rad_s: float = 0.7
 
@@ -80,8 +80,8 @@ class ImageServoLaw(VelocityLaw):
     """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns].
 
     Attributes:
-        phase: As of the last step.
-        error: Root mean square distance of the points from their wanted places, in the plane at z = 1.
+        phase: Phase at the last step.
+        error: Root mean square distance between the points and their wanted positions, in the plane at z = 1.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class ImageServoLaw(VelocityLaw):
         """Initialise the law.
 
         Args:
-            camera: The camera, with its mounting.
-            wanted: Wanted places of the points in the level camera, (n, 2) in the plane at z = 1.
-            depth_m: Distance of the points from the camera at the goal.
-            settings: None are the defaults.
+            camera: The camera, including its mounting.
+            wanted: Wanted positions of the points in the level camera, (n, 2) in the plane at z = 1.
+            depth_m: Distance between the points and the camera at the goal.
+            settings: Settings of the law; None for the defaults.
 
         Raises:
             UsageError: The camera's mounting is unknown.
@@ -105,7 +105,7 @@ class ImageServoLaw(VelocityLaw):
         )
         super().__init__(limits, Part.ATTITUDE)
         self.phase = ServoPhase.SEARCHING
-        self.error = math.inf  #: root mean square distance of the points from their wanted places, plane at z = 1
+        self.error = math.inf  #: RMS distance between the points and their wanted positions, plane at z = 1
         self._camera = camera
         self._wanted = np.asarray(wanted, np.float64)
         self._depth_m = depth_m
@@ -114,15 +114,15 @@ class ImageServoLaw(VelocityLaw):
         self._search = TurningSearch(s.search_rad_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the points of a frame.
+        """Update with the points from a frame.
 
-        Ignored, as if nothing was seen, while the attitude is unknown, and if the vehicle is tilted so far that a level
-        camera would not see the points. The depth of all points is estimated from their apparent size.
+        They are ignored, as if nothing were seen, if the attitude is unknown or the vehicle is tilted so far that a
+        level camera would not see them. The depth of all points is estimated from their apparent size.
 
         Args:
             points: The points as the camera saw them, (n, 2) in the plane at z = 1.
-            at_capture: Feedback with the attitude at the capture.
-            captured_ns: Capture of the frame.
+            at_capture: Feedback with the attitude at the time of capture.
+            captured_ns: Capture time of the frame.
         """
         self.airframe.add(at_capture)
         roll, pitch = at_capture.roll_rad, at_capture.pitch_rad
@@ -133,7 +133,7 @@ class ImageServoLaw(VelocityLaw):
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
-        # Averaging the depths now and at the goal keeps large motions straight (their equation 14).
+        # Averaging depths now and at the goal keeps large motions straight (Chaumette and Hutchinson, equation 14).
         now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))
         depths = np.full(len(level), (now_m + self._depth_m) / 2)
         self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
@@ -159,9 +159,9 @@ class ImageServoLaw(VelocityLaw):
 
 
 class ImageServo(Behaviour):
-    """Flies to where a marker looks as it would from ``distance_m`` straight in front of it, and holds that position.
+    """Flies to where a marker looks as it does from ``distance_m`` straight in front of it, and holds that position.
 
-    Works in the image alone; the marker's size serves only to compute the wanted image. Runs until stopped.
+    Works purely in the image; the marker's size is only used to compute the wanted image. Runs until stopped.
     """
 
     name = "servo"
@@ -183,14 +183,14 @@ class ImageServo(Behaviour):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             marker_id: Id of the marker.
-            distance_m: Wanted distance, straight in front of the marker.
+            distance_m: Wanted distance straight in front of the marker.
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
-            camera: A camera that looks forward; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults.
+            camera: A camera that looks forward; None for the vehicle's first camera.
+            settings: Settings of the law; None for the defaults.
 
         Raises:
-            UsageError: The distance is not a finite number above 0, or the camera does not look forward.
+            UsageError: The distance is not a finite number greater than 0, or the camera does not look forward.
             UnknownNameError: There is no such camera or dictionary.
             MissingExtraError: OpenCV is not installed.
         """
@@ -213,7 +213,7 @@ class ImageServo(Behaviour):
 
     @property
     def error_px(self) -> float:
-        """Root mean square distance of the corners from their wanted places; infinite before the first sighting."""
+        """RMS distance between the corners and their wanted positions [px]; infinite before the first sighting."""
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -235,7 +235,7 @@ class ImageServo(Behaviour):
 
 
 def _size(points: Array) -> float:
-    """Return the apparent size of points: the root mean square distance from their middle."""
+    """Return the points' apparent size: the root mean square distance from their middle."""
     return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
@@ -261,8 +261,8 @@ class FlowSettings:
     tilt_rad: float = 0.2
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.12  #: from a set-point's decision until it takes effect
-    fresh_s: float = 0.3  #: continue without a sighting of the ground for this long
+    lead_s: float = 0.12  #: time from deciding on a set-point until it takes effect
+    fresh_s: float = 0.3  #: time to continue without sight of the ground
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -283,12 +283,12 @@ class _Kept:
 class FlowLaw(AirframeLaw):
     """Computes attitudes from horizontal positions. Pure: times are on the proxy's clock [ns].
 
-    One PID per axis: acceleration from position, velocity and the integral of the position. The velocity comes from a
-    constant-velocity filter of the positions, not from the vehicle.
+    There is one PID controller per axis: acceleration from the position, its integral and the velocity. The velocity
+    comes from a constant-velocity filter over the positions, not from the vehicle.
 
     Attributes:
-        phase: As of the last step.
-        off_m: Estimated distance from the position to hold; None while unknown.
+        phase: Phase at the last step.
+        off_m: Estimated distance from the position to hold; None if unknown.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
@@ -296,23 +296,23 @@ class FlowLaw(AirframeLaw):
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING
-        self.off_m: float | None = None  #: estimated distance from the position to hold; None while unknown
+        self.off_m: float | None = None  #: estimated distance from the position to hold; None if unknown
         self._loop = VectorPi(Gains(p=s.gain, i=s.integral), 2, most=0.5 * s.tilt_rad * GRAVITY_M_S2)
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
         self._kept: _Kept | None = None
         self._seen_ns: int | None = None
 
     def pause(self) -> None:
-        """Restart without an integral."""
+        """Restart with the integral at zero."""
         super().pause()
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position; the first one, and the first after a second without, becomes the one to hold.
+        """Update with a position. The first one, or the first after a second without any, becomes the position to hold.
 
         Args:
-            place: The vehicle's position at the capture, (2,) [m], along yaw 0 and to its left.
-            captured_ns: Capture of the frame.
+            place: The vehicle's position at the time of capture, (2,) [m], along yaw 0 and to its left.
+            captured_ns: Capture time of the frame.
         """
         newest, altitude = self.airframe.feedback, self.airframe.altitude_m(captured_ns)
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():
@@ -325,7 +325,7 @@ class FlowLaw(AirframeLaw):
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """Compute the set-point for now; level, without braking, while the position is unknown."""
+        """Compute the set-point for now. While the position is unknown it is level, which doesn't brake."""
         s, ready, newest = self.settings, self._ready(now_ns), self.airframe.feedback
         if self._seen_ns is not None and not_ahead(self._seen_ns, now_ns) is None:
             self._seen_ns, self.phase, self.off_m = None, FlowPhase.LOST, None
@@ -353,11 +353,11 @@ class FlowLaw(AirframeLaw):
 
 
 class FlowHover(Behaviour):
-    """Holds the position, height and yaw at which it first saw the ground, by a camera that looks down.
+    """Holds the position, height and yaw at which it first saw the ground, using a camera that looks down.
 
-    Needs the vehicle's attitude and height, uses nothing else of its feedback, and flies by attitude. Without sight of
-    the ground the vehicle hovers by its own means, perhaps drifting, and a warning is emitted; the behaviour then
-    holds the position at which it sees the ground again.
+    Needs the vehicle's attitude and height, uses nothing else from its feedback, and flies by attitude. Without sight
+    of the ground, the vehicle only hovers and may drift, and a warning event is published. The behaviour
+    then holds the position at which it sees the ground again.
     """
 
     name = "flow hover"
@@ -369,7 +369,7 @@ class FlowHover(Behaviour):
         Args:
             drone: The drone to fly; it must be airborne when :meth:`run` is called.
             camera: A camera that looks down.
-            settings: Settings of the law; None are the defaults.
+            settings: Settings of the law; None for the defaults.
 
         Raises:
             UnknownNameError: The vehicle has no such camera.
@@ -389,11 +389,11 @@ class FlowHover(Behaviour):
 
     @property
     def off_m(self) -> float | None:
-        """Estimated distance from the position to hold [m]; None while unknown."""
+        """Estimated distance from the position to hold [m]; None if unknown."""
         return self._flow_law.off_m
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point; hover instead while the ground is out of view (the phase's event reports it)."""
+        """Send the set-point, but hover instead while the ground is out of view (the phase's event reports it)."""
         if self.phase is FlowPhase.HOLDING:
             super().steer(wanted)
         else:

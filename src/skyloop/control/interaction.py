@@ -1,12 +1,12 @@
-"""Image-based visual servoing of points: interaction matrix, level camera, four degrees of freedom. Pure.
+"""Image-based visual servoing with points: interaction matrix, level camera, four degrees of freedom. Pure.
 
-Chaumette and Hutchinson, "Visual servo control, part I: basic approaches", IEEE Robotics & Automation Magazine 13(4),
-2006; equation numbers below are theirs. Camera axes are optical: x right, y down, z forward. Points are the
-intersections of their rays with the plane at z = 1, shape (n, 2). A multirotor must tilt to fly, which shifts even
-fixed points in the image. Points are therefore first turned into the image of a *virtual level camera* that has the
-vehicle's yaw but not its roll and pitch (Jabbari, Oriolo and Bolandi, "An adaptive scheme for image-based visual
-servoing of an underactuated UAV", Int. J. Robotics and Automation 29(1), 2014), and the twist is restricted to the
-levelled vehicle's motions: forward, left, up and yaw.
+The method is that of Chaumette and Hutchinson, "Visual servo control, part I: basic approaches", IEEE Robotics &
+Automation Magazine 13(4), 2006, whose equation numbers are given below. Camera axes are optical: x right, y down, z
+forward. Points are the intersections of their rays with the plane at z = 1, shape (n, 2). A multirotor must tilt to
+fly, which shifts even fixed points in the image. Points are therefore first converted to the image of a *virtual level
+camera* that has the vehicle's yaw but not its roll and pitch (Jabbari, Oriolo and Bolandi, "An adaptive scheme for
+image-based visual servoing of an underactuated UAV", Int. J. Robotics and Automation 29(1), 2014), and the twist is
+restricted to motions of the levelled vehicle: forward, left, up and yaw.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ Array = NDArray[np.float64]
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:
-    """Return the interaction matrix (2n, 6) of points: their image motion per camera twist, equation 11.
+    """Return the interaction matrix (2n, 6) of points, which is their image motion per camera twist (equation 11).
 
-    The twist is velocity [m/s] and angular velocity [rad/s] of the camera along and about its own axes, (6,); the rows
+    The twist is the camera's velocity [m/s] and angular velocity [rad/s] along and about its own axes, (6,). The rows
     are x and y of each point in turn.
 
     Args:
         points: Shape (n, 2).
-        depths_m: Shape (n,), above 0.
+        depths_m: Shape (n,), greater than 0.
 
     Raises:
         UsageError: A shape is wrong, or a number is out of its range.
@@ -47,10 +47,10 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 
 
 def camera_twist(camera: CameraInfo) -> Array:
-    """Return the matrix (6, 4) from the levelled vehicle's motion to the twist of a level camera.
+    """Return the matrix (6, 4) that converts the levelled vehicle's motion to the twist of a level camera.
 
-    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's place in the body matters: a camera
-    mounted ahead of the centre swings when the vehicle turns.
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's position in the body matters, because a
+    camera mounted ahead of the centre swings when the vehicle turns.
 
     Raises:
         UsageError: The camera's mounting is unknown.
@@ -66,11 +66,11 @@ def camera_twist(camera: CameraInfo) -> Array:
 
 
 def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
-    """Return the points as a level camera would see them, (n, 2).
+    """Return the points (n, 2) as a level camera would see them.
 
     Args:
         points: The points as the camera sees them, (n, 2).
-        camera: The camera, with its mounting.
+        camera: The camera, including its mounting.
         roll: Roll of the vehicle [rad].
         pitch: Pitch of the vehicle [rad].
 
@@ -86,15 +86,15 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Compute the motion that brings the level camera's points exponentially to their wanted places.
+    """Compute the motion that brings the level camera's points to their wanted positions at an exponential rate.
 
-    ``-gain · (L·T)⁺ · e`` (equation 5, with T of :func:`camera_twist`).
+    The result is ``-gain · (L·T)⁺ · e`` (equation 5, with T from :func:`camera_twist`).
 
     Args:
-        points: The points in the level camera, (n, 2), two or more.
-        wanted: Their wanted places, (n, 2).
-        depths_m: Shape (n,), above 0.
-        camera: The camera, with its mounting.
+        points: Two or more points in the level camera, (n, 2).
+        wanted: Wanted positions of the points, (n, 2).
+        depths_m: Depths of the points, shape (n,), greater than 0.
+        camera: The camera, including its mounting.
         gain: [1/s]
 
     Returns:

@@ -1,11 +1,11 @@
-"""Kalman filters of points seen intermittently. Pure. Times are nanoseconds on one clock.
+"""Kalman filters for points seen intermittently. Pure. Times are nanoseconds on one clock.
 
-:class:`ConstantVelocityFilter` assumes straight motion, in any number of dimensions. :class:`TurningTargetFilter` also
-turns and speeds up, as a platform on wheels does: its horizontal state is (x, y, vx, vy, ω, ax, ay), a coordinated turn
-with an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
-Wiley 2001, section 11.7) plus an acceleration that fades (Singer, "Estimating Optimal Tracking Filter Performance for
-Manned Maneuvering Targets", IEEE T-AES 6(4), 1970). The turn explains fast motion on a curve and is predicted to
-continue; the acceleration explains slow motion. A separate filter tracks the height.
+:class:`ConstantVelocityFilter` assumes straight motion in any number of dimensions. :class:`TurningTargetFilter` also
+models turning and speeding up, as by a platform on wheels: its horizontal state is (x, y, vx, vy, ω, ax, ay), a
+coordinated turn with an unknown turn rate (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking
+and Navigation", Wiley 2001, section 11.7) plus an acceleration that fades (Singer, "Estimating Optimal Tracking Filter
+Performance for Manned Maneuvering Targets", IEEE T-AES 6(4), 1970). The turn explains fast motion on a curve and is
+predicted to continue; the acceleration explains slow motion. A separate filter tracks the height.
 """
 
 from __future__ import annotations
@@ -24,42 +24,42 @@ from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
-#: Added to an innovation's variance, so that a nearly exact state does not cause a division by zero.
+#: Added to an innovation's variance so that a nearly exact state does not cause a division by zero.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
 _SEEN = np.eye(2, 7)  # the measured part of the state
-_STEP_S = 0.1  # longest step of a prediction; within a step the acceleration keeps its direction
-_STRAIGHT_RAD = 1e-4  # below this angle the transition uses its series expansion
-_HEIGHT_INTENSITY_M2_S3 = 0.01  # random acceleration of the height
+_STEP_S = 0.1  # maximum time step of a prediction; the acceleration keeps its direction within a step
+_STRAIGHT_RAD = 1e-4  # angle below which the transition uses its series expansion
+_HEIGHT_INTENSITY_M2_S3 = 0.01  # intensity of the random vertical acceleration
 _CLIMB_M_S = 0.3  # initial standard deviation of the vertical velocity
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Position and velocity of a point at one time, and their covariance."""
+    """A point's position and velocity at a time, with their covariance."""
 
     at_ns: int
-    position: Array  #: (n,) [m]
-    velocity: Array  #: (n,) [m/s]
-    covariance: Array  #: (2n, 2n) of position and velocity, in that order [m², m²/s, m²/s²]
+    position: Array  #: position, (n,) [m]
+    velocity: Array  #: velocity, (n,) [m/s]
+    covariance: Array  #: covariance of position and velocity, in that order, (2n, 2n) [m², m²/s, m²/s²]
 
     @property
     def deviation_m(self) -> float:
-        """Standard deviation of the position: the root of its summed variances."""
+        """Standard deviation of the position: the root of the sum of its variances."""
         n = len(self.position)
         return math.sqrt(float(np.trace(self.covariance[:n, :n])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TurnEstimate:
-    """Motion of a point at one time.
+    """A point's motion at a time.
 
     Attributes:
-        at_ns: The time.
-        position: (3,) [m].
-        velocity: (3,) [m/s].
+        at_ns: Time of the estimate.
+        position: Position, (3,) [m].
+        velocity: Velocity, (3,) [m/s].
         turn_rate: Turn rate of the horizontal velocity, counter-clockwise from above [rad/s].
-        extra: Horizontal acceleration on top of the turn's, (2,) [m/s²].
+        extra: Horizontal acceleration in addition to the turn's, (2,) [m/s²].
         covariance: Covariance of x, y, their velocities, the turn rate and the extra acceleration, (7, 7).
     """
 
@@ -77,7 +77,7 @@ class TurnEstimate:
 
     @property
     def turning_rad_s(self) -> float:
-        """Turn rate of the horizontal velocity by both accelerations, unsigned; 0 for a standing point."""
+        """Unsigned turn rate of the horizontal velocity from both accelerations; 0 for a point at rest."""
         (vx, vy), (ax, ay) = self.velocity[:2].tolist(), self.acceleration.tolist()
         squared = vx * vx + vy * vy
         return abs(vx * ay - vy * ax) / squared if squared > 0.0 else 0.0
@@ -97,10 +97,10 @@ _E = TypeVar("_E", Estimate, TurnEstimate)
 
 
 class _Filter(ABC, Generic[_E]):
-    """The common base of both filters.
+    """The common base class of both filters.
 
     Attributes:
-        refused: Measurements outside the gate since the last one inside it.
+        refused: Number of measurements outside the gate since the last one inside it.
     """
 
     def __init__(self, dimensions: int, gate: float, **finite: float) -> None:
@@ -111,15 +111,15 @@ class _Filter(ABC, Generic[_E]):
             raise UsageError(f"gate is {gate!r} and must be above 0")
         self._n, self._gate = dimensions, gate
         self._estimate: _E | None = None
-        self.refused = 0  #: measurements outside the gate since the last one inside it
+        self.refused = 0  #: number of measurements outside the gate since the last one inside it
 
     @property
     def newest(self) -> _E | None:
-        """The estimate as of the last measurement; None before the first."""
+        """Estimate from the last measurement; None before the first one."""
         return self._estimate
 
     def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> _E:
-        """Restart at a measured position, with velocity 0.
+        """Restart at a measured position with velocity 0.
 
         Args:
             position: As in :meth:`update`.
@@ -138,14 +138,14 @@ class _Filter(ABC, Generic[_E]):
 
         Args:
             position: Shape (n,) [m].
-            deviation_m: Its standard deviation [m], one for all axes, or its covariance (n, n) [m²].
+            deviation_m: The position's standard deviation [m], the same for all axes, or its covariance (n, n) [m²].
             at_ns: Time of the measurement.
 
         Returns:
-            Whether it was used; False outside the gate (counted in :attr:`refused`), or if older than the last one.
+            Whether it was used: False outside the gate (counted in :attr:`refused`) or if older than the last.
 
         Raises:
-            UsageError: A shape is wrong, a number is not finite, or both estimate and measurement are exact.
+            UsageError: A shape is wrong, a number is not finite, or both the estimate and the measurement are exact.
         """
         if self._estimate is None:
             self.start(position, deviation_m, at_ns)
@@ -160,21 +160,21 @@ class _Filter(ABC, Generic[_E]):
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict the estimate for a time; for times before the last measurement, return that measurement's estimate.
+        """Predict the estimate for a time. For times before the last measurement, return that measurement's estimate.
 
         Args:
             at_ns: The time to predict for.
-            longest_s: Longest extrapolation of the last measurement.
+            longest_s: Maximum time to extrapolate the last measurement.
 
         Raises:
-            UsageError: There was no measurement.
+            UsageError: There has been no measurement.
         """
         if self._estimate is None:
             raise UsageError("the target was never seen")
         return self.predicted(self._estimate, at_ns, longest_s=longest_s)
 
     def predicted(self, last: _E, at_ns: int, *, longest_s: float = math.inf) -> _E:
-        """Predict from any estimate of this filter; see :meth:`at`."""
+        """Predict from any estimate of this filter, as in :meth:`at`."""
         return self._moved(last, within(seconds(at_ns - last.at_ns), 0.0, longest_s))
 
     @abstractmethod
@@ -182,13 +182,13 @@ class _Filter(ABC, Generic[_E]):
 
     @abstractmethod
     def _corrected(self, before: _E, measured: Array, noise: Array, at_ns: int) -> _E | None:
-        """Return the estimate after a measurement; None if it is outside the gate."""
+        """Return the estimate after a measurement; None if the measurement is outside the gate."""
 
     @abstractmethod
     def _moved(self, last: _E, dt: float) -> _E: ...
 
     def _checked(self, position: Array, deviation: float | Array) -> tuple[Array, Array]:
-        """Return position (n,) and covariance (n, n) of a measurement."""
+        """Return a measurement's position (n,) and covariance (n, n)."""
         n = self._n
         measured = np.asarray(position, dtype=np.float64)
         noise = np.asarray(deviation, dtype=np.float64)
@@ -206,10 +206,10 @@ class _Filter(ABC, Generic[_E]):
 
 
 class ConstantVelocityFilter(_Filter[Estimate]):
-    """A Kalman filter of a point with constant velocity and random accelerations.
+    """A Kalman filter for a point that moves at constant velocity with random accelerations.
 
     Attributes:
-        refused: Measurements outside the gate since the last one inside it.
+        refused: Number of measurements outside the gate since the last one inside it.
     """
 
     def __init__(
@@ -223,11 +223,11 @@ class ConstantVelocityFilter(_Filter[Estimate]):
         """Initialise the filter.
 
         Args:
-            dimensions: Dimensions of the position; 1 or more.
-            intensity_m2_s3: White noise of the acceleration: within a second the velocity wanders by its root.
+            dimensions: Number of dimensions of the position; 1 or more.
+            intensity_m2_s3: White noise of the acceleration; its root is how far the velocity wanders within a second.
             speed_m_s: Initial standard deviation of each velocity component.
-            gate: Refuse measurements more than this many standard deviations off (Mahalanobis distance); ``math.inf``
-                refuses none.
+            gate: Refuse measurements that are more than this many standard deviations off (Mahalanobis distance);
+                ``math.inf`` refuses none.
 
         Raises:
             UsageError: An argument is out of its range.
@@ -265,10 +265,10 @@ class ConstantVelocityFilter(_Filter[Estimate]):
 
 
 class TurningTargetFilter(_Filter[TurnEstimate]):
-    """Estimates the motion of a point in levelled axes from measured positions (3,), each with one deviation above 0.
+    """Estimates a point's motion in levelled axes from measured positions (3,), each with one deviation greater than 0.
 
     Attributes:
-        refused: Measurements outside the gate since the last one inside it.
+        refused: Number of measurements outside the gate since the last one inside it.
     """
 
     def __init__(
@@ -285,13 +285,13 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
         """Initialise the filter.
 
         Args:
-            intensity_m2_s3: Intensity of the acceleration's white noise, on top of the turn and the extra acceleration.
+            intensity_m2_s3: Intensity of the acceleration's white noise, besides the turn and the extra acceleration.
             speed_m_s: Initial standard deviation of each velocity component.
             turn_rad_s: Initial standard deviation of the turn rate.
-            turn_wander_rad_s: How far the turn rate wanders within a second.
+            turn_wander_rad_s: Change of the turn rate within a second.
             extra_m_s2: Standard deviation of each component of the extra acceleration.
-            extra_s: Time in which the extra acceleration fades to a third; above 0.
-            gate: Refuse positions more than this many standard deviations off (Mahalanobis distance).
+            extra_s: Time in which the extra acceleration fades to a third; greater than 0.
+            gate: Refuse positions that are more than this many standard deviations off (Mahalanobis distance).
 
         Raises:
             UsageError: An argument is out of its range.
@@ -318,7 +318,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
     def _started(self, measured: Array, noise: Array, at_ns: int) -> TurnEstimate:
         covariance = self._first + _SEEN.T @ noise[:2, :2] @ _SEEN
         rate = 0.0
-        if self._estimate is not None:  # a target that turned may well keep turning
+        if self._estimate is not None:  # a target that turned is likely to keep turning
             rate, known = self._estimate.turn_rate, float(self._estimate.covariance[4, 4])
             covariance[4, 4] = min(covariance[4, 4], known + self._again)
         height = self._height.start(measured[2:], noise[2:, 2:], at_ns)
@@ -341,7 +341,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
         return last
 
     def _stepped(self, last: TurnEstimate, dt: float) -> TurnEstimate:
-        """Predict one step [s]."""
+        """Predict one step of ``dt`` [s]."""
         (x, y, z), (vx, vy, climb), rate, (ax, ay) = last.position, last.velocity, last.turn_rate, last.extra
         along, aside, by_along, by_aside = _turn(rate, dt)
         c, s, fade = math.cos(rate * dt), math.sin(rate * dt), math.exp(-dt / self._fade_s)
@@ -381,7 +381,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
 
 
 def _turn(rate: float, dt: float) -> tuple[float, float, float, float]:
-    """Return sin(ωt)/ω and (1 - cos(ωt))/ω [s], and their derivatives with respect to ω [s²]."""
+    """Return sin(ωt)/ω and (1 - cos(ωt))/ω [s] and their derivatives with respect to ω [s²]."""
     angle = rate * dt
     if abs(angle) < _STRAIGHT_RAD:
         return dt, angle * dt / 2, -angle * dt * dt / 3, dt * dt / 2

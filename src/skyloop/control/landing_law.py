@@ -1,10 +1,10 @@
-"""Land on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
+"""A law that lands on a marker that may move, from sightings and feedback. Pure: no clock, no thread.
 
-A filter of straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. The vehicle flies to
-where the marker will be when the set-point takes effect, with the marker's velocity and acceleration, by the vehicle's
-predicted motion (:mod:`.response`). It descends while inside a cone over the marker, as in Saripalli, Montgomery and
-Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003; outside the cone it keeps its
-height, or climbs to see more, and closes up first. The last part, where the marker no longer fits into the image, is
+A filter for straight motion and steady turns (:mod:`.kalman`) tracks the marker in odometry axes. The vehicle flies to
+where the marker will be when the set-point takes effect, matching its velocity and acceleration, by the vehicle's
+predicted motion (:mod:`.response`). It descends while inside a cone above the marker, as in Saripalli, Montgomery and
+Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003. Outside the cone it keeps its
+height, or climbs to see more, and closes in first. The last part, where the marker no longer fits into the image, is
 flown by prediction. If the vehicle would touch down too far off, it aborts with a climb along the marker's predicted
 path. After a number of aborted attempts it gives up and hovers at a safe height.
 """
@@ -33,50 +33,50 @@ __all__ = ["LandingLaw", "LandingPhase", "LandingSettings", "SpiralSearch"]
 
 Array = NDArray[np.float64]
 
-_KEPT_S = 2.0  # history of estimates, to check how well the marker's motion was predicted
-_MOST_REFUSED = 4  # after this many sightings in a row outside the gate, the filter restarts
-_CONTRADICTED = 2  # after this many, a touch-down is aborted
-_LATEST_S = 0.1  # longest extrapolation of the turn rate from the feedback at a frame
-_REACTION_S = 0.25  # a velocity error shifts the touch-down point for this long; then the vehicle has removed it
-_JUST = 0.999  # margin below a limit: turning a velocity into body axes may round it up
-_MOVES_M_S = 0.1  # a slower target has no direction that could turn
-_FRESH_S = 0.2  # greatest age of the motion for which a touch-down counts
-_GIVEN_UP_CLIMB_S = 4.0  # duration of the climb of a vehicle without an altimeter
+_KEPT_S = 2.0  # duration of the history of estimates, kept to check how well the motion was predicted
+_MOST_REFUSED = 4  # sightings in a row outside the gate after which the filter restarts
+_CONTRADICTED = 2  # sightings in a row outside the gate after which a touch-down is aborted
+_LATEST_S = 0.1  # maximum time to extrapolate the turn rate from a frame's feedback
+_REACTION_S = 0.25  # time for which a velocity error shifts the touch-down point, until it is corrected
+_JUST = 0.999  # factor below a limit, because converting a velocity to body axes may round it up
+_MOVES_M_S = 0.1  # minimum speed of a target with a direction that can turn
+_FRESH_S = 0.2  # maximum age of the motion for a touch-down to count
+_GIVEN_UP_CLIMB_S = 4.0  # duration of the climb for a vehicle without an altimeter
 
 
 class LandingPhase(StrEnum):
     """The phases of :class:`LandingLaw`."""
 
-    SEARCHING = "searching for the marker"  #: waiting, then on a square spiral, at the search height
+    SEARCHING = "searching for the marker"  #: waiting, then flying a square spiral, at the search height
     CHASING = "moving over the marker"
     DESCENDING = "descending over the marker"
     RECOVERING = "lost the marker: climbing at its predicted position"
-    COMMITTED = "touching down"  #: too near to see the whole marker
+    COMMITTED = "touching down"  #: too close to see the whole marker
     DOWN = "down"
     GIVEN_UP = "giving up: climbing to a safe height"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Relative:
-    """The marker relative to the vehicle, when a set-point sent now takes effect."""
+    """The marker relative to the vehicle at the time when a set-point sent now takes effect."""
 
     target: TurnEstimate
-    offset: Array  #: (3,) [m], from the vehicle's centre
-    velocity: Array  #: (2,) [m/s]
-    height: float  #: height of the feet over the marker [m]
-    touching_off: float  #: distance by which a touch-down now would miss [m]
+    offset: Array  #: offset from the vehicle's centre, (3,) [m]
+    velocity: Array  #: relative velocity, (2,) [m/s]
+    height: float  #: height of the feet above the marker [m]
+    touching_off: float  #: distance by which a touch-down would miss now [m]
 
 
 class LandingLaw(AirframeLaw):
-    """Computes velocities from feedback and sightings; the motors stop at :attr:`phase` DOWN.
+    """Computes velocities from feedback and sightings. The motors stop when :attr:`phase` is DOWN.
 
     Times are on the proxy's clock [ns].
 
     Attributes:
-        settings: As given.
-        phase: As of the last step.
-        height_m: Height of the feet over the marker, as of the last step; None while searching.
-        off_m: Horizontal distance from the marker's centre, as of the last step; None while searching.
+        settings: Settings of the law, as given.
+        phase: Phase at the last step.
+        height_m: Height of the feet above the marker at the last step; None while searching.
+        off_m: Horizontal distance from the marker's centre at the last step; None while searching.
         aborted: Number of aborted touch-downs.
     """
 
@@ -85,8 +85,8 @@ class LandingLaw(AirframeLaw):
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING
-        self.height_m: float | None = None  #: height of the feet over the marker, as of the last step
-        self.off_m: float | None = None  #: horizontally from the marker's centre, as of the last step
+        self.height_m: float | None = None  #: height of the feet above the marker at the last step
+        self.off_m: float | None = None  #: horizontal distance from the marker's centre at the last step
         self.aborted = 0  #: number of aborted touch-downs
         self._response = VelocityResponse(s.response)
         self._target = TurningTargetFilter()
@@ -96,7 +96,7 @@ class LandingLaw(AirframeLaw):
         self._searching_ns: int | None = None  # start of the search
         self._gave_up_ns: int | None = None
         self._search = SpiralSearch(s.search_lane_m, s.search_speed_m_s, s.search_largest_m)
-        self._place: Array | None = None  # where to wait
+        self._place: Array | None = None  # position to wait at
         self._committed_ns: int | None = None
         limits = SetpointLimits(
             s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2, climb_acceleration_m_s2=s.climb_acceleration_m_s2
@@ -125,7 +125,7 @@ class LandingLaw(AirframeLaw):
             self._response.add(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart from rest with a search; a vehicle that was down may have been flown elsewhere."""
+        """Restart from rest with a search, because a vehicle that was down may have been flown elsewhere."""
         super().pause()
         self._limiter.reset(Velocity())
         self._response.pause()
@@ -134,7 +134,7 @@ class LandingLaw(AirframeLaw):
             self.phase = LandingPhase.SEARCHING
 
     def forget(self) -> None:
-        """Forget where the marker is; the phases DOWN and GIVEN_UP stay."""
+        """Forget where the marker is. The phases DOWN and GIVEN_UP remain."""
         self._target, self._seen_ns, self._committed_ns = TurningTargetFilter(), None, None
         self._place, self._searching_ns = None, None
         self._past.clear()
@@ -144,12 +144,12 @@ class LandingLaw(AirframeLaw):
         self.height_m = self.off_m = None
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with a sighting; ignore it while the vehicle's attitude or motion is unknown.
+        """Update with a sighting; ignore it if the vehicle's attitude or motion is unknown.
 
         Args:
             position: The marker's centre in body axes, (3,) [m].
-            at_capture: Feedback with the attitude at the capture; an older one is extrapolated by its turn rate.
-            captured_ns: Capture of the frame.
+            at_capture: Feedback with the attitude at the capture time; older feedback is extrapolated by its turn rate.
+            captured_ns: Capture time of the frame.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position)
         if found is None:
@@ -172,7 +172,7 @@ class LandingLaw(AirframeLaw):
             self._past.popleft()
 
     def step(self, now_ns: int) -> Velocity:
-        """Compute the set-point for now; all zero while the vehicle's motion is unknown, and once down."""
+        """Compute the set-point for now: zero while the vehicle's motion is unknown, and once it is down."""
         if self.phase is LandingPhase.DOWN or not self._ready(now_ns):
             return Velocity()
         newest, ahead = self.airframe.newest, self._response.predict(now_ns)
@@ -200,17 +200,17 @@ class LandingLaw(AirframeLaw):
         if newest is None or float(np.hypot(*newest.velocity[:2])) < s.turn_from_m_s:
             return 0.0
         way = math.atan2(newest.velocity[1], newest.velocity[0])
-        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # in either direction
+        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # either direction will do
         return clamped(1.5 * error, s.turn_rad_s)
 
     def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
-        """Return the marker relative to the vehicle; None if it was never seen, or not recently."""
+        """Return the marker relative to the vehicle; None if it was never seen or not recently."""
         s = self.settings
         if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
             return None
         target = self._target.at(own.at_ns)
         if self.phase is LandingPhase.SEARCHING and target.speed_deviation_m_s > s.known_m_s:
-            return None  # by position alone, the vehicle would meet a fast marker head-on
+            return None  # if it flew by position alone, the vehicle would meet a fast marker head-on
         offset, velocity = target.position - own.position, (target.velocity - own.velocity)[:2]
         height = -float(offset[2]) - s.feet_m
         left_s = clamped(height / s.final_descent_m_s, _REACTION_S)
@@ -247,7 +247,7 @@ class LandingLaw(AirframeLaw):
         return LandingPhase.DESCENDING if within else LandingPhase.CHASING
 
     def _misses(self, relative: _Relative, now_ns: int) -> bool:
-        """Return whether to abort a touch-down that has begun."""
+        """Return whether to abort a touch-down that is under way."""
         s = self.settings
         if relative.height < s.nearly_m:
             return relative.touching_off > s.pad_m
@@ -255,7 +255,7 @@ class LandingLaw(AirframeLaw):
         return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s or contradicted
 
     def _may_touch_down(self, relative: _Relative) -> bool:
-        """Return whether the vehicle is over the marker, as fast as it, and predicted its recent motion well."""
+        """Return whether the vehicle is over the marker, matches its speed and predicted its recent motion well."""
         s = self.settings
         if self._target.refused or relative.touching_off > s.commit_off_m:
             return False
@@ -272,7 +272,7 @@ class LandingLaw(AirframeLaw):
         return float(np.hypot(*(foreseen.position - newest.position)[:2])) < s.foreseen_m
 
     def _wanted(self, own: Motion, relative: _Relative | None, now_ns: int) -> tuple[Array, float]:
-        """Return the horizontal acceleration (2,) [m/s²], in odometry axes, and the climb [m/s]."""
+        """Return the horizontal acceleration (2,) [m/s²] in odometry axes, and the climb rate [m/s]."""
         s = self.settings
         if self.phase is LandingPhase.SEARCHING:
             return s.velocity_gain * (self._searched(own, now_ns) - own.velocity[:2]), self._to_search_height()
@@ -286,7 +286,7 @@ class LandingLaw(AirframeLaw):
         return acceleration, float(target.velocity[2]) + self._climb(relative)
 
     def _closing(self, offset: Array) -> Array:
-        """Return the velocity towards the marker, relative to it, (2,) [m/s], from which the vehicle can stop there."""
+        """Return the velocity relative to the marker, (2,) [m/s], from which the vehicle can stop above it."""
         s = self.settings
         rate, off = s.position_gain / s.velocity_gain, float(np.hypot(*offset))
         near = s.braking_m_s2 / rate**2
@@ -318,7 +318,7 @@ class LandingLaw(AirframeLaw):
         return self._search.step(own.position[:2])
 
     def _allowed(self, up: float) -> float:
-        """Limit a climb [m/s]; slow down towards the ceiling, as the proxy does."""
+        """Limit a climb rate [m/s], slowing down towards the ceiling as the proxy does."""
         most = self.settings.climb_m_s
         room = math.inf if self._altitude is None else max(0.0, self.settings.ceiling_m - self._altitude)
         return within(up, -most, min(most, room))
@@ -338,10 +338,10 @@ def _then(newest: Motion, ahead: Predicted) -> Motion:
 
 
 class SpiralSearch:
-    """Flies an expanding square around its start; after the largest square it returns and starts over.
+    """Flies an expanding square around its start. After the largest square it returns and starts over.
 
-    The expanding-square search of sea rescue, with a camera that looks down: International Aeronautical and Maritime
-    Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes, each a quarter turn on).
+    This is the expanding-square search of sea rescue, with a camera that looks down: International Aeronautical and
+    Maritime Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes with quarter turns).
     """
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
@@ -349,11 +349,11 @@ class SpiralSearch:
 
         Args:
             lane_m: Distance between lanes.
-            speed_m_s: Greatest speed.
+            speed_m_s: Maximum speed.
             largest_m: Length of the longest leg.
 
         Raises:
-            UsageError: A number is not finite and above 0.
+            UsageError: A number is not finite and greater than 0.
         """
         for name, value in (("lane_m", lane_m), ("speed_m_s", speed_m_s), ("largest_m", largest_m)):
             if not 0.0 < value < math.inf:
@@ -365,11 +365,11 @@ class SpiralSearch:
         self._begin: Array | None = None
 
     def restart(self) -> None:
-        """Start the next search around the position at its first step."""
+        """Start the next search around the position given to its first step."""
         self._leg, self._goal = 0, None
 
     def step(self, position: Array) -> Array:
-        """Return the wanted velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
+        """Return the wanted velocity (2,) [m/s] for a position (2,) [m], in the same axes."""
         if self._goal is None:
             self._begin = self._goal = position.copy()
         way = self._goal - position

@@ -1,6 +1,6 @@
-"""Limits of numbers, vectors and set-points: of their size and of how fast they change. Pure.
+"""Limits for numbers, vectors and set-points: for their size and for how fast they change. Pure.
 
-NaN never passes: it counts as 0, or as the number of the range nearest to 0.
+NaN never passes: it counts as 0 or as the number nearest to 0 in the range.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ __all__ = ["GRAVITY_M_S2", "SetpointLimiter", "SetpointLimits", "clamped", "lowe
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.80665  #: standard gravity
-_LONGEST_STEP_S = 0.2  # a longer pause does not allow a larger step
+_LONGEST_STEP_S = 0.2  # maximum time step: a longer pause does not allow a larger change
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """Return a vector (n,) in the same direction, at most ``longest`` long; zero if a component is not finite."""
+    """Return a vector (n,) in the same direction, but at most ``longest`` long; zero if a component is not finite."""
     length = math.sqrt(float(vector @ vector))
     if length <= longest and length < math.inf:
         return vector
@@ -32,11 +32,11 @@ def shortened(vector: Array, longest: float) -> Array:
 
 
 def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.0) -> float:
-    """Return a number, lowered to a drone's limit if that is below it.
+    """Return a number, lowered to a drone's limit if the limit is lower.
 
     Args:
         own: The number.
-        limits: As in ``drone.config``; a missing name limits nothing.
+        limits: Limits as in ``drone.config``; a missing name sets no limit.
         name: Name of the limit.
         less: Margin to stay below the limit.
     """
@@ -49,13 +49,13 @@ class SetpointLimits:
     """Limits of velocity set-points and of their rates of change; infinite means no limit.
 
     Raises:
-        UsageError: A limit is not above 0.
+        UsageError: A limit is not greater than 0.
     """
 
-    speed_m_s: float = math.inf  #: horizontal
+    speed_m_s: float = math.inf  #: horizontal speed
     climb_m_s: float = math.inf
     turn_rad_s: float = math.inf
-    acceleration_m_s2: float = math.inf  #: horizontal; harder acceleration tilts a camera off its target
+    acceleration_m_s2: float = math.inf  #: horizontal acceleration; more of it would tilt a camera off its target
     climb_acceleration_m_s2: float = math.inf
     turn_acceleration_rad_s2: float = math.inf
 
@@ -67,7 +67,7 @@ class SetpointLimits:
 
 
 class SetpointLimiter:
-    """Limits velocity set-points and the change from one to the next; the first may be anything."""
+    """Limits velocity set-points and the change from one to the next. The first may be anything."""
 
     def __init__(self, limits: SetpointLimits) -> None:
         self.limits = limits
@@ -77,8 +77,8 @@ class SetpointLimiter:
         """Limit the next set-point.
 
         Args:
-            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); values that are not finite count as 0.
-            dt_s: Time since the last call; counts as 0.2 s at most, so that a pause does not allow a larger step.
+            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,); non-finite values count as 0.
+            dt_s: Time since the last call; counted as at most 0.2 s, so that a pause does not allow a larger step.
         """
         limits, dt = self.limits, within(dt_s, 0.0, _LONGEST_STEP_S)
         result = np.nan_to_num(np.asarray(wanted, dtype=np.float64), posinf=0.0, neginf=0.0)
@@ -96,7 +96,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Restart from a set-point; None allows any next one."""
+        """Restart from a set-point; with None the next one may be anything."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

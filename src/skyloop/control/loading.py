@@ -1,6 +1,6 @@
-"""Load the user's controller from a Python file, with errors that give the line and the reason, and reload it.
+"""Loading and reloading the user's controller from a Python file, with errors that give the line and the reason.
 
-A saved change of the file, or of a module beside it that it imports, is loaded without interrupting the flight.
+A saved change to the file, or to a module next to it that it imports, is loaded without interrupting the flight.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from typing import Final, Self
 from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError, UsageError
 
-LOOK_S: Final = 0.1  #: how often the files are polled
-Stamp = tuple[int, int, int]  #: changes when a file is saved: time [ns], size, inode
+LOOK_S: Final = 0.1  #: interval at which the files are polled
+Stamp = tuple[int, int, int]  #: value that changes when a file is saved: time [ns], size, inode
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """Load the controller class of a Python file.
+    """Load the controller class from a Python file.
 
-    The file is executed and can import modules beside it, as a script can. Imported classes count only if the file
-    defines no controller itself.
+    The file is executed and can import modules next to it, as a script can. Imported classes count only if the file
+    itself defines no controller.
 
     Args:
         path: The Python file.
-        class_name: Name of the class, if the file has several.
+        class_name: Name of the class, in case the file has several.
 
     Raises:
         FileFormatError: The file can't be read or executed (with the line), or has no controller.
-        UnknownNameError: The file has no class of that name.
-        UsageError: The file does not exist, or it has several classes and no name was given.
+        UnknownNameError: The file has no class with that name.
+        UsageError: The file does not exist, or it has several controllers and no name was given.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -50,7 +50,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source: Python's cache takes a file with the same second and size for unchanged."""
+    """Always compiles the source, because Python's cache considers a file with the same second and size unchanged."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -100,7 +100,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Return the line of the user's file that raised an exception; empty if it was raised elsewhere."""
+    """Return which line of the user's file raised an exception; empty if it was raised elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -135,16 +135,16 @@ def load_module(file: Path, what: str) -> ModuleType:
 class Reloader:
     """Watches a controller's file and reloads it on a background thread after each save. A context manager.
 
-    A file counts as saved once unchanged for ``look_s / 2``, so that no half-written file is loaded.
+    A file counts as saved when it has not changed for ``look_s / 2``, so that no half-written file is loaded.
     """
 
     def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
-        """Record the state of the files; the thread starts with the context.
+        """Record the state of the files. The thread starts when the context is entered.
 
         Args:
             path: The controller's file.
-            class_name: Name of the class, if the file has several.
-            look_s: How often the files are polled [s].
+            class_name: Name of the class, in case the file has several.
+            look_s: Interval at which the files are polled [s].
         """
         self._path = Path(path)
         self._folder = self._path.resolve().parent
@@ -177,11 +177,11 @@ class Reloader:
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
-        """Return the new class, or the error that kept it from loading; None if nothing was saved since."""
+        """Return the new class, or the error that prevented loading it; None if nothing has been saved since."""
         return self._loaded.popleft() if self._loaded else None
 
     def look(self) -> None:
-        """Poll the files once and load them if they changed."""
+        """Poll the files once and load them if they have changed."""
         found = self._stamps()
         if found == self._seen:
             return
@@ -193,7 +193,7 @@ class Reloader:
             self._loaded.append(self._load())
         except SkyloopError as error:
             self._loaded.append(error)
-        self._seen = {**self._stamps(), **found}  # modules that the new version imports are watched too
+        self._seen = {**self._stamps(), **found}  # watch modules that the new version imports, too
 
     def _settled(self) -> dict[Path, Stamp]:
         self._ended.wait(self._look_s / 2)
@@ -204,7 +204,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Reload the file and its neighbours; on failure restore the previously loaded modules."""
+        """Reload the file and its neighbouring modules; on failure restore the previously loaded ones."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -215,7 +215,7 @@ class Reloader:
             raise
 
     def _neighbours(self) -> dict[str, ModuleType]:
-        """Return the loaded modules in the folder of the user's file, that file included."""
+        """Return the loaded modules in the folder of the user's file, including that file."""
         loaded = dict(sys.modules)
         tops = {name for name in loaded if "." not in name and self._lies_here(name, loaded[name])}
         return {name: module for name, module in loaded.items() if name.partition(".")[0] in tops and _file(module)}
@@ -237,7 +237,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """Return a stamp that changes with each save; None while the file is missing, as while an editor replaces it."""
+    """Return a stamp that changes with each save; None while the file is missing, such as during its replacement."""
     try:
         found = file.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Fly by a learned policy: a network in an ONNX file that maps an image and the state to a set-point."""
+"""Flying by a learned policy: a network in an ONNX file that maps an image and the state to a set-point."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ STATE_INPUT: Final = "observation.state"
 IMAGE_INPUT: Final = "observation.images."
 OUTPUT: Final = "action"
 MEMORY: Final = "memory"
-NEXT_MEMORY: Final = "next_memory"  #: output that becomes the memory for the next image
-STATE_NAMES: Final = "skyloop.state"  #: metadata key: names of the state's numbers, a JSON list
-ACTION_NAMES: Final = "skyloop.action"  #: metadata key: names of the action's numbers
-_MOST_SIDE: Final = 4096  # limit of an input image [px]
-_MOST_MEMORY: Final = 2**20  # limit of a memory, in numbers
+NEXT_MEMORY: Final = "next_memory"  #: name of the output that becomes the memory for the next image
+STATE_NAMES: Final = "skyloop.state"  #: metadata key for the names of the state's numbers, a JSON list
+ACTION_NAMES: Final = "skyloop.action"  #: metadata key for the names of the action's numbers
+_MOST_SIDE: Final = 4096  # maximum side of an input image [px]
+_MOST_MEMORY: Final = 2**20  # maximum size of a memory, in numbers
 _PURPOSE: Final = "flying by an ONNX file"
 
 
 class PolicyPhase(StrEnum):
-    """Whether a policy flies, and if not, why."""
+    """Whether a policy is flying and, if not, why."""
 
     FLYING = "flying"
     NO_STATE = "the drone does not report all values that the policy needs: hovering"
@@ -51,28 +51,28 @@ class PolicyNetwork:
     """A policy's network. Call it from one thread only.
 
     The file has an input ``observation.images.CAMERA`` of float32 (1, 3, height, width), red, green, blue, 0 to 1, and
-    may have ``observation.state`` of float32 (1, n); its output is ``action`` of (1, m). Names and numbers match
-    ``skyloop log export --to lerobot``. The metadata lists the numbers' names, as JSON lists in ``skyloop.state`` and
+    may have ``observation.state`` of float32 (1, n). Its output is ``action`` of (1, m). Names and numbers match those
+    of ``skyloop log export --to lerobot``. The metadata lists the numbers' names as JSON lists in ``skyloop.state`` and
     ``skyloop.action``. A network with memory has an input ``memory``, float32 of a fixed shape, and an output
-    ``next_memory`` of the same shape, which becomes its ``memory`` for the next image; it starts as zeros.
+    ``next_memory`` of the same shape, which becomes ``memory`` for the next image. The memory starts as zeros.
 
     Args:
         path: The ONNX file.
-        state: Names of the state's numbers, of :data:`~skyloop.messages.rows.STATE`; None: from the metadata.
-        action: ``velocity`` or ``attitude``; None: from the metadata.
-        threads: CPU threads of one run, 1 to 64.
+        state: Names of the state's numbers, from :data:`~skyloop.messages.rows.STATE`; None to read the metadata.
+        action: ``velocity`` or ``attitude``; None to read the metadata.
+        threads: CPU threads for one run, 1 to 64.
 
     Attributes:
-        camera: The camera whose images it was trained on.
-        size: Width and height of its input images [px]; others are scaled.
+        camera: The camera on whose images the network was trained.
+        size: Width and height of its input images [px]; other images are scaled.
         state: Names of the state's numbers.
         action: ``velocity`` or ``attitude``.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.
-        UnknownNameError: A name of the state's numbers, or of the action, is unknown.
+        UnknownNameError: A name of one of the state's numbers, or of the action, is unknown.
         UsageError: There is no such file, or an argument is out of its range or contradicts the file.
-        FileFormatError: It is not an ONNX file, or its inputs, outputs or metadata are not as above.
+        FileFormatError: It is not an ONNX file, or its inputs, outputs or metadata are not as described above.
     """
 
     def __init__(
@@ -100,14 +100,14 @@ class PolicyNetwork:
         self.forget()
 
     def __call__(self, image: NDArray[np.uint8], state: Sequence[float]) -> Velocity | Attitude:
-        """Compute the set-point and keep the network's memory for the next image.
+        """Compute the set-point, and keep the network's memory for the next image.
 
         Args:
             image: BGR, shape (height, width, 3), or grey (height, width), uint8, of any size.
             state: Numbers in the order of :attr:`state`.
 
         Returns:
-            The set-point, which may not be finite.
+            The set-point; its values are not necessarily finite.
 
         Raises:
             FileFormatError: The network can't be run, or its action has a wrong number of values.
@@ -134,7 +134,7 @@ class PolicyNetwork:
             raise FileFormatError(f"{self._path}: {error}") from None
 
     def forget(self) -> None:
-        """Clear the memory: treat the next image as the first."""
+        """Clear the memory, so that the next image is treated as the first."""
         self._memory = self._blank
 
     def _remember(self, kept: Sequence[NDArray[np.float32]]) -> None:
@@ -146,11 +146,11 @@ class PolicyNetwork:
                 f"{self._path} takes {MEMORY} as {self._blank.shape} and gives {NEXT_MEMORY} as {memory.shape}: "
                 "they must be alike"
             )
-        # Values that are not finite would stay in the memory forever.
+        # Non-finite values would stay in the memory forever.
         self._memory = memory if np.isfinite(memory).all() else self._blank
 
     def _memory_of(self, inputs: Mapping[str, Any], outputs: Sequence[str]) -> NDArray[np.float32] | None:
-        """Return the initial memory; None for a network without memory."""
+        """Return the initial memory; None if the network has no memory."""
         if (MEMORY in inputs) != (NEXT_MEMORY in outputs):
             raise FileFormatError(
                 f"{self._path} must have both the input {MEMORY} and the output {NEXT_MEMORY}, or neither"
@@ -230,10 +230,10 @@ _ACTIONS: Final = " or ".join(f"{kind} ({', '.join(names)})" for kind, names in 
 class OnnxPolicy(Behaviour):
     """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
-    Limits, zones and failsafe of the proxy apply as for any application. The vehicle hovers, and an event reports it,
-    when frames stop, when a number of the state that the network needs is missing or half a second old, and when the
-    action is not finite. A network's memory is cleared after each of these.
-    The vehicle must be airborne when :meth:`run` is called. All callbacks run on the thread that called it.
+    The proxy's limits, zones and failsafe apply as for any application. The vehicle hovers, and an event reports it, if
+    frames stop, if a number of the state that the network needs is missing or half a second old, or if the action is
+    not finite. Each of these clears the network's memory. The vehicle must be airborne when :meth:`run` is called. All
+    callbacks run on the thread that called it.
     """
 
     name = "policy"
@@ -254,9 +254,9 @@ class OnnxPolicy(Behaviour):
         Args:
             drone: The drone to fly.
             path: The ONNX file; see :class:`PolicyNetwork`.
-            camera: Camera to use; None is the camera named in the file.
-            state: Names of the state's numbers, if the file does not give them.
-            action: ``velocity`` or ``attitude``, if the file does not give it.
+            camera: Camera to use; None for the camera named in the file.
+            state: Names of the state's numbers, in case the file does not give them.
+            action: ``velocity`` or ``attitude``, in case the file does not give it.
             threads: CPU threads for one image.
 
         Raises:
@@ -269,15 +269,15 @@ class OnnxPolicy(Behaviour):
         self._newest = _Newest()
         super().__init__(drone, self._newest, self.network.camera if camera is None else camera)
         self._phase = PolicyPhase.FLYING
-        self._looked_at_ns = 0  # capture of the newest frame given to the network
+        self._looked_at_ns = 0  # capture time of the newest frame given to the network
 
     @property
     def phase(self) -> PolicyPhase:
-        """The current phase: whether it flies, or why not."""
+        """The current phase: whether it is flying or why it is not."""
         return self._phase
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Compute a frame's set-point and write it on the frame."""
+        """Compute a frame's set-point and annotate the frame with it."""
         if frame.captured_ns - self._looked_at_ns > nanoseconds(BLIND_S):
             self.network.forget()
         self._looked_at_ns = frame.captured_ns
@@ -296,7 +296,7 @@ class OnnxPolicy(Behaviour):
         return [self._written(self._newest.wanted)]
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Send the set-point; hover while there is none."""
+        """Send the set-point, or hover if there is none."""
         if self._phase is PolicyPhase.FLYING:
             super().steer(wanted)
         else:
@@ -308,7 +308,7 @@ class OnnxPolicy(Behaviour):
 
 
 class _Newest:
-    """The law of a behaviour whose set-point comes from :meth:`Behaviour.look`."""
+    """The law of a behaviour that gets its set-points from :meth:`Behaviour.look`."""
 
     def __init__(self) -> None:
         self.wanted: Velocity | Attitude = Velocity()

@@ -1,9 +1,9 @@
 """Paths: position and velocity over time. World axes x east, y north, z up [m]. Pure.
 
-Every object with :class:`Path`'s attributes is a path. All paths of this module except :class:`FunctionPath` start and
-end at rest: each stretch has its own speed limit, and the speeds at the joints come from one backward and one forward
-pass with ``v² = v₀² + 2·a·s`` (a trapezoidal profile; Biagiotti and Melchiorri, "Trajectory Planning for Automatic
-Machines and Robots", Springer 2008, section 3.2).
+Every object with the attributes of :class:`Path` is a path. All paths in this module except :class:`FunctionPath` start
+and end at rest: each stretch has its own speed limit, and the speeds at the joints come from one backward and one
+forward pass with ``v² = v₀² + 2·a·s`` (a trapezoidal profile; Biagiotti and Melchiorri, "Trajectory Planning for
+Automatic Machines and Robots", Springer 2008, section 3.2).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.control.limiting import within
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Shorter stretches are skipped: the squares of their speeds would underflow a float.
+#: Shorter stretches are skipped because the squares of their speeds would underflow a float.
 SHORTEST_M: Final = 1e-9
 
 
@@ -40,12 +40,12 @@ class MotionProfile:
         """Compute the profile.
 
         Args:
-            stretches: Length [m] and greatest speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches
-                of at most :data:`SHORTEST_M` take no time.
-            acceleration_m_s2: Acceleration and deceleration; above 0.
+            stretches: Length [m] and maximum speed [m/s] of each stretch. Speed 0 with length 0 is a stop. Stretches of
+                at most :data:`SHORTEST_M` take no time.
+            acceleration_m_s2: Acceleration and deceleration; greater than 0.
 
         Raises:
-            UsageError: A stretch would never end, because its speed limit is 0.
+            UsageError: A stretch would never end because its speed limit is 0.
         """
         self._pieces: list[_Piece] = []
         self.duration_s = 0.0  #: duration of the whole profile
@@ -96,15 +96,15 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
 
 
 Array = NDArray[np.float64]
-_DIFFERENCE_S = 0.01  # step of the numerical derivative, to each side
+_DIFFERENCE_S = 0.01  # step of the numerical derivative on either side
 
-#: Lengths, speeds, accelerations and times in this range divide without under- or overflow.
+#: Lengths, speeds, accelerations and times in this range can be divided without under- or overflow.
 _LEAST: Final = 1e-6
 _MOST: Final = 1e6
 
 
 class Path(Protocol):
-    """Position and velocity at each time from 0 to ``duration_s``; at rest at its ends before and after."""
+    """Position and velocity at each time from 0 to ``duration_s``, and at rest at either end before and after that."""
 
     @property
     def duration_s(self) -> float: ...
@@ -137,7 +137,7 @@ class FunctionPath:
             velocity: Returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
 
         Raises:
-            UsageError: The duration is not from 1e-6 to 1e6 s.
+            UsageError: The duration is not between 1e-6 and 1e6 s.
         """
         self.duration_s = _positive("duration_s", duration_s)
         self._position = position
@@ -175,7 +175,7 @@ class _Profiled:
 
 
 class Polyline(_Profiled):
-    """Straight legs between points at one speed, with a stop at each corner, or with corners rounded by arcs."""
+    """Straight legs between points at one speed, with a stop at each corner or with corners rounded by arcs."""
 
     def __init__(
         self,
@@ -188,14 +188,14 @@ class Polyline(_Profiled):
         """Compute the legs and arcs.
 
         Args:
-            points: At least two that differ, each (3,) [m].
+            points: Points, each (3,) [m], at least two of which differ.
             speed_m_s: Speed along the legs.
-            acceleration_m_s2: Acceleration at start and end, at stops, and across the arcs.
-            corner_m: Where an arc starts before its corner, at most half a leg; on the arc the vehicle is no faster
-                than its acceleration allows. 0 stops at each corner.
+            acceleration_m_s2: Acceleration at the start and end, at stops, and across the arcs.
+            corner_m: Distance before its corner at which an arc starts, at most half a leg. On the arc the vehicle is
+                no faster than its acceleration allows. 0 stops at each corner.
 
         Raises:
-            UsageError: Fewer than two points differ, or a number is out of its range.
+            UsageError: Fewer than two points are different, or a number is out of its range.
         """
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
         if not 0.0 <= corner_m < math.inf:
@@ -239,7 +239,7 @@ class Polyline(_Profiled):
 
 
 class Circle(_Profiled):
-    """A circle about a centre at one height and speed, from rest to rest."""
+    """A circle around a centre at constant height and speed, starting and ending at rest."""
 
     def __init__(
         self,
@@ -259,9 +259,9 @@ class Circle(_Profiled):
             radius_m: Radius of the circle.
             speed_m_s: Speed along the circle.
             laps: Number of laps.
-            begin_rad: Start on the circle, counter-clockwise from east.
-            clockwise: Direction, seen from above.
-            acceleration_m_s2: Acceleration at start and end.
+            begin_rad: Starting angle on the circle, counter-clockwise from east.
+            clockwise: Direction as seen from above.
+            acceleration_m_s2: Acceleration at the start and end.
 
         Raises:
             UsageError: A number is out of its range.
@@ -290,7 +290,7 @@ class Circle(_Profiled):
 
 
 class Lemniscate(_Profiled):
-    """A horizontal figure of eight, Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``, turned by ``yaw_rad``."""
+    """A horizontal figure of eight (Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``) turned by ``yaw_rad``."""
 
     def __init__(
         self,
@@ -302,15 +302,15 @@ class Lemniscate(_Profiled):
         yaw_rad: float = 0.0,
         acceleration_m_s2: float = 0.8,
     ) -> None:
-        """Initialise the path; it starts in the centre.
+        """Initialise the path, which starts in the centre.
 
         Args:
             centre: x, y, z [m].
-            half_width_m: ``a``, from the centre to each end.
-            speed_m_s: Greatest speed, reached in the centre.
+            half_width_m: ``a``, the distance from the centre to each end.
+            speed_m_s: Maximum speed, reached in the centre.
             laps: Number of laps.
-            yaw_rad: Turns the figure counter-clockwise.
-            acceleration_m_s2: Acceleration at start and end.
+            yaw_rad: Angle by which to turn the figure counter-clockwise.
+            acceleration_m_s2: Acceleration at the start and end.
 
         Raises:
             UsageError: A number is out of its range.
@@ -320,7 +320,7 @@ class Lemniscate(_Profiled):
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
-        steepest = self._a * math.sqrt(2.0)  # greatest distance per u
+        steepest = self._a * math.sqrt(2.0)  # maximum distance per unit of u
         turns = 2 * math.pi * _positive("laps", laps)
         self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
 
@@ -337,7 +337,7 @@ class Lemniscate(_Profiled):
 
 
 class Spline:
-    """A smooth curve through points at given times, at rest at both ends: SciPy's clamped cubic spline.
+    """A smooth curve through points at given times that is at rest at both ends: SciPy's clamped cubic spline.
 
     Attributes:
         duration_s: Duration of the path.
@@ -347,11 +347,11 @@ class Spline:
         """Compute the curve.
 
         Args:
-            points: At least two, each (3,) [m].
-            times_s: One for each point, starting at 0 and increasing.
+            points: At least two points, each (3,) [m].
+            times_s: Time at each point, starting at 0 and increasing.
 
         Raises:
-            UsageError: The times do not fit the points, do not start at 0, or do not increase.
+            UsageError: The number of times does not match the points, or the times don't start at 0 or don't increase.
             MissingExtraError: SciPy is not installed.
         """
         places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)
@@ -397,7 +397,7 @@ class _Arc:
     """A circular arc that leaves one leg and joins the next."""
 
     def __init__(self, corner: Array, before: Array, after: Array, reach: float, turn: float) -> None:
-        """Compute the arc from the directions of the legs, the distance ``reach`` to its ends, and the angle [rad]."""
+        """Compute the arc from the legs' directions, the distance ``reach`` to the arc's ends, and the angle [rad]."""
         self.begin, self.end = corner - before * reach, corner + after * reach
         self.radius = reach / math.tan(turn / 2)
         self.length = self.radius * turn
@@ -416,7 +416,7 @@ class _Arc:
 
 
 def _arc(before: Array, corner: Array, after: Array, reach: float) -> _Arc | None:
-    """Return the arc; None if there is no corner, or if the path turns back on itself."""
+    """Return the arc; None if there is no corner or the path turns back on itself."""
     come, go = corner - before, after - corner
     reach = min(reach, float(np.linalg.norm(come)) / 2, float(np.linalg.norm(go)) / 2)
     come, go = come / np.linalg.norm(come), go / np.linalg.norm(go)

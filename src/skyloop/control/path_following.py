@@ -22,7 +22,7 @@ from skyloop.messages import EventKind, Feedback, Severity, Vector
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-APPROACH_M_S: Final = 0.5  #: speed to the start of a path
+APPROACH_M_S: Final = 0.5  #: speed on the way to the start of a path
 
 
 @dataclass(slots=True)
@@ -35,7 +35,7 @@ class TrackingError:
 
     @property
     def rms_m(self) -> float:
-        """Root of the mean square; 0 before the first sample."""
+        """Root mean square of the distances; 0 before the first sample."""
         return math.sqrt(self._squares / self.samples) if self.samples else 0.0
 
     def add(self, error_m: float) -> None:
@@ -46,7 +46,7 @@ class TrackingError:
 
 
 class _PathFlyer(Controller):
-    """The common base of both controllers: a law and a position source; hovers while the source has no position."""
+    """Common base of both controllers: a law and a position source. Hovers while the source has no position."""
 
     def __init__(
         self,
@@ -60,8 +60,8 @@ class _PathFlyer(Controller):
         if not 0.0 < max_age_s < math.inf:
             raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds above 0")
         self.settings = (settings or PathSettings()).within(dict(drone.config.items()))
-        self.error = TrackingError()  #: distance from the target, by the position source
-        self.done = False  #: the whole path is flown
+        self.error = TrackingError()  #: distance from the target, according to the position source
+        self.done = False  #: the whole path has been flown
         self.lost = False  #: the vehicle hovers because the position is unknown
         self._yaw = yaw
         self._source = source
@@ -72,15 +72,15 @@ class _PathFlyer(Controller):
     def target(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
         """The vehicle's current target on the path.
 
-        Position (3,) [m] and velocity (3,) [m/s], world axes; None before the first fix.
+        Position (3,) [m] and velocity (3,) [m/s] in world axes; None before the first fix.
         """
         return None if self._law is None else self._law.target
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Send the next set-point; hover while the position is unknown or older than ``max_age_s``.
+        """Send the next set-point, or hover while the position is unknown or older than ``max_age_s``.
 
         Raises:
-            UsageError: There is no other source, and the vehicle does not report its position at the start.
+            UsageError: There is no other source and the vehicle does not report its position at the start.
         """
         if self.done:
             return
@@ -125,7 +125,7 @@ class _PathFlyer(Controller):
 
 
 class FollowPath(_PathFlyer):
-    """Flies to a path's start, along the path, and hovers at its end; then :meth:`run` returns.
+    """Flies to a path's start and along the path, and hovers at its end. Then :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
@@ -133,7 +133,7 @@ class FollowPath(_PathFlyer):
         path: The path.
         on_path: Whether the vehicle has reached the start.
         error: Tracking error from the path's start to its end.
-        done: Whether the whole path is flown.
+        done: Whether the whole path has been flown.
         lost: Whether the vehicle hovers because the position is unknown.
     """
 
@@ -153,12 +153,12 @@ class FollowPath(_PathFlyer):
             drone: The drone to fly.
             path: The path, in world axes.
             yaw: A :class:`skyloop.control.YawMode`; None keeps the current yaw.
-            settings: Settings of the law; None are the defaults.
-            source: Position source; None is the vehicle's own feedback.
-            max_age_s: Greatest age of a position; the vehicle hovers with an older one.
+            settings: Settings of the law; None for the defaults.
+            source: Position source; None for the vehicle's own feedback.
+            max_age_s: Maximum age of a position; if it is older, the vehicle hovers.
 
         Raises:
-            UsageError: ``max_age_s`` is not a finite number above 0.
+            UsageError: ``max_age_s`` is not a finite number greater than 0.
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.path = path
@@ -180,14 +180,14 @@ class FollowPath(_PathFlyer):
 
 
 class Waypoints(_PathFlyer):
-    """Flies straight from waypoint to waypoint and stays at each; then hovers, and :meth:`run` returns.
+    """Flies straight from waypoint to waypoint, staying at each, and then hovers; :meth:`run` returns.
 
     The vehicle must be airborne when :meth:`run` is called.
 
     Attributes:
         waypoints: The waypoints.
         reached: Number of waypoints reached.
-        error: Distance from the moving target, over the whole flight.
+        error: Distance from the moving target over the whole flight.
         done: Whether the vehicle has reached the last waypoint.
         lost: Whether the vehicle hovers because the position is unknown.
     """
@@ -209,17 +209,17 @@ class Waypoints(_PathFlyer):
 
         Args:
             drone: The drone to fly.
-            waypoints: :class:`Waypoint` or (x, y, z) [m], world axes.
-            speed_m_s: Greatest speed between waypoints.
+            waypoints: Waypoints as :class:`Waypoint` or (x, y, z) in world axes [m].
+            speed_m_s: Maximum speed between waypoints.
             acceleration_m_s2: Acceleration at the start and end of each leg.
             hold_s: How long to stay at each waypoint.
-            yaw: A :class:`skyloop.control.YawMode`, for waypoints without a yaw; None keeps the current yaw.
-            settings: Settings of the law; None are the defaults.
-            source: Position source; None is the vehicle's own feedback.
-            max_age_s: Greatest age of a position; the vehicle hovers with an older one.
+            yaw: A :class:`skyloop.control.YawMode` for waypoints without a yaw; None keeps the current yaw.
+            settings: Settings of the law; None for the defaults.
+            source: Position source; None for the vehicle's own feedback.
+            max_age_s: Maximum age of a position; if it is older, the vehicle hovers.
 
         Raises:
-            UsageError: There is no waypoint, or a number is out of its range.
+            UsageError: There are no waypoints, or a number is out of its range.
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.waypoints = tuple(one if isinstance(one, Waypoint) else Waypoint(*one) for one in waypoints)
@@ -230,7 +230,7 @@ class Waypoints(_PathFlyer):
         self.reached = 0
         self._speed = (speed_m_s, acceleration_m_s2)
         self._hold_ns = nanoseconds(hold_s)
-        self._there_ns: int | None = None  # arrival at the next waypoint
+        self._there_ns: int | None = None  # time of arrival at the next waypoint
         _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises here if speed or acceleration is out of range
 
     def _begin(self, fix: Fix) -> PathLaw:

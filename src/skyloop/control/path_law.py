@@ -1,7 +1,7 @@
-"""Keep a vehicle on a path: position in, velocities out. Pure: no clock, no thread.
+"""A law that keeps a vehicle on a path, from positions to velocities. Pure: no clock, no thread.
 
-The path's velocity is fed forward, ahead by the vehicle's response time, and a PI loop on the position removes the
-rest: the integral counters wind and a velocity that the vehicle measures wrong (Åström and Hägglund, "Advanced PID
+The path's velocity is fed forward, ahead of time by the vehicle's response time, and a PI loop on the position removes
+the remaining error. The integral counteracts wind and a wrongly measured velocity (Åström and Hägglund, "Advanced PID
 Control", ISA 2006, chapter 5). A measured position is compared with the path at the time of the measurement, so its
 delay causes no error.
 """
@@ -26,11 +26,11 @@ from skyloop.messages import Value, Velocity
 from skyloop.messages.geometry import turned, wrap_angle
 
 Array = NDArray[np.float64]
-_LONGEST_STEP_S = 0.5  # a longer gap between two fixes advances the path by no more
+_LONGEST_STEP_S = 0.5  # maximum time by which the path advances between two fixes
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
-_SHARE = 0.6  # limit of the integral, as a share of the greatest speed
-_ALONG_M_S = 0.05  # slower velocities have no direction worth turning to
-_NEAR_M = 0.3  # a point nearer than this, seen from above, has no reliable bearing
+_SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
+_ALONG_M_S = 0.05  # minimum speed with a direction worth turning to
+_NEAR_M = 0.3  # minimum horizontal distance to a point for a reliable bearing
 _AHEAD_S = 0.1  # interval over which the rate of the wanted yaw is computed
 
 
@@ -64,7 +64,7 @@ class FixedYaw:
 
 @dataclass(frozen=True, slots=True)
 class AlongPath:
-    """Yaw along the direction of flight plus ``offset`` [rad]; unchanged while the vehicle hovers or only climbs."""
+    """Yaw along the direction of flight plus ``offset`` [rad], unchanged while the vehicle hovers or only climbs."""
 
     offset: float = 0.0
 
@@ -77,13 +77,13 @@ class AlongPath:
 
 @dataclass(frozen=True, slots=True)
 class LookAt:
-    """Yaw towards a point, x and y in world axes [m]; unchanged while the vehicle is above or below it."""
+    """Yaw towards a point, x and y in world axes [m], unchanged while the vehicle is above or below it."""
 
     x: float
     y: float
 
     def __call__(self, position: Array, velocity: Array) -> float | None:  # noqa: ARG002
-        """Return the yaw, or None within 0.3 m of the point, seen from above."""
+        """Return the yaw, or None if the horizontal distance to the point is less than 0.3 m."""
         east, north = self.x - position[0], self.y - position[1]
         return math.atan2(north, east) if math.hypot(east, north) >= _NEAR_M else None
 
@@ -96,21 +96,21 @@ class PathSettings:
         UsageError: A number is out of its range.
     """
 
-    #: Gains of the position error [1/s, 1/s²]; ``velocity_gain`` takes the place of the derivative.
+    #: Gains of the position error [1/s, 1/s²]; ``velocity_gain`` replaces the derivative.
     gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))
-    #: Share of the velocity error, if the velocity is known, added to the set-point: a vehicle with a soft velocity
-    #: loop responds sooner, and gusts push it less far.
+    #: Fraction of the velocity error (if the velocity is known) that is added to the set-point: a vehicle with a soft
+    #: velocity loop responds sooner, and gusts push it less far.
     velocity_gain: float = 1.0
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.25  #: response time to a set-point: how far ahead the velocity is fed forward
+    lead_s: float = 0.25  #: response time to a set-point; the velocity is fed forward this far ahead
     limits: SetpointLimits = field(
         default_factory=lambda: SetpointLimits(
             speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0
         )
     )
-    leash_m: float = 0.5  #: beyond this distance from it the path slows down, beyond twice this it waits
+    leash_m: float = 0.5  #: distance from the target beyond which the path slows down; beyond twice this it waits
     near_m: float = 0.15  #: acceptance radius
-    near_rad: float = 0.15  #: greatest acceptable yaw error
+    near_rad: float = 0.15  #: maximum acceptable yaw error
 
     def __post_init__(self) -> None:
         for name in ("velocity_gain", "yaw_gain", "lead_s", "leash_m", "near_m", "near_rad"):
@@ -122,11 +122,11 @@ class PathSettings:
             raise UsageError(f"gains.d is {self.gains.d!r} and must be 0: velocity_gain damps")
 
     def within(self, limits: Mapping[str, Value]) -> PathSettings:
-        """Return these settings within the limits of a drone: speeds beyond them would wind up the integral.
+        """Return these settings clamped to a drone's limits: higher speeds would wind up the integral.
 
         Args:
             limits: ``limits.speed``, ``limits.climb`` and ``limits.yaw_rate``, as in ``drone.config``; a missing one
-                limits nothing.
+                sets no limit.
         """
         own = self.limits
         return replace(
@@ -144,8 +144,8 @@ class PathLaw:
     """Computes velocities from fixes. The path's time starts with the first fix.
 
     Attributes:
-        time_s: Time on the path.
-        off_m: Distance from the target on the path, as of the last fix.
+        time_s: Current time on the path.
+        off_m: Distance from the target on the path at the last fix.
     """
 
     def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
@@ -153,12 +153,12 @@ class PathLaw:
 
         Args:
             path: The path, in world axes.
-            settings: None are the defaults.
+            settings: Settings of the law; None for the defaults.
             yaw: Chooses the yaw; None keeps the yaw of the first fix.
         """
         self.settings = settings or PathSettings()
-        self.time_s = 0.0  #: time on the path
-        self.off_m = 0.0  #: distance from the target on the path, as of the last fix
+        self.time_s = 0.0  #: current time on the path
+        self.off_m = 0.0  #: distance from the target on the path at the last fix
         self._path = path
         self._yaw = yaw
         limits = self.settings.limits
@@ -179,7 +179,7 @@ class PathLaw:
         return self._path.position(self.time_s), self._path.velocity(self.time_s)
 
     def follow(self, path: Path, yaw: YawMode | None = None) -> None:
-        """Continue with another path from its start, keeping the integrals.
+        """Continue with another path from its start while keeping the integrals.
 
         Args:
             path: The path, in world axes.
@@ -190,21 +190,21 @@ class PathLaw:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """Restart from rest without an integral: the vehicle hovers or another client flies it; the path waits."""
+        """Restart from rest with zero integral: the vehicle hovers or another client flies it; the path waits."""
         self._limiter.reset(Velocity())
         self._loop.reset()
         self._last = None
 
     def there(self, fix: Fix) -> bool:
-        """Return whether the path is over and the vehicle is at its end, at the wanted yaw."""
+        """Return whether the path is over and the vehicle is at its end with the wanted yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
 
     def step(self, fix: Fix) -> Velocity:
-        """Compute the set-point for a fix. A fix that is not newer than the last does not advance the path.
+        """Compute the set-point for a fix. A fix that is no newer than the last one does not advance the path.
 
-        A fix with values that are not finite pauses the flight.
+        A fix with non-finite values pauses the flight.
         """
         if not fix.finite:
             self.pause()
@@ -228,7 +228,7 @@ class PathLaw:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
-        """Advance the path's time: slower beyond the leash, not at all beyond twice the leash."""
+        """Advance the path's time: slower beyond the leash, and not at all beyond twice the leash."""
         share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 

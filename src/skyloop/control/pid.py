@@ -1,9 +1,9 @@
-"""A PID controller of one number and a PI controller of a vector. Pure: the time step is an argument.
+"""A PID controller for a number and a PI controller for a vector. Pure: the time step is an argument.
 
-Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is filtered (section
-3.3); the part that a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains cause no
-jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's integral
-grows only as far as later limits let its output through (conditional integration, section 3.5).
+Both follow Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and is
+filtered (section 3.3); what a limit cuts off is fed back into the integral (back-calculation, section 3.5); new gains
+cause no jump of the output, because the integral term is kept rather than the integral (section 3.6). The vector's
+integral grows only as far as later limits let its output through (conditional integration, section 3.5).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Gains of the error, its integral and its derivative, with their time constants.
+    """Gains for the error, its integral and its derivative, with their time constants.
 
     Raises:
         UsageError: A number is negative or not finite.
@@ -34,7 +34,7 @@ class Gains:
     i: float = 0.0  #: output per unit of error and second
     d: float = 0.0  #: output per change of the measurement per second
     derivative_filter_s: float = 0.05  #: time constant of the low pass before the derivative
-    #: Time constant with which the integral term follows a limited output; None: p/i, or at once without p.
+    #: Time constant of the integral term following a limited output; None uses p/i, or none without p.
     tracking_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -45,17 +45,17 @@ class Gains:
 
     @property
     def tracking_time_s(self) -> float:
-        """The effective time constant of back-calculation [s]."""
+        """Effective time constant of back-calculation [s]."""
         if self.tracking_s is not None:
             return self.tracking_s
         return self.p / self.i if self.i > 0.0 else 0.0
 
 
 class Pid:
-    """A PID loop of one number.
+    """A PID loop for a number.
 
     :attr:`gains` can be replaced in flight. With an integral gain the output does not jump, because the integral term
-    takes up the difference; without one it changes no faster than the rate limit allows.
+    absorbs the difference; without one the output changes no faster than the rate limit allows.
     """
 
     def __init__(
@@ -71,13 +71,13 @@ class Pid:
 
         Args:
             gains: Initial gains.
-            low: Least output.
-            high: Greatest output.
-            rate: Greatest change of the output per second.
-            angle: Whether set-point and measurement are angles [rad]: their difference is the shorter way around.
+            low: Minimum output.
+            high: Maximum output.
+            rate: Maximum change of the output per second.
+            angle: Whether set-point and measurement are angles [rad], whose difference is the shorter way around.
 
         Raises:
-            UsageError: ``low`` is not below ``high``, or ``rate`` is not above 0.
+            UsageError: ``low`` is not less than ``high``, or ``rate`` is not greater than 0.
         """
         if not low < high:
             raise UsageError(f"low is {low!r} and must be below high, which is {high!r}")
@@ -86,7 +86,7 @@ class Pid:
         self._gains = gains
         self._low, self._high, self._rate = low, high, rate
         self._angle = angle
-        self._integral = 0.0  # the term, in units of the output
+        self._integral = 0.0  # the integral term, in units of the output
         self._slope: LowPass[float] = LowPass(gains.derivative_filter_s, 0.0)
         self._measured: float | None = None
         self._error = 0.0
@@ -122,7 +122,7 @@ class Pid:
             set_point: The wanted value.
             measured: The measured value, in the same unit.
             dt_s: Time since the last measurement [s].
-            feed_forward: Added to the output before the limits.
+            feed_forward: Value that is added to the output before the limits.
 
         Returns:
             The output, within ``low`` and ``high`` and the rate limit; unchanged if an argument is not finite.
@@ -139,13 +139,13 @@ class Pid:
         limited = within(self._unlimited, self._low, self._high)
         if self._output is not None and self._rate < math.inf:
             nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
-            # Rounding may carry the sum one bit beyond the limit.
+            # Rounding may take the sum one bit beyond the limit.
             limited = min(nearer, limited) if limited >= self._output else max(nearer, limited)
         self.applied(limited)
         return limited
 
     def applied(self, output: float) -> None:
-        """Report the output really applied, if a limit outside this loop reduced it.
+        """Report the output actually applied, if a limit outside this loop reduced it.
 
         The integral term follows it (back-calculation). :meth:`step` calls this with its own limited output.
 
@@ -160,12 +160,12 @@ class Pid:
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
         """Restart with the integral term that makes ``output`` the next output, so that taking over causes no jump.
 
-        Without an integral gain, error and derivative alone give the next output.
+        Without an integral gain, the error and the derivative alone determine the next output.
 
         Args:
             output: The output applied until now.
             set_point: The current set-point.
-            measured: The current measured value; None counts the error as 0.
+            measured: The current measured value; None assumes an error of 0.
         """
         self._error = 0.0 if measured is None else self._difference(set_point, measured)
         self._integral = output - self._gains.p * self._error if self._gains.i > 0.0 else 0.0
@@ -177,7 +177,7 @@ class Pid:
 
 
 class VectorPi:
-    """A PI loop of a vector. Its integral grows only as far as the output is applied, and not during pauses.
+    """A PI loop for a vector. Its integral grows only as far as the output is applied, and not during pauses.
 
     Attributes:
         integral: The integral term, (n,), in units of the output.
@@ -187,9 +187,9 @@ class VectorPi:
         """Initialise the loop.
 
         Args:
-            gains: The gains; derivative and ``tracking_s`` are unused.
+            gains: The gains; the derivative's and ``tracking_s`` are unused.
             dimensions: Length of the vector.
-            most: Greatest magnitude of the integral term.
+            most: Maximum magnitude of the integral term.
         """
         self.gains = gains
         self._most = most
@@ -202,15 +202,15 @@ class VectorPi:
         return self.gains.p * error + self.integral
 
     def applied(self, asked: Array, applied: Array) -> None:
-        """Undo the integral's growth along the axes in which limits cut the output.
+        """Undo the integral's growth along the axes in which limits cut the output off.
 
         Args:
             asked: The whole set-point that contains the last output, (n,).
-            applied: That set-point after the limits, (n,).
+            applied: The same set-point after the limits, (n,).
         """
         wound_up = (applied - asked) * (self.integral - self._before) < 0.0
         self.integral = np.where(wound_up, self._before, self.integral)
 
     def reset(self) -> None:
-        """Restart without an integral, because another client flew or the measurement is too old."""
+        """Restart with the integral at zero, because another client flew or the measurement is too old."""
         self._before = self.integral = np.zeros_like(self.integral)

@@ -1,4 +1,4 @@
-"""Rehearse a controller in simulated time: with delay, loss and noise, and faster than real time."""
+"""Rehearsal of a controller in simulated time: with delay, loss and noise, and faster than real time."""
 
 from skyloop.stepping.rehearsal import Radio, rehearse
 

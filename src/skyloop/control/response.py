@@ -1,13 +1,13 @@
-"""Model a vehicle's response to velocity set-points: predict its motion, and invert the response. Pure.
+"""A model of a vehicle's response to velocity set-points, to predict its motion and invert the response. Pure.
 
-The model of the vehicle's own loop: ``delay_s`` after a set-point was sent, it demands a lean in proportion to the
-velocity error (plus a trim that the loop learns); the lean follows within ``lag_s``; lean and the air's push accelerate
-the vehicle. The lean is measured. A Kalman filter of velocity and push attributes the rest of the acceleration to the
-push; the trim is the lean that the velocity error does not explain. The model includes all set-points under way, so a
-law can use the velocity at which its set-point will find the vehicle, with gains that would otherwise make it oscillate
-(O. J. M. Smith, "Closer Control of Loops with Dead Time", Chemical Engineering Progress 53(5), 1957). It also cancels
-the push before it becomes an error (a disturbance observer: Ohnishi, Shibata and Murakami, "Motion Control for Advanced
-Mechatronics", IEEE/ASME Trans. Mechatronics 1(1), 1996).
+The model of the vehicle's own loop: ``delay_s`` after a set-point was sent, the loop demands a lean in proportion to
+the velocity error, plus a trim that it learns. The lean follows within ``lag_s``, and together with the air's push it
+accelerates the vehicle. The lean is measured. A Kalman filter for velocity and push attributes the rest of the
+acceleration to the push; the trim is the lean that the velocity error does not explain. The model includes all
+set-points in transit, so a law can use the velocity that the vehicle will have when its set-point takes effect, with
+gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with Dead Time", Chemical
+Engineering Progress 53(5), 1957). It also cancels the push before it becomes an error (a disturbance observer: Ohnishi,
+Shibata and Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans. Mechatronics 1(1), 1996).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from skyloop.messages.geometry import rotation_from_euler
 
 Array = NDArray[np.float64]
 
-_STEP_S = 0.01  # step of the prediction
-_LONGEST_GAP_S = 0.25  # after a longer gap the intervening motion is unknown
-_LONGEST_PREDICTION_S = 0.5  # beyond the last feedback
-_KEPT_SETPOINTS = 64  # newest set-points sent
+_STEP_S = 0.01  # time step of the prediction
+_LONGEST_GAP_S = 0.25  # maximum gap in the feedback; after a longer one the motion during it is unknown
+_LONGEST_PREDICTION_S = 0.5  # maximum prediction beyond the last feedback
+_KEPT_SETPOINTS = 64  # number of newest set-points to keep
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The response of a vehicle's velocity loop. Defaults: the AR.Drone's, as far as public sources give it.
+    """The response of a vehicle's velocity loop. The defaults are the AR.Drone's, as far as public sources give them.
 
     Raises:
         UsageError: A number is out of its range.
@@ -45,11 +45,11 @@ class ResponseSettings:
 
     gain_per_s: float = 2.0  #: acceleration demanded per m/s of velocity error
     lag_s: float = 0.1  #: lag of the lean behind the demand; Engel, Sturm and Cremers, IROS 2012: 10 1/s
-    delay_s: float = 0.05  #: from sending a set-point until the loop uses it
-    tilt_rad: float = 0.5  #: greatest lean that the loop demands; see also ``LandingSettings.within``
-    push_m_s3: float = 1.5  #: how far the air's push wanders within a second [m/s² in √s]
-    velocity_noise_m_s: float = 0.05  #: noise of the velocity in feedback
-    trim_s: float = 0.3  #: time constant with which the trim is learned
+    delay_s: float = 0.05  #: time from sending a set-point until the loop uses it
+    tilt_rad: float = 0.5  #: maximum lean that the loop demands; see also ``LandingSettings.within``
+    push_m_s3: float = 1.5  #: change of the air's push within a second [m/s² in √s]
+    velocity_noise_m_s: float = 0.05  #: noise of the velocity reported in feedback
+    trim_s: float = 0.3  #: time constant for learning the trim
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -62,20 +62,20 @@ class ResponseSettings:
 
     @property
     def most_m_s2(self) -> float:
-        """The greatest horizontal acceleration from leaning."""
+        """Maximum horizontal acceleration from leaning."""
         return GRAVITY_M_S2 * math.tan(self.tilt_rad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Predicted:
-    """The motion when a set-point sent now takes effect; horizontal axes with x along yaw 0.
+    """The motion when a set-point sent now takes effect, in horizontal axes with x along yaw 0.
 
     Attributes:
-        at_ns: Time at which it takes effect.
+        at_ns: Time at which the set-point takes effect.
         moved: Distance moved since the last feedback, (2,) [m].
-        velocity: (2,) [m/s].
-        push: Acceleration by the air, (2,) [m/s²].
-        trim: Acceleration that the loop adds to the demand of the velocity error, (2,) [m/s²].
+        velocity: Velocity, (2,) [m/s].
+        push: Acceleration caused by the air, (2,) [m/s²].
+        trim: Acceleration that the loop adds to what the velocity error demands, (2,) [m/s²].
     """
 
     at_ns: int
@@ -86,23 +86,23 @@ class Predicted:
 
 
 class VelocityResponse:
-    """Predicts a vehicle's horizontal motion from its feedback and the set-points under way."""
+    """Predicts a vehicle's horizontal motion from its feedback and the set-points in transit."""
 
     def __init__(self, settings: ResponseSettings | None = None) -> None:
         """Initialise the model."""
         self.settings = settings or ResponseSettings()
-        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: effective from, velocity
+        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: start, velocity
         self._at_ns: int | None = None
         self._velocity = np.zeros(2)
         self._push = np.zeros(2)
         self._trim = np.zeros(2)
-        self._lean = np.zeros(2)  # acceleration from the lean
-        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push, in each axis
+        self._lean = np.zeros(2)  # acceleration caused by the lean
+        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push per axis
 
     def add(self, feedback: Feedback) -> None:
-        """Update with the next sample. Ignored without velocity or attitude, or if not newer than the last.
+        """Update with the next sample; ignore it if it has no velocity or attitude or is not newer than the last one.
 
-        A sample older by more than half a second restarts the model: the one before was stamped ahead.
+        A sample older by more than half a second restarts the model, because the previous one was stamped ahead.
         """
         if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return
@@ -113,7 +113,7 @@ class VelocityResponse:
         lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * GRAVITY_M_S2)
         before_ns = self._at_ns
         if before_ns is not None and seconds(before_ns - feedback.captured_ns) > _LONGEST_PREDICTION_S:
-            before_ns = None  # that sample was stamped ahead and would hide all samples until then
+            before_ns = None  # the last sample was stamped ahead and would hide all samples until its time
             self._setpoints.clear()
         self._at_ns = max(feedback.captured_ns, before_ns or 0)
         if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:
@@ -124,7 +124,7 @@ class VelocityResponse:
             self._lean = lean
 
     def pause(self) -> None:
-        """Forget the set-points under way, because another client flew the vehicle, and the trim learned from them."""
+        """Forget the set-points in transit, because another client flew the vehicle, and the trim learned from them."""
         self._setpoints.clear()
         self._trim = np.zeros(2)
 
@@ -149,18 +149,18 @@ class VelocityResponse:
         return Predicted(end_ns, moved, velocity, self._push, self._trim)
 
     def setpoint(self, acceleration: Array, motion: Predicted) -> Array:
-        """Return the velocity set-point (2,) [m/s] that gives a wanted acceleration.
+        """Return the velocity set-point (2,) [m/s] that results in a wanted acceleration.
 
         Args:
-            acceleration: Wanted acceleration, (2,) [m/s²]; at most what leaning can give against the push.
-            motion: From :meth:`predict`.
+            acceleration: Wanted acceleration, (2,) [m/s²]; at most what leaning can produce against the push.
+            motion: The motion returned by :meth:`predict`.
         """
         by_lean = shortened(acceleration - motion.push, self.settings.most_m_s2)
         return motion.velocity + (by_lean - motion.trim) / self.settings.gain_per_s
 
     def _asked(self, velocity: Array, at_ns: int) -> Array:
-        """Return the acceleration that the vehicle's loop demands of the lean."""
-        setpoint = velocity  # without a set-point it keeps its velocity
+        """Return the acceleration that the vehicle's loop demands from the lean."""
+        setpoint = velocity  # without a set-point the vehicle keeps its velocity
         for from_ns, asked in reversed(self._setpoints):
             if from_ns <= at_ns:
                 setpoint = asked
@@ -176,7 +176,7 @@ class VelocityResponse:
         self._trim = shortened(self._trim, self.settings.most_m_s2)
 
     def _correct(self, lean: Array, measured: Array, dt: float) -> None:
-        """Run one step of the Kalman filter of velocity and push."""
+        """Run one step of the Kalman filter for velocity and push."""
         s = self.settings
         move, wander = drift(dt, s.push_m_s3**2)
         velocity = self._velocity + (lean + self._push) * dt

@@ -1,4 +1,4 @@
-"""Routes: waypoints with speeds, headings and actions, stored in ``NAME.route.json``, and checks before the flight.
+"""Routes: waypoints with speeds, headings and actions, stored in ``NAME.route.json``, and checks before a flight.
 
 World axes are x east, y north, z up [m]; yaw is counter-clockwise from x [rad]. ``docs/routes.md`` describes the file.
 The checks cover legs, heights, speeds, battery and start.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 ENDING: Final = ".route.json"
 VERSION: Final = 1
-LARGEST_FILE: Final = 65_536  #: bytes
+LARGEST_FILE: Final = 65_536  #: maximum size of a route file [bytes]
 MOST_WAYPOINTS: Final = 200
 
 Metres = Annotated[float, msgspec.Meta(ge=-10_000.0, le=10_000.0)]
@@ -35,15 +35,15 @@ Speed = Annotated[float, msgspec.Meta(ge=0.05, le=30.0)]
 Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Name = Annotated[str, msgspec.Meta(max_length=64)]
 Point = tuple[Metres, Metres]
-SETTLE_S: Final = 1.0  #: extra time of a leg for getting under way and coming to rest
+SETTLE_S: Final = 1.0  #: extra time per leg for accelerating and coming to rest
 LOOK_S: Final = 3.0  #: estimated duration of a look
 PHOTO_S: Final = 1.0  #: estimated duration of a photo
-DESCENT_M_S: Final = 0.4  #: assumed landing speed, for the estimate
-SLACK_M: Final = 0.15  #: same as the proxy's
+DESCENT_M_S: Final = 0.4  #: landing speed assumed by the estimate
+SLACK_M: Final = 0.15  #: tolerance, the same as the proxy's
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Base of the parts of a route."""
+    """Base class for the parts of a route."""
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
@@ -66,13 +66,13 @@ class Look(_Part, frozen=True, tag_field="do", tag="look"):
 
 
 class Wait(_Part, frozen=True, tag_field="do", tag="wait"):
-    """Stay at the waypoint for a time [s]."""
+    """Stay at the waypoint for some time [s]."""
 
     seconds: Seconds
 
 
 class Photo(_Part, frozen=True, tag_field="do", tag="photo"):
-    """Save a frame of a camera; None is the vehicle's first."""
+    """Save a frame from a camera; None for the vehicle's first one."""
 
     camera: Name | None = None
 
@@ -81,16 +81,16 @@ Action = Look | Wait | Photo
 
 
 class RouteWaypoint(_Part, frozen=True):
-    """One waypoint.
+    """A waypoint of a route.
 
     Attributes:
         x: East [m].
         y: North [m].
         z: Up [m].
-        speed: Greatest speed on the way there [m/s]; None: the route's.
-        yaw: Yaw to turn to on the way there [rad]; None keeps the current one.
+        speed: Maximum speed on the way there [m/s]; None for the route's.
+        yaw: Yaw to turn to on the way there [rad]; None keeps the current yaw.
         look_at: Point (x, y) to face instead of a fixed yaw [m].
-        actions: Actions to do there, in this order.
+        actions: Actions to perform there, in this order.
     """
 
     x: Metres
@@ -117,7 +117,7 @@ class RouteWaypoint(_Part, frozen=True):
         return Waypoint(self.x, self.y, self.z, self.yaw if self.look_at is None else self.yaw_to(self.look_at))
 
     def yaw_to(self, point: Point) -> float:
-        """Return the yaw that faces a point from here [rad]."""
+        """Return the yaw that faces a point from this waypoint [rad]."""
         return math.atan2(point[1] - self.y, point[0] - self.x)
 
 
@@ -125,15 +125,15 @@ class Route(_Part, frozen=True, kw_only=True):
     """A route.
 
     Attributes:
-        waypoints: In the order of the flight.
-        name: A name for people.
-        speed: Greatest speed towards waypoints without their own [m/s].
-        end: What to do after the last waypoint: ``hover``, ``land``, or ``return``: fly back to the start of the route
-            at the last waypoint's height, and land.
-        version: Version of the file's format.
+        waypoints: Waypoints in flight order.
+        name: A human-readable name.
+        speed: Maximum speed towards waypoints that don't have their own [m/s].
+        end: What to do after the last waypoint: ``hover``, ``land``, or ``return``, which flies back to the start of
+            the route at the last waypoint's height and lands.
+        version: Version of the file format.
 
     Raises:
-        UsageError: A number is not finite, or there is no waypoint.
+        UsageError: A number is not finite, or there are no waypoints.
     """
 
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
@@ -148,18 +148,18 @@ class Route(_Part, frozen=True, kw_only=True):
             raise UsageError("a route needs at least one waypoint")
 
     def speed_to(self, index: int) -> float:
-        """Return the greatest speed on the way to a waypoint [m/s]; an index past the last means the way back."""
+        """Return the maximum speed on the way to a waypoint [m/s]; an index past the last one is for the way back."""
         own = self.waypoints[index].speed if index < len(self.waypoints) else None
         return self.speed if own is None else own
 
     def to_json(self) -> bytes:
-        """Return the file's content."""
+        """Return the content of the route's file."""
         plain: dict[str, Any] = {"version": self.version, **msgspec.to_builtins(self)}
         return msgspec.json.format(msgspec.json.encode(plain), indent=1) + b"\n"
 
 
 def parse_route(content: bytes | str) -> Route:
-    """Read a route from the content of its file.
+    """Read a route from the content of a file.
 
     Raises:
         UsageError: The content is not a route; the message says where and why.
@@ -174,7 +174,7 @@ def load_route(path: str | Path) -> Route:
     """Read a route file.
 
     Raises:
-        FileFormatError: It can't be read.
+        FileFormatError: The file can't be read.
         UsageError: The file is not a route; the message says where and why.
     """
     content = files.read_text(path, "the route", LARGEST_FILE)
@@ -185,10 +185,10 @@ def load_route(path: str | Path) -> Route:
 
 
 def save_route(route: Route, path: str | Path) -> None:
-    """Write a route file; replace an existing one.
+    """Write a route file, replacing an existing one.
 
     Raises:
-        UsageError: It can't be written, or a number of the route is out of range.
+        UsageError: The file can't be written, or a number in the route is out of range.
     """
     files.write(files.expand(path), checked(route).to_json())
 
@@ -207,20 +207,20 @@ def checked(route: Route) -> Route:
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The conditions that a route is checked against.
+    """The conditions against which a route is checked.
 
     Attributes:
         space: Where flying is allowed.
-        start: Start of the route [m]: the vehicle's position, or above it before a take-off; None: unknown.
+        start: Start of the route [m]: the vehicle's position, or above it before take-off; None if unknown.
         problem: Why the vehicle can't be flown by position; empty if it can.
-        ground_m: Height of the ground in world axes; None: unknown.
-        battery: Current charge, 0 to 1; None: unknown.
-        speed_m_s: Greatest horizontal speed.
-        climb_m_s: Greatest speed up or down.
-        altitude_m: Greatest height above the ground.
+        ground_m: Height of the ground in world axes; None if unknown.
+        battery: Current charge, 0 to 1; None if unknown.
+        speed_m_s: Maximum horizontal speed.
+        climb_m_s: Maximum speed up or down.
+        altitude_m: Maximum height above the ground.
         battery_warn: Charge below which the vehicle warns.
         battery_land: Charge below which the vehicle lands.
-        flight_time_s: Flight time of a full battery.
+        flight_time_s: Flight time with a full battery.
     """
 
     space: Space = field(default_factory=Space)
@@ -237,9 +237,9 @@ class Conditions:
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """A problem of a route, or a warning about it."""
+    """A problem with a route, or a warning about it."""
 
-    waypoint: int | None  #: from 1; None: the whole route. Problems of a leg have the number of its end
+    waypoint: int | None  #: from 1, or None for the whole route; for a leg, the waypoint at its end
     severity: Literal["error", "warning"]
     reason: str
 
@@ -254,7 +254,7 @@ class RouteCheck(msgspec.Struct, frozen=True):
 
     @property
     def ok(self) -> bool:
-        """Whether the route has no errors."""
+        """Whether no errors were found."""
         return all(one.severity != "error" for one in self.findings)
 
 
@@ -298,18 +298,18 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
-    """Check a route against a drone's newest feedback and its parameters. Waits for the proxy's answer.
+    """Check a route against a drone's newest feedback and parameters. Waits for the proxy's answer.
 
     Args:
-        drone: The drone; connected as an observer is enough.
+        drone: The drone; an observer's connection is enough.
         route: The route.
-        wait_s: How long to wait for a position, for example after connecting.
+        wait_s: Time to wait for a position, for example after connecting.
 
     Raises:
         LinkError: The proxy does not answer.
     """
     feedback = None
-    with suppress(LinkError):  # no feedback yet: that becomes a finding
+    with suppress(LinkError):  # having no feedback yet becomes a finding
         if wait_s > 0.0:
             with suppress(NoAnswerError):
                 drone.wait(lambda newest: newest.position_m is not None, wait_s)
@@ -319,10 +319,10 @@ def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
 
 
 def check_route(route: Route, conditions: Conditions) -> RouteCheck:
-    """Check each waypoint, each leg and the whole route.
+    """Check each waypoint, each leg and the route as a whole.
 
-    The estimate adds up each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the actions'
-    times; the battery falls in proportion to that time, by ``flight_time_s``.
+    The estimate adds up the time of each leg at its speed, :data:`SETTLE_S` per leg for starting and stopping, and the
+    duration of the actions. The battery falls in proportion to this time, as given by ``flight_time_s``.
 
     Args:
         route: The route.
@@ -378,7 +378,7 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
 
 
 def _height_problem(place: Vector, c: Conditions) -> str:
-    """Return the problem with a point's height; empty if there is none."""
+    """Return the problem with the height of a point; empty if there is none."""
     ground = c.ground_m
     if ground is None:
         return ""

@@ -1,7 +1,7 @@
-"""Fly routes: the law of their course, the controller for programs, and the photos of any flight along a route.
+"""Route flights: the law that decides their course, the controller for programs, and the photos taken on a route.
 
-Programs, the command line and the cockpit's page all fly routes by this law. It is pure: times are arguments, and it
-decides the next step from the newest feedback.
+Programs, the command line and the cockpit's page all use this law to fly routes. It is pure: times are arguments, and
+it decides on the next step from the newest feedback.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ from skyloop.vision.opencv import opencv
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-TURN_S: Final = 15.0  #: longest wait for a turn
-PHOTO_S: Final = 5.0  #: longest wait for a photo
-SLOWEST: Final = 3.0  #: a leg may take this many times its duration at full speed
-EXTRA_S: Final = 20.0  #: plus this time; then the route pauses
-_NEAR_RAD: Final = 0.12  # yaw error at which a look is done
+TURN_S: Final = 15.0  #: maximum time for a turn
+PHOTO_S: Final = 5.0  #: maximum time for a photo
+SLOWEST: Final = 3.0  #: maximum duration of a leg, as a multiple of that at full speed
+EXTRA_S: Final = 20.0  #: time added to this maximum; after both, the route pauses
+_NEAR_RAD: Final = 0.12  # maximum yaw error at which a look is complete
 ENDED: Final = "a failsafe took over: this program sent nothing for a while, or a link was lost"
 TAKEN: Final = "another command of this program replaced it"
 PHOTOS: Final = "photos"  #: default folder of photos
 LOG: Final = "route"  #: log name of the progress
 WAYPOINTS: Final = "waypoints"  #: log name of the remaining waypoints, for maps
 _QUALITY: Final = 92  # JPEG quality
-_LOG_S: Final = 4.0  #: maps drop places logged more than 10 s ago
+_LOG_S: Final = 4.0  #: interval of logging: maps drop positions logged more than 10 s ago
 
 
 class RouteState(StrEnum):
     """The state of a flight along a route."""
 
     READY = "ready"
-    FLYING = "flying"  #: to the next waypoint
-    ACTING = "acting"  #: at a waypoint
+    FLYING = "flying"  #: flying to the next waypoint
+    ACTING = "acting"  #: performing a waypoint's actions
     PAUSED = "paused"
     DONE = "done"
     STOPPED = "stopped"
@@ -73,9 +73,9 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class TakePhoto:
-    """Save a frame captured from now on, then call :meth:`RouteLaw.photo_done`."""
+    """Save a frame captured after this request, then call :meth:`RouteLaw.photo_done`."""
 
-    waypoint: int  #: from 1
+    waypoint: int  #: number of the waypoint, from 1
     camera: str | None
 
 
@@ -84,7 +84,7 @@ class Progress:
     """A progress report of kind ``route.started``, ``route.waypoint_reached``, ``route.paused`` and so on."""
 
     kind: str
-    waypoint: int  #: the next or the current one; from 1
+    waypoint: int  #: number of the next or current waypoint, from 1
     text: str
 
 
@@ -99,8 +99,8 @@ class RouteLaw:
 
     Attributes:
         state: State of the flight.
-        index: The waypoint ahead, or the one it is at, from 0; past the last one on the way back.
-        problem: Why the law paused without a request; empty otherwise.
+        index: Index of the next or current waypoint, from 0; past the last one on the way back.
+        problem: Why the law paused without being asked to; empty otherwise.
     """
 
     def __init__(self, route: Route) -> None:
@@ -110,11 +110,11 @@ class RouteLaw:
         self.problem = ""
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
-        self._arrived = False  # at the waypoint, whose actions have begun
-        self._skipped_all = False  # while paused: only the route's end remains
+        self._arrived = False  # whether the vehicle is at the waypoint and its actions have begun
+        self._skipped_all = False  # whether, while paused, only the end of the route remains
         self._since_ns: int | None = None  # start of the current action
         self._deadline_ns: int | None = None
-        self._photo: str | None = None  # result of the photo: empty if saved; None: pending
+        self._photo: str | None = None  # result of the photo: empty if saved, None while pending
 
     @property
     def over(self) -> bool:
@@ -123,12 +123,12 @@ class RouteLaw:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the law commands the vehicle now."""
+        """Whether the law is commanding the vehicle now."""
         return self.state in (RouteState.FLYING, RouteState.ACTING)
 
     @property
     def goal(self) -> Waypoint:
-        """The waypoint ahead, or the one it is at."""
+        """The next waypoint, or the one the vehicle is at."""
         return self._goals[self.index].goal
 
     # Requests ---------------------------------------------------------------------------------------------------
@@ -150,14 +150,14 @@ class RouteLaw:
         return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
 
     def pause(self, why: str = "") -> list[Effect]:
-        """Hover until :meth:`resume`; ``why`` is the reason if no person requested it."""
+        """Hover until :meth:`resume`; ``why`` is the reason for a pause that was not requested."""
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
         return [Command(Hover()), self._tell("paused", why or "as asked")]
 
     def resume(self) -> list[Effect]:
-        """Continue straight to the next waypoint, or to the route's end if all were skipped."""
+        """Continue straight to the next waypoint, or to the route's end if all waypoints were skipped."""
         if self.state is not RouteState.PAUSED:
             return []
         if self._skipped_all:
@@ -165,7 +165,7 @@ class RouteLaw:
         return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
 
     def skip(self) -> list[Effect]:
-        """Skip the current waypoint; a paused route stays paused, even if none remains."""
+        """Skip the current waypoint. A paused route stays paused, even if no waypoint remains."""
         if self.over or self.state is RouteState.READY or self._skipped_all:
             return []
         skipped = self._tell("skipped", self._what())
@@ -180,13 +180,13 @@ class RouteLaw:
         return [*([Command(Hover())] if under_way else []), self._tell("stopped", "as asked")]
 
     def photo_done(self, problem: str = "") -> None:
-        """Report the result of the photo; can be called from any thread."""
+        """Report the result of the photo. Can be called from any thread."""
         self._photo = problem
 
     # The vehicle's progress ---------------------------------------------------------------------------------------
 
     def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Take the next step, by the newest feedback.
+        """Take the next step according to the newest feedback.
 
         Args:
             feedback: The newest feedback.
@@ -198,7 +198,7 @@ class RouteLaw:
             self.state, self.problem = RouteState.STOPPED, f"the vehicle is {feedback.state.value}"
             return [self._tell("stopped", self.problem)]
         if lacking(feedback):
-            return []  # the proxy hovers the vehicle meanwhile
+            return []  # meanwhile the proxy makes the vehicle hover
         if self.state is RouteState.FLYING:
             return self._on_the_way(feedback, now_ns)
         return self._act(feedback, now_ns)
@@ -219,7 +219,7 @@ class RouteLaw:
         return [*arrived, *self._act(feedback, now_ns)]
 
     def _act(self, feedback: Feedback, now_ns: int) -> list[Effect]:
-        """Do the actions of the waypoint in turn."""
+        """Perform the waypoint's actions in sequence."""
         effects: list[Effect] = []
         while self._step < len(self._actions):
             action = self._actions[self._step]
@@ -248,7 +248,7 @@ class RouteLaw:
         return []
 
     def _done(self, action: Action, feedback: Feedback, for_s: float) -> tuple[bool, str]:
-        """Return whether an action is done, and its problem."""
+        """Return whether an action is done, and the problem if there was one."""
         if isinstance(action, Wait):
             return for_s >= action.seconds, ""
         if isinstance(action, Look):
@@ -291,16 +291,16 @@ def _name(action: Action) -> str:
 
 
 class FlyRoute(Controller):
-    """Flies along a route and does the actions at its waypoints; :meth:`run` returns at the route's end.
+    """Flies along a route and performs the actions at its waypoints. :meth:`run` returns at the route's end.
 
     The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
     ``data["route"]``, for example ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg,
-    or a failsafe or another command of this program ends it, the route pauses with the reason until :meth:`resume`.
+    or a failsafe or another command from this program ends it, the route pauses, with the reason, until :meth:`resume`.
     :meth:`pause`, :meth:`resume`, :meth:`skip` and :meth:`end` can be called from any thread; they take effect with the
     next feedback.
 
     Attributes:
-        law: The course: its state, waypoint and problem.
+        law: The course of the flight: its state, waypoint and problem.
         photos: Paths of the saved photos.
     """
 
@@ -316,9 +316,9 @@ class FlyRoute(Controller):
 
         Args:
             drone: The drone to fly.
-            route: The route; check it first (:meth:`check`).
-            folder: Folder of photos; created when needed.
-            on_progress: Called with each step, on the thread that runs the controller.
+            route: The route; use :meth:`check` before flying it.
+            folder: Folder for photos; created when needed.
+            on_progress: Function that is called with each step, on the thread that runs the controller.
         """
         super().__init__(drone)
         self.law = RouteLaw(route)
@@ -326,11 +326,11 @@ class FlyRoute(Controller):
         self._folder = Path(folder)
         self._on_progress = on_progress
         self._asked: list[Callable[[], list[Effect]]] = []
-        self._leg: int | None = None  # intent that flies the current leg
+        self._leg: int | None = None  # intent number of the current leg's command
         self._logged_ns: int | None = None
 
     def check(self) -> RouteCheck:
-        """Check the route against the drone's newest feedback and its parameters."""
+        """Check the route against the drone's newest feedback and parameters."""
         return check_for(self.drone, self.law.route)
 
     def pause(self) -> None:
@@ -353,7 +353,7 @@ class FlyRoute(Controller):
         """Take the next step.
 
         Raises:
-            UsageError: Before the start, the vehicle does not report its position or is on the ground.
+            UsageError: At the start, the vehicle does not report its position or is on the ground.
         """
         law = self.law
         if law.state is RouteState.READY:
@@ -378,7 +378,7 @@ class FlyRoute(Controller):
                 self._leg = None
                 if isinstance(effect.action, Position):
                     self._leg = ask(self.drone, effect.action)
-                else:  # the route, not a person, makes it hover or land
+                else:  # the route, not a person, made it hover or land
                     let_go(self.drone, f"the route is {self.law.state.value}", land=isinstance(effect.action, Land))
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
@@ -404,7 +404,7 @@ class FlyRoute(Controller):
             self._on_progress(step)
 
     def _why_ended(self) -> str:
-        """Return why the current leg ended early, once; empty while it is flown."""
+        """Return why the current leg ended early, once; empty while it is being flown."""
         flown = commands(self.drone)
         outcome = None if self._leg is None else flown.outcome(self._leg)
         if outcome is None or not outcome.failed or not flown.may_ask:
@@ -436,7 +436,7 @@ def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} can't be created: {error.strerror or error}") from None
-    while path.exists():  # same time, for example after the clock was set back
+    while path.exists():  # the same time can recur, for example after the clock was set back
         number += 1
         path = folder / f"{moment}-{number}-{name}"
     write(path, jpeg.tobytes())

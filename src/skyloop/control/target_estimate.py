@@ -1,13 +1,13 @@
-"""Estimate a target's position, motion and size from its box in images. Pure: times are on the proxy's clock.
+"""Estimation of a target's position, motion and size from its box in images. Pure: times are on the proxy's clock.
 
-An extended Kalman filter (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
-Wiley 2001, section 10.3) of the position of the target's foot, its horizontal velocity, the foot's height and the
-logarithm of the target's height. Each box gives an azimuth and the slopes to its lower and upper edge. The range comes,
-with an uncertainty, from all available cues: the known size of a class or target; the ground that it stands on, if the
-vehicle knows its own height; and the vehicle's motion, because near things grow faster. Without any cue, the initial
-range is a nominal one, and all ranges scale with it: the law then keeps the apparent size, as in image-based following
-(Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object tracking and following for unmanned
-aerial vehicles", SSRR 2013).
+The estimate is an extended Kalman filter (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", Wiley 2001, section 10.3) of the position of the target's foot, its horizontal velocity, the foot's height
+and the logarithm of the target's height. Each box gives an azimuth and the slopes to its lower and upper edge. The
+range comes, with an uncertainty, from all available cues: the known size of a class or target; the ground below the
+target, if the vehicle knows its own height; and the vehicle's motion, because close things grow faster. Without any
+cue, the initial range is a nominal one and all ranges scale with it: the law then keeps the apparent size, as in
+image-based following (Pestana, Sanchez-Lopez, Campoy and Saripalli, "Vision based GPS-denied object tracking and
+following for unmanned aerial vehicles", SSRR 2013).
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from skyloop.estimation import corrected, drift
 
 Array = NDArray[np.float64]
 
-_NEAREST_M: Final = 0.3  # least range
+_NEAREST_M: Final = 0.3  # minimum range
 _RECKONING_M2_S3: Final = 0.5  # noise intensity of dead reckoning: gusts, and a wrong drag constant
-_LATE_S: Final = 0.5  # later boxes are useless
-_ADAPTING: Final = 0.3  # weight of one box in the average surprise
-_USUAL: Final = 1.5  # surprise up to this counts as noise
+_LATE_S: Final = 0.5  # maximum age of a useful box
+_ADAPTING: Final = 0.3  # weight of a single box in the average surprise
+_USUAL: Final = 1.5  # maximum surprise that counts as noise
 _MOST_SURPRISE: Final = 4.0  # limit of a single box in the average
-_STRAIGHT_S: Final = 4.0  # longest straight prediction of an unseen target
-_GONE_S: Final = 0.2  # a target unseen for longer, and for more than one or two images, is hidden
-_GONE_INTERVALS: Final = 2.5  # ... measured in intervals between boxes
-_BEFORE_S: Final = 0.2  # this long before the last sighting, the occluder had not begun to cut off the box
+_STRAIGHT_S: Final = 4.0  # maximum time to predict an unseen target's straight motion
+_GONE_S: Final = 0.2  # minimum time unseen after which a target counts as hidden ...
+_GONE_INTERVALS: Final = 2.5  # ... and the minimum number of intervals between boxes
+_BEFORE_S: Final = 0.2  # time before the last sighting when the occluder had not begun to cut off the box
 _GATE: Final = 4.0  # standard deviations of the azimuth
-_EDGE_GATE: Final = 3.0  # standard deviations of an edge: beyond it the edge is hidden or belongs to another thing
-_OUTGROWN: Final = 3.0  # standard deviations by which both edges lie outside
-_PACE_PER_S: Final = 0.2  # velocity deviation per metre of a guessed range
-LEAST_SLOPE: Final = 0.04  # below this slope an edge's height says nothing about the range
+_EDGE_GATE: Final = 3.0  # standard deviations of an edge, beyond which it is hidden or not the target's
+_OUTGROWN: Final = 3.0  # standard deviations by which both edges are too far out
+_PACE_PER_S: Final = 0.2  # velocity deviation per metre of the guessed range
+LEAST_SLOPE: Final = 0.04  # minimum slope at which an edge's height reveals the range
 SURE_OF_SIZE: Final = 0.4  # deviation of the log height from which the size counts as unknown
 
 
@@ -55,12 +55,12 @@ class Traits:
     """Prior knowledge about a kind of target.
 
     Attributes:
-        height_m: Height; None: unknown.
-        height_share: Standard deviation of the height, as a share of it.
-        radius_m: Distance from its middle to its visible lower edge.
-        intensity_m2_s3: Intensity of the random acceleration: within a second the velocity wanders by its root.
-        on_ground: Whether it stands on the ground. None: assumed for a target with a class; for others one hypothesis
-            among several (:mod:`.target_range`).
+        height_m: Height; None if unknown.
+        height_share: Standard deviation of the height, as a fraction of the height.
+        radius_m: Distance from the target's middle to its visible lower edge.
+        intensity_m2_s3: Intensity of the random acceleration; its root is the change of the velocity within a second.
+        on_ground: Whether the target is on the ground. None assumes so for a target with a class; for others it is one
+            hypothesis among several (:mod:`.target_range`).
 
     Raises:
         UsageError: A number is out of its range.
@@ -81,7 +81,7 @@ class Traits:
                 raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
 
 
-#: Traits by class name, with the typical spread of heights; a bus is not a car.
+#: Traits by class name, with the typical spread of heights. A bus is not a car.
 TRAITS: Final = {
     "person": Traits(height_m=1.74, height_share=0.06, radius_m=0.25, intensity_m2_s3=0.6),
     "car": Traits(height_m=1.45, height_share=0.2, radius_m=1.2, intensity_m2_s3=3.0),
@@ -96,18 +96,18 @@ UNKNOWN: Final = Traits(radius_m=0.1)  #: a target without a class
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetState:
-    """The state of a target at one time.
+    """The state of a target at a point in time.
 
     Attributes:
-        at_ns: On the proxy's clock.
-        foot: Position of its foot, (3,) [m]: odometry axes, the third above the ground.
-        velocity: Horizontal velocity, (2,) [m/s]; through the air if the vehicle does not report its own.
-        height_m: Its height.
-        place_m: Standard deviation of its position: the root of the summed horizontal variances.
-        range_m: Horizontal distance from the camera that saw it last.
+        at_ns: Time of the state on the proxy's clock.
+        foot: Position of the target's foot, (3,) [m]: in odometry axes, but with its height above the ground.
+        velocity: Horizontal velocity, (2,) [m/s]; relative to the air if the vehicle does not report its own.
+        height_m: Height of the target.
+        place_m: Standard deviation of the position: the root of the sum of the horizontal variances.
+        range_m: Horizontal distance from the camera that last saw the target.
         range_deviation_m: Standard deviation along the line of sight.
-        range_known: Whether the range is good enough to fly by; False while it is only a guess.
-        margin_m: Extra distance to keep, because the target may be nearer; 0 for a target on the ground.
+        range_known: Whether the range is good enough to fly by; False if it is only a guess.
+        margin_m: Extra distance to keep because the target may be closer; 0 for a target on the ground.
     """
 
     at_ns: int
@@ -133,12 +133,12 @@ class _Estimate(NamedTuple):
 
 
 class TargetEstimator:
-    """The filter of one target.
+    """The filter for one target.
 
     Attributes:
-        traits: Prior knowledge.
-        refused: Consecutive boxes that did not fit.
-        seen_ns: Capture of the last box that fit; None before :meth:`start`.
+        traits: Prior knowledge about the target.
+        refused: Number of consecutive boxes that did not fit.
+        seen_ns: Capture time of the last box that fit; None before :meth:`start`.
     """
 
     def __init__(self, traits: Traits = UNKNOWN, *, nominal_m: float = 4.0, relative: bool = False) -> None:
@@ -146,7 +146,7 @@ class TargetEstimator:
 
         Args:
             traits: Prior knowledge about the target.
-            nominal_m: Assumed initial distance if there is no cue.
+            nominal_m: Initial distance to assume if there is no cue.
             relative: Whether the vehicle's own velocity comes from dead reckoning, whose changing error adds to the
                 target's motion.
         """
@@ -159,17 +159,17 @@ class TargetEstimator:
         self._state = np.zeros(6)  # x, y, velocities, foot's height, log of the height
         self._covariance = np.eye(6)
         self._surprise = 1.0  # recent mean of the squared Mahalanobis distance of azimuth and size, about 1
-        self._eye: Array = np.zeros(3)  # position of the camera that saw it last
-        self._before: deque[_Estimate] = deque()  # estimates of earlier boxes, back to _BEFORE_S
+        self._eye: Array = np.zeros(3)  # position of the camera that last saw the target
+        self._before: deque[_Estimate] = deque()  # estimates from earlier boxes, back to _BEFORE_S
         self._interval_s = 0.0  # time between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
-        """Start from the first box.
+        """Start from a first box.
 
         Args:
             view: Directions of the box.
             camera: The camera that took the image.
-            at_ns: Capture of the image.
+            at_ns: Capture time of the image.
             ground: Whether the camera's height above the ground is known.
         """
         traits, height = self.traits, float(camera.position[2])
@@ -212,14 +212,14 @@ class TargetEstimator:
         self._begin(self._state, covariance, camera, at_ns)
 
     def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
-        """Start from the first box at a guessed range, with the size that explains the box.
+        """Start from a first box at a guessed range, with the size that explains the box.
 
         Args:
-            distance_m: The range; foot and height scale with it.
-            share: Standard deviation of the range, as a share of it.
+            distance_m: The guessed range, with which foot and height scale.
+            share: Standard deviation of the range, as a fraction of the range.
             view: Directions of the box.
             camera: The camera that took the image.
-            at_ns: Capture of the image.
+            at_ns: Capture time of the image.
         """
         bottom = -0.2 if view.bottom is None else view.bottom
         top = 0.2 if view.top is None else view.top
@@ -237,9 +237,9 @@ class TargetEstimator:
         self.loosen(distance_m)
 
     def loosen(self, distance_m: float) -> None:
-        """Right after the start, assume a target faster in proportion to its range.
+        """Assume, right after the start, that the target's speed is in proportion to its range.
 
-        Otherwise boxes that hardly move would favour the farthest of several guesses.
+        Without this, boxes that hardly move would favour the farthest of several guesses.
 
         Args:
             distance_m: The guessed range.
@@ -260,9 +260,9 @@ class TargetEstimator:
         """Measure how badly a box fits.
 
         Returns:
-            The squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own boxes;
+            The squared Mahalanobis distance divided by the number of measurements, about 1 for the target's own boxes,
             and the box's negative log-likelihood, up to a constant that is the same for all filters. Both are infinite
-            for a box that is too large above and below: occlusion hides parts of a target but never adds any.
+            for a box that is too large above and below, because occlusion hides parts of a target but never adds any.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
@@ -276,12 +276,12 @@ class TargetEstimator:
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
         """Update with a box.
 
-        An edge far from its expected position is ignored as hidden. A box in another direction is refused.
+        An edge far from its expected position is ignored as hidden. A box in a different direction is refused.
 
         Args:
             view: Directions of the box.
             camera: The camera that took the image.
-            at_ns: Capture of the image.
+            at_ns: Capture time of the image.
 
         Returns:
             Whether the box was used; False also for a box more than half a second older than the newest.
@@ -315,9 +315,9 @@ class TargetEstimator:
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state: it moves for at most four seconds, while the uncertainty keeps growing.
+        """Predict the target's state. It moves for at most four seconds, while the uncertainty keeps growing.
 
-        A hidden target keeps its motion from shortly before: the occluder cuts off its last boxes.
+        A hidden target keeps its motion from shortly before, because the occluder cuts off its last boxes.
 
         Args:
             at_ns: The time to predict for.
@@ -347,10 +347,10 @@ class TargetEstimator:
         return TargetEstimator(self.traits, nominal_m=self.at(at_ns).range_m, relative=self._relative)
 
     def _predict(self, at_ns: int) -> tuple[Array, Array]:
-        """Return state and covariance at a time.
+        """Return the state and covariance at a time.
 
-        For a time shortly before the newest box (detections from other processes arrive late) the state moves back and
-        the covariance stays.
+        For a time shortly before the newest box (detections from other processes arrive late), the state is moved back
+        and the covariance is unchanged.
         """
         dt = seconds(at_ns - self._at_ns)
         if dt <= 0.0:
@@ -382,7 +382,7 @@ def _moved(state: Array, dt_s: float) -> Array:
 
 
 def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) -> tuple[Array, Array, Array]:
-    """Return measured minus expected, its derivative by the state, and the noise covariance; azimuth first."""
+    """Return measured minus expected values, azimuth first, their derivative by the state, and the noise covariance."""
     eye = camera.position
     dx, dy = float(state[0] - eye[0]), float(state[1] - eye[1])
     distance = max(_NEAREST_M, math.hypot(dx, dy))
@@ -399,7 +399,7 @@ def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) ->
     ):
         expected = (level - float(eye[2])) / away
         if slope is None and bound is not None and side * (expected - bound) < 0.0:
-            slope = bound  # otherwise the edge would be visible, so it is at least this near
+            slope = bound  # otherwise the edge would be visible, so the target is at least this close
         if slope is None:
             continue
         rows.append(slope - expected)

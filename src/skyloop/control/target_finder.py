@@ -1,9 +1,9 @@
-"""Find one target in a series of images, by a box tracker and, if there is a detector, by detections.
+"""Find a target in a series of images by a box tracker and, if there is a detector, by detections.
 
-No drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows the
-target's appearance; the scene (:mod:`.target_scene`) knows where everything is and how it moves. Each finds the target
-where the other fails, and neither may mistake something else for it: the tracker's box must be where the target can be,
-and a thing that appears after a loss must be where the target can be, look like it, and be the only such thing.
+It has no drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows
+the target's appearance, and the scene (:mod:`.target_scene`) knows where everything is and how it moves. Each finds the
+target where the other fails, and neither may mistake another object for it: the tracker's box must be where the target
+can be, and an object that appears after a loss must be where the target can be, look like it, and be the only one to.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from skyloop.vision.appearance import colours
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, overlap_area
 
-_SAME: Final = 0.4  # overlap from which two boxes show the same thing
-_POINTED_AT: Final = 0.3  # overlap of the user's box with the detection that it selects
-_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges, as a share of the box height; a detector's are sharper
-_BESIDE_LATE: Final = 0.25  # the same while late detections give the size, which the tracker gets wrong in the long run
-_TAKEN: Final = 0.5  # share of the tracker's box inside another thing's detection
-_FITS: Final = 12.0  # squared Mahalanobis distance per measurement up to which a box can be the target's
-_DOUBT: Final = 6  # consecutive images with the tracker's box where the target can't be
-_LATELY_S: Final = 1.0  # keep clear of others for this long after they were seen
-_DORMANT_S: Final = 1.0  # after this long unseen, the target must be recognised again
-_SIMILAR: Final = 1.6  # mean colour unlikeness up to which a newcomer may be the target
-_LOOKED_AT: Final = 5  # images needed to judge a newcomer
-_LOOKED_AT_IN_DOUBT: Final = 10  # images needed if in doubt: its motion must be known
-_LOOKED_AT_LONGEST: Final = 20  # after this many images a rejected newcomer is no longer considered
-_OF_LATE: Final = 8  # images that dominate the mean
-_TWIN: Final = 0.6  # unlikeness up to which only place and motion distinguish another thing from the target
-_TWIN_S: Final = 60.0  # for this long after a twin was seen, a newcomer may be the twin
-_TWIN_OFF_M: Final = 1.0  # then a newcomer may be this far from the target's expected place ...
-_TWIN_OFF_M_S: Final = 0.5  # ... and differ this much in velocity
-_OTHER_WAY_M_S: Final = 2.2  # greatest difference between a newcomer's velocity and the target's before it was hidden
-_GOES_ON_S: Final = 6.0  # for this long a hidden target is assumed to keep its direction
-_CLEARLY: Final = 1.0  # margin by which every other newcomer must be more unlike
-_FAST_M_S: Final = 4.0  # greatest assumed speed of an unseen thing
-_KEPT_FRAMES: Final = 12  # frames kept for detections that arrive late
+_SAME: Final = 0.4  # overlap from which two boxes show the same object
+_POINTED_AT: Final = 0.3  # overlap between the user's box and the detection that it selects
+_TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges, a fraction of the box height; a detector's are sharper
+_BESIDE_LATE: Final = 0.25  # the same while late detections give the size, on which the tracker drifts
+_TAKEN: Final = 0.5  # fraction of the tracker's box that is inside another object's detection
+_FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
+_DOUBT: Final = 6  # number of consecutive images with the tracker's box where the target can't be
+_LATELY_S: Final = 1.0  # time to keep clear of others after they were last seen
+_DORMANT_S: Final = 1.0  # time out of sight after which the target must be recognised again
+_SIMILAR: Final = 1.6  # maximum mean colour unlikeness of a newcomer that may be the target
+_LOOKED_AT: Final = 5  # number of images needed to judge a newcomer
+_LOOKED_AT_IN_DOUBT: Final = 10  # number of images needed in case of doubt, to know its motion
+_LOOKED_AT_LONGEST: Final = 20  # number of images after which a rejected newcomer is no longer considered
+_OF_LATE: Final = 8  # number of images that dominate the mean
+_TWIN: Final = 0.6  # unlikeness up to which only place and motion tell another object from the target
+_TWIN_S: Final = 60.0  # time after the last sighting of a twin during which a newcomer may be the twin
+_TWIN_OFF_M: Final = 1.0  # in that time, maximum distance of a newcomer from the target's expected position ...
+_TWIN_OFF_M_S: Final = 0.5  # ... plus this for each second unseen [m/s]
+_OTHER_WAY_M_S: Final = 2.2  # maximum change from the target's velocity before it was hidden to a newcomer's
+_GOES_ON_S: Final = 6.0  # time for which a hidden target is assumed to keep its direction
+_CLEARLY: Final = 1.0  # margin by which all other newcomers must be less similar
+_FAST_M_S: Final = 4.0  # maximum assumed speed of an unseen object
+_KEPT_FRAMES: Final = 12  # number of frames kept for detections that arrive late
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
     """The result of searching one image."""
 
-    box: Box | None  #: x, y, width, height [px]; None: the target was not found
-    confidence: float | None  #: 0 to 1: the tracker's chance to be right, or a detection's score
-    contested: bool = False  #: the target may be in view, but the sighting may be of something else
+    box: Box | None  #: x, y, width, height [px]; None if the target was not found
+    confidence: float | None  #: 0 to 1: the probability that the tracker is right, or a detection's score
+    contested: bool = False  #: the target may be in view, but the sighting may be of another object
 
 
 @dataclass(slots=True, eq=False)
@@ -68,11 +68,11 @@ class _Seen:
 
 
 class TargetFinder:
-    """Finds one target in image after image.
+    """Finds a target in a sequence of images.
 
     Attributes:
         estimator: The target's motion; None before the first sighting.
-        class_name: Class of the target, if known.
+        class_name: Class of the target, if it is known.
         detections: Detections in the newest image searched by a detector.
     """
 
@@ -88,10 +88,10 @@ class TargetFinder:
         """Initialise the finder.
 
         Args:
-            box: The target in the first image: x, y, width, height [px].
-            class_name: Without a box, the largest detection of this class is the target; with a box, its class.
-            traits: Traits of the target; None: those of its class.
-            nominal_m: Assumed initial distance if there is no cue.
+            box: Box of the target in the first image: x, y, width, height [px].
+            class_name: Class of the target in the box; without a box, its largest detection is the target.
+            traits: Traits of the target; None for those of its class.
+            nominal_m: Initial distance to assume if there is no cue.
             relative: Whether the vehicle does not know its own velocity.
 
         Raises:
@@ -113,10 +113,10 @@ class TargetFinder:
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
         self._middle: tuple[float, float] | None = None  # expected position of the target in the newest image [px]
         self._doubts = 0
-        self._twin_ns: int | None = None  # last sighting of a look-alike beside the target
+        self._twin_ns: int | None = None  # time of the last sighting of a look-alike in addition to the target
         self._newcomers: dict[int, tuple[int, float]] = {}  # number of images, and mean unlikeness to the target
         self._ground = False  # whether the camera's height above the ground is known in the newest image
-        self._agreed = 0  # consecutive images in which tracker and detection agree
+        self._agreed = 0  # number of consecutive images in which tracker and detection agree
 
     def see(
         self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
@@ -124,11 +124,11 @@ class TargetFinder:
         """Find the target in the next image.
 
         Args:
-            image: A :class:`skyloop.Frame` or an array, as for trackers.
-            camera: The camera that took it.
-            captured_ns: Capture of the image, on the proxy's clock.
+            image: A :class:`skyloop.Frame` or an array like those for trackers.
+            camera: The camera that took the image.
+            captured_ns: Capture time of the image on the proxy's clock.
             ground: Whether the camera's height above the ground is known.
-            detections: Detections in it; None: it was not searched.
+            detections: Detections in the image; None if it was not searched.
 
         Raises:
             UsageError: The first box does not fit into the image.
@@ -157,8 +157,8 @@ class TargetFinder:
     def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> bool:
         """Use detections that arrive after their image; return whether they show, or may show, the target.
 
-        If the tracker missed the target in that image, or found it elsewhere, it restarts from there. Detections of an
-        image that is not among the last ones given to :meth:`see` are ignored.
+        If the tracker missed the target in that image or found it elsewhere, it restarts from there. Detections are
+        ignored if their image is not among the last ones given to :meth:`see`.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
         if frame is None:
@@ -170,20 +170,20 @@ class TargetFinder:
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
-            # The target is identified without the tracker, whose model failed to recognise it: drop that model.
+            # The target is identified without the tracker, whose model failed to recognise it: so drop that model.
             self._tracking = self._tracking and frame.box is not None
             self._resume(frame.image, target.detection.box)
-            # The tracker's next step begins in that image, not in the newest.
+            # The tracker's next step begins in that image, not in the newest one.
             self._middle = frame.camera.pixel(target.estimator.at(captured_ns).middle)
         return True
 
     @property
     def target(self) -> SceneObject | None:
-        """The target among the detected things; None if no detector knows it."""
+        """The target among the detected objects; None if no detector knows it."""
         return None if self._scene is None or self._number is None else self._scene.objects.get(self._number)
 
     def candidate(self, at_ns: int) -> TargetState | None:
-        """Return the state of a recently seen thing that may be the lost target and is worth a closer look."""
+        """Return the state of a recently seen object that may be the lost target and deserves a closer look."""
         scene, found = self._scene, None
         if scene is None or self._number not in scene.dormant:
             return None
@@ -196,7 +196,7 @@ class TargetFinder:
         return None if found is None else found[1].estimator.at(at_ns)
 
     def others(self, at_ns: int) -> list[TargetState]:
-        """Return the states of things detected in the last second, without the target."""
+        """Return the states of objects detected in the last second, excluding the target."""
         if self._scene is None:
             return []
         return [
@@ -206,7 +206,7 @@ class TargetFinder:
         ]
 
     def _shift(self, camera: Camera, captured_ns: int) -> None:
-        """Tell the tracker how far turning, flying and the target's own motion have moved the target in the image."""
+        """Tell the tracker how far rotation, flight and the target's own motion have moved the target in the image."""
         if self.estimator is None or self._middle is None:
             return
         middle = camera.pixel(self.estimator.at(captured_ns).middle)
@@ -224,7 +224,7 @@ class TargetFinder:
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
     def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
-        """Decide where the target is in this image, by its detection or by the tracker."""
+        """Decide where the target is in this image, from its detection or the tracker."""
         target, estimator = self.target, self.estimator
         if estimator is None:
             return Sighting(None, None)
@@ -235,7 +235,7 @@ class TargetFinder:
                 self._resume(image, box)
             return Sighting(box, tracked.confidence if agrees else target.detection.score)
         contested = target is not None and target.contested
-        # It is unknown which of two things the tracker stayed with while they were one.
+        # It is unknown which of two objects the tracker followed while they appeared as one.
         unsure = target is not None and target.contested_ns > (target.estimator.seen_ns or 0)
         if tracked.box is None or unsure or self._is_taken(tracked.box):
             return Sighting(None, None, contested)
@@ -262,7 +262,7 @@ class TargetFinder:
         return Sighting(box, tracked.confidence)
 
     def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
-        """Return whether an unseen target can have reached the tracker's box; if so, move the estimate there."""
+        """Return whether an unseen target can have reached the tracker's box and, if so, move the estimate there."""
         assert estimator.seen_ns is not None
         unseen_s = seconds(captured_ns - estimator.seen_ns)
         if unseen_s < _DORMANT_S or self._number is not None:
@@ -279,8 +279,8 @@ class TargetFinder:
     def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
         """Return whether the tracker's box may be the target's, according to the detector.
 
-        A tracker may continue on whatever hides the target. For a target that the detector knows, trust the tracker
-        only between searched images, for a second.
+        The tracker may stay on whatever hides the target. If the detector knows the target, trust the tracker only
+        between searched images, and only for a second.
         """
         target, scene = self.target, self._scene
         if box is None or target is None or scene is None or target.seen:
@@ -290,7 +290,7 @@ class TargetFinder:
         return detections is None or any(overlap(one.box, box) >= _SAME for one in detections)
 
     def _is_taken(self, box: Box) -> bool:
-        """Return whether the box belongs to another thing, by that thing's detection in this image."""
+        """Return whether the box belongs to another object, according to that object's detection in this image."""
         if self._scene is None or self._number is None:
             return False
         now, taken = self._frames[-1].captured_ns, _TAKEN * box[2] * box[3]
@@ -326,7 +326,7 @@ class TargetFinder:
         if target is not None:
             if target.seen and self._is_unsure(scene, target):
                 target.estimator = self._learning(target, frame, back=True)
-            self.estimator = target.estimator  # two confused things may have been exchanged
+            self.estimator = target.estimator  # two confused objects may have been exchanged
         if target is None:
             self._choose(scene, frame, tracked)
         elif target.number in scene.dormant:
@@ -357,7 +357,7 @@ class TargetFinder:
             self._adopt(scene, best, frame)
 
     def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
-        """Accept a newcomer as the target if it can be the target, looks like it, and is the only such thing."""
+        """Accept a newcomer as the target if it can be the target, looks like it, and is the only such object."""
         assert target.estimator.seen_ns is not None
         likely: list[tuple[float, SceneObject]] = []
         for each in scene.objects.values():
@@ -369,7 +369,7 @@ class TargetFinder:
                 continue
             images, mean = self._newcomers.get(each.number, (0, 0.0))
             if images and not self._is_expected(target, each, mean, frame.captured_ns):
-                images = 0  # start over: two things may have merged in an image
+                images = 0  # start over, because two objects may have merged in an image
             if each.whole:
                 images += 1
                 mean += (unlikeness(target.looks, each.places) - mean) / min(images, _OF_LATE)
@@ -383,16 +383,16 @@ class TargetFinder:
         if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
-            return  # they can't be distinguished
+            return  # they are indistinguishable
         if not self._is_expected(target, found, mean, frame.captured_ns):
             return
-        # While a thing comes out of hiding, its first boxes also show the occluder, so keep the old colours.
+        # When an object reappears, its first boxes also show the occluder, so keep the old colours.
         found.looks, found.hits = target.looks, target.hits + found.hits
         self._adopt(scene, found, frame, back=True)
         del scene.objects[target.number]
 
     def _note_twins(self, scene: Scene, target: SceneObject, at_ns: int) -> None:
-        """Note whether a look-alike is in view beside the target."""
+        """Note whether a look-alike is in view in addition to the target."""
         if target.seen and any(
             each.seen and each.whole and each.confirmed and unlikeness(target.looks, each.looks) < _TWIN
             for each in scene.objects.values()
@@ -401,7 +401,7 @@ class TargetFinder:
             self._twin_ns = at_ns
 
     def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
-        """Return whether a newcomer moves like the target and, if the target has a twin, is where it should be."""
+        """Return whether a newcomer moves like the target and, if there is a twin, is where the target should be."""
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
@@ -415,13 +415,13 @@ class TargetFinder:
         return self.class_name is None or each.class_name == self.class_name
 
     def _is_unsure(self, scene: Scene, thing: SceneObject) -> bool:
-        """Return whether a thing is assumed to stand on the ground but might hang on a wall."""
+        """Return whether an object is assumed to be on the ground but might hang on a wall."""
         traits = scene.traits.get(thing.class_name)
         unsure = traits is None or (traits is self._given and self._unnamed and traits.on_ground is None)
         return unsure and not isinstance(thing.estimator, RangeEstimator)
 
     def _learning(self, thing: SceneObject, frame: _Seen, *, back: bool) -> TargetEstimator:
-        """Return the filter that learns the range of a thing seen in a frame; with ``back``, of a returned target."""
+        """Return the filter that learns the range of an object seen in a frame; with ``back``, of a returned target."""
         before = self.estimator
         if isinstance(before, RangeEstimator) and not back:
             return before

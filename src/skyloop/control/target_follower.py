@@ -1,6 +1,6 @@
-"""Follow anything: the content of a box in the image, or anything of a class.
+"""Follow any target: the content of a box in the image, or any object of a class.
 
-:class:`TargetFollower` finds the target in frames and computes the set-points, without thread or clock;
+:class:`TargetFollower` finds the target in frames and computes the set-points; it has no thread or clock.
 :class:`FollowTarget`, or a page, gives it frames and feedback and sends the set-points.
 """
 
@@ -41,9 +41,9 @@ Array = NDArray[np.float64]
 _SEEN: Final[Colour] = (64, 220, 100)
 _LOST: Final[Colour] = (255, 180, 60)
 _OTHER: Final[Colour] = (150, 150, 150)
-_TRACE_S: Final = 4.0  # length of the drawn track
-_TRACE_EACH_S: Final = 0.2  # between points of the drawn track
-_FEET_M: Final = 0.08  # below the body's centre; heights above the ground are measured from there
+_TRACE_S: Final = 4.0  # duration of the drawn track
+_TRACE_EACH_S: Final = 0.2  # interval between points of the drawn track
+_FEET_M: Final = 0.08  # distance of the feet below the body's centre; heights are measured from the feet
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,25 +52,25 @@ class FollowStatus:
 
     phase: str
     mode: FollowMode
-    box: Box | None  #: box of the target in the newest frame [px]; None: not seen in it
-    confidence: float | None  #: 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
+    box: Box | None  #: box of the target in the newest frame [px]; None if the frame does not show it
+    confidence: float | None  #: confidence, 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
     class_name: str | None
-    predicted_px: tuple[float, float] | None = None  #: expected position of its middle in the newest frame
+    predicted_px: tuple[float, float] | None = None  #: expected position of the target's middle in the newest frame
     range_m: float | None = None  #: horizontal distance from the camera
     range_deviation_m: float | None = None
-    bearing_rad: float | None = None  #: counter-clockwise from straight ahead
+    bearing_rad: float | None = None  #: angle to the target, counter-clockwise from straight ahead
     speed_m_s: float | None = None  #: speed of the target; None if the vehicle does not know its own
-    lost_s: float = 0.0  #: time since the last sighting; 0 while it is seen, and before the first sighting
-    problem: str = ""  #: obstacle to following as wanted; empty if there is none
-    unknown: str = ""  #: unknown part of the vehicle's motion, for which it must hover, whatever the set-point
+    lost_s: float = 0.0  #: time since the last sighting; 0 while the target is in sight and before the first sighting
+    problem: str = ""  #: why following as wanted is not possible; empty if it is
+    unknown: str = ""  #: unknown part of the vehicle's motion, which makes it hover whatever the set-point
 
 
 class TargetFollower(AirframeLaw):
-    """Follows one target. Call it from one thread.
+    """Follows a target. Call it from one thread.
 
     Attributes:
-        mode: How to follow; can be changed in flight.
-        over: Whether it gave up because the target was lost for too long.
+        mode: How to follow the target; can be changed in flight.
+        over: Whether the follower gave up because the target was lost for too long.
     """
 
     def __init__(
@@ -88,14 +88,14 @@ class TargetFollower(AirframeLaw):
         """Initialise the follower.
 
         Args:
-            camera: The camera and its mounting; it must look forward.
-            box: The target in the first frame given to :meth:`look`: x, y, width, height [px].
-            class_name: Follow the largest thing of this class, if there is no box; needs detections.
+            camera: The camera, including its mounting; it must look forward.
+            box: Box of the target in the first frame given to :meth:`look`: x, y, width, height [px].
+            class_name: Class of which to follow the largest object if there is no box; needs detections.
             mode: How to follow.
-            detector: Detector to run on every frame, on the thread that calls :meth:`look`.
-            detects: Whether detections arrive from elsewhere, by :meth:`detected`.
-            traits: Prior knowledge about the target; None: that of its class.
-            settings: Settings of the law; None are the defaults.
+            detector: Detector to run on every frame on the thread that calls :meth:`look`.
+            detects: Whether detections arrive from elsewhere through :meth:`detected`.
+            traits: Prior knowledge about the target; None for that of its class.
+            settings: Settings of the law; None for the defaults.
 
         Raises:
             UsageError: There is neither a box nor a class, a class has no detections, the camera does not look forward,
@@ -116,7 +116,7 @@ class TargetFollower(AirframeLaw):
         self._detector = detector
         self._box, self._class_name, self._traits = box, class_name, traits
         self._finder: TargetFinder | None = None
-        self._seen_ns: int | None = None  # capture of the last frame that showed, or may have shown, the target
+        self._seen_ns: int | None = None  # capture time of the last frame that showed, or may have shown, the target
         self._sighting = Sighting(None, None)
         self._view: Camera | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
@@ -124,7 +124,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def settings(self) -> ChaseSettings:
-        """Goal, gains and limits; can be replaced in flight."""
+        """Goal, gains and limits. Can be replaced in flight."""
         return self._law.settings
 
     @settings.setter
@@ -133,7 +133,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def mode(self) -> FollowMode:
-        """How to follow; can be changed in flight."""
+        """How to follow the target. Can be changed in flight."""
         return self._law.mode
 
     @mode.setter
@@ -142,12 +142,12 @@ class TargetFollower(AirframeLaw):
 
     @property
     def phase(self) -> TargetPhase:
-        """Phase as of the last set-point."""
+        """Phase at the last set-point."""
         return self._law.phase
 
     @property
     def over(self) -> bool:
-        """Whether the follower gave up."""
+        """Whether the follower has given up."""
         return self.phase is TargetPhase.GIVEN_UP
 
     @property
@@ -157,7 +157,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def finder(self) -> TargetFinder | None:
-        """The finder of the target; None before the first frame."""
+        """Finder of the target; None before the first frame."""
         return self._finder
 
     def feedback(self, feedback: Feedback) -> None:
@@ -169,7 +169,7 @@ class TargetFollower(AirframeLaw):
             self._law.feedback(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart set-points from rest; keep the target."""
+        """Restart the set-points from rest and keep the target."""
         super().pause()
         self._law.pause()
 
@@ -189,7 +189,7 @@ class TargetFollower(AirframeLaw):
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:
-            state = None  # stamped ahead, or no recent feedback: the camera's pose is unknown
+            state = None  # the frame is stamped ahead or there is no recent feedback, so the pose is unknown
         # A vehicle without a known velocity hovers at its last position.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
@@ -202,7 +202,7 @@ class TargetFollower(AirframeLaw):
             body[2] = state.altitude_m + _FEET_M
         rates = (0.0, 0.0)
         if state.angular_velocity_rad_s is None and state.yaw_rad is not None:
-            # Without a gyroscope, attitude arrives rarely, and images are stamped on arrival.
+            # Without a gyroscope, the attitude arrives rarely and images are stamped on arrival.
             rates = motion.yaw_rate, self.airframe.tilt_rate_rad_s
             if frame.captured_ns > state.captured_ns:
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
@@ -227,14 +227,14 @@ class TargetFollower(AirframeLaw):
         return self._drawing(frame.captured_ns)
 
     def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
-        """Use a processor's detections in a recent frame, which arrive after that frame."""
+        """Use a processor's detections for a recent frame, which arrive after that frame."""
         if self._finder is not None:
             ground = self.airframe.feedback is not None and self.airframe.feedback.altitude_m is not None
             if self._finder.detected(detections, captured_ns, ground=ground):
                 self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
-        """Compute the set-point for now [ns on the proxy's clock]; hold the vehicle while its motion is unknown.
+        """Compute the set-point for now [ns on the proxy's clock], or hold the vehicle while its motion is unknown.
 
         A vehicle that does not report its velocity is flown by attitude.
         """
@@ -261,7 +261,7 @@ class TargetFollower(AirframeLaw):
 
     @property
     def status(self) -> FollowStatus:
-        """The state of the pursuit, as of the newest frame and set-point."""
+        """The state of the pursuit at the newest frame and set-point."""
         estimator, at_ns = self._estimator, self._frame_ns
         box, confidence = self._sighting.box, self._sighting.confidence
         class_name = self._class_name if self._finder is None else self._finder.class_name
@@ -295,7 +295,7 @@ class TargetFollower(AirframeLaw):
         assert view is not None
         box = self._sighting.box
         colour = _SEEN if box is not None else _LOST
-        # A processor draws its own detections, on their frames.
+        # A processor draws its own detections on their frames.
         found = () if self._detector is None else self._finder.detections[:16]
         shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
@@ -324,12 +324,12 @@ class TargetFollower(AirframeLaw):
 
 
 class FollowTarget(Behaviour):
-    """Keeps a target in view at a distance, circles it, or only turns to it. The vehicle must be airborne.
+    """Keeps a target in view at a distance, circles it, or only turns towards it. The vehicle must be airborne.
 
-    The target is the content of a box in the first frame, or the largest thing of a class. It is tracked by appearance
-    and, with a detector, by its detections, and is not confused with look-alikes. While it is hidden the vehicle first
-    follows its predicted motion, then hovers, then looks around; after ``give_up_s`` the behaviour ends, hovering. The
-    vehicle needs neither position nor map. A vehicle that reports no velocity is flown by attitude.
+    The target is the content of a box in the first frame, or the largest object of a class. It is tracked by appearance
+    and, with a detector, by its detections, and is not confused with look-alikes. While it is hidden, the vehicle first
+    follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour ends in a hover. The
+    vehicle needs neither a position nor a map. A vehicle that reports no velocity is flown by attitude.
 
     Attributes:
         follower: Finds the target and computes the set-points.
@@ -357,24 +357,24 @@ class FollowTarget(Behaviour):
 
         Args:
             drone: The drone to fly.
-            box: The target in the first frame: x, y, width, height [px].
-            class_name: Follow the largest thing of this class, if there is no box. Needs a detector.
-            distance_m: Horizontal distance to keep; None: the settings'.
+            box: Box of the target in the first frame: x, y, width, height [px].
+            class_name: Class of which to follow the largest object if there is no box. Needs a detector.
+            distance_m: Horizontal distance to keep; None for that of the settings.
             bearing_rad: Side of the target to stay on, as seen from it, counter-clockwise from its direction of motion:
-                0 is ahead of it, π behind. None: any side, or the settings'.
+                0 is ahead of it, π behind. None for any side, or for that of the settings.
             mode: ``follow``, ``orbit`` or ``look``.
-            detector: Searches every frame; or the name of a processor whose results are detections, such as that of
-                ``skyloop detect``. None: the target is tracked by appearance alone.
-            height_m: The target's height, if known, to estimate its distance; otherwise the height of its class. With
-                neither, the drone only turns until its own motion has revealed the range.
+            detector: Detector that searches every frame, or the name of a processor whose results are detections, such
+                as that of ``skyloop detect``. None tracks the target by appearance only.
+            height_m: The target's height, if known, to estimate its distance; otherwise its class determines the
+                height. With neither, the drone only turns until its own motion has revealed the range.
             traits: Complete prior knowledge about the target, instead of ``height_m``.
-            camera: Camera to use; None is the vehicle's first camera.
-            settings: Settings of the law; None are the defaults. They are clamped to the drone's ``limits.*``.
+            camera: Camera to use; None for the vehicle's first camera.
+            settings: Settings of the law; None for the defaults. Clamped to the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera.
             UsageError: There is neither a box nor a class, the camera does not look forward, a number is out of its
-                range, or the vehicle neither reports velocity nor takes attitude set-points.
+                range, or the vehicle neither reports velocity nor accepts attitude set-points.
             MissingExtraError: OpenCV or, for detections, SciPy is not installed.
         """
         given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
@@ -406,7 +406,7 @@ class FollowTarget(Behaviour):
 
     @property
     def status(self) -> FollowStatus:
-        """The state of the pursuit, as of the newest frame."""
+        """The state of the pursuit at the newest frame."""
         return self.follower.status
 
     def look(self, frame: Frame) -> list[Shape]:
@@ -414,13 +414,13 @@ class FollowTarget(Behaviour):
         return self.follower.look(frame)
 
     def on_frame(self, frame: Frame) -> None:
-        """Find the target and steer; after ``give_up_s``, hover and let :meth:`run` return."""
+        """Find the target and steer. After ``give_up_s``, hover and let :meth:`run` return."""
         super().on_frame(frame)
         if self.follower.over and not self.done:
             self.finish("gave up: the target was lost for too long")
 
     def on_result(self, result: Result) -> None:
-        """Use a processor's detections in frames of this behaviour's camera; ignore other cameras'."""
+        """Use a processor's detections in frames from this behaviour's camera; ignore those from other cameras."""
         if result.camera == self._mounting.name:
             self.follower.detected(detections_of(result.value), result.captured_ns)
 
@@ -434,7 +434,7 @@ def _box(box: Sequence[float]) -> Box:
 
 
 def detections_of(value: Any) -> list[Detection]:
-    """Return the detections in a result of ``skyloop detect``; skip malformed ones."""
+    """Return the detections in a result of ``skyloop detect``, skipping malformed ones."""
     found = []
     given = value.get("detections") if isinstance(value, dict) else None
     for one in given if isinstance(given, list | tuple) else ():

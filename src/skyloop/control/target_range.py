@@ -1,14 +1,14 @@
-"""The range of a target that may not stand on the ground: hypotheses that the bearings decide between. Pure.
+"""The range of a target that may not be on the ground: bearings decide between several hypotheses. Pure.
 
-A box that a person draws may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
-only of a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and the filter
-is wrongly sure of it. Standing on the ground is therefore one hypothesis among others at ranges from near to far, with
-a filter each (T. R. Kronhamn, "Bearings-only target motion analysis based on a multihypothesis Kalman filter and
-adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995). While the
-vehicle stays, all hypotheses fit. Once it has moved, above all up or down, where hardly any target moves, those at a
-wrong range do not.
-An altimeter over rising ground, or one that drifts, reports motion that did not happen. For a target that may hang, the
-camera's height therefore follows the vehicle's own climb, and the altimeter only slowly.
+A box drawn by a person may hold a person on the ground, a picture on a wall or a lamp. Its lower edge gives the range
+only for a target on the ground: a picture whose lower edge is a little below the vehicle seems far away, and the filter
+would be wrongly sure of it. Being on the ground is therefore one of several hypotheses; the others are at ranges from
+near to far, with a filter each (T. R. Kronhamn, "Bearings-only target motion analysis based on a multihypothesis Kalman
+filter and adaptive ownship motion control", IEE Proceedings 145(4), 1998; N. Peach, IEE Proceedings 142(1), 1995).
+While the vehicle is at rest, all hypotheses fit. Once it has moved, above all up or down, where targets hardly move,
+those at a wrong range no longer fit.
+An altimeter over rising ground, or one that drifts, reports motion that did not happen. For a target that may be off
+the ground, the camera's height therefore follows the vehicle's own climb, and the altimeter only slowly.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from skyloop.control.target_estimate import LEAST_SLOPE, SURE_OF_SIZE, UNKNOWN, 
 from skyloop.control.target_view import BoxView, Camera
 
 _RANGES_M: Final = tuple(0.7 * 1.7**n for n in range(8))  # initial ranges of the hypotheses, up to 29 m
-_SHARE: Final = 0.3  # standard deviation of each range, as a share of it
-_ON_GROUND: Final = 0.5  # prior probability that the target stands on the ground
+_SHARE: Final = 0.3  # standard deviation of each range, as a fraction of the range
+_ON_GROUND: Final = 0.5  # prior probability that the target is on the ground
 _AS_BEFORE: Final = 0.5  # standard deviation of the log range of a target seen before
-_TOGETHER_S: Final = 0.3  # boxes within this time count as one, because a tracker's errors persist
-_WORST: Final = 50.0  # greatest cost of a single box for a hypothesis
-_LEAST: Final = 1e-3  # drop less likely hypotheses
+_TOGETHER_S: Final = 0.3  # time within which boxes count as one, because a tracker's errors persist
+_WORST: Final = 50.0  # maximum cost of a single box for a hypothesis
+_LEAST: Final = 1e-3  # minimum probability of a hypothesis; less likely ones are dropped
 _KNOWN: Final = 0.2  # relative deviation below which the range becomes known
-_UNKNOWN: Final = 0.4  # and above which it becomes unknown again
-_STIRRED_M: Final = 0.1  # offset from its recent position from which a box counts in full
+_UNKNOWN: Final = 0.4  # relative deviation above which it becomes unknown again
+_STIRRED_M: Final = 0.1  # offset from the vehicle's recent position from which a box has its full weight
 _OF_LATE_S: Final = 2.0  # averaging time of the recent position
-_BASELINE: Final = 0.015  # offset per range that the vehicle must once have reached before the range is known
-_JUMP_M: Final = 0.15  # the vehicle's height does not change by more than this at once, ...
-_JUMP_M_S: Final = 1.0  # ... nor faster than this: the altimeter now measures to something else
-_JUMPING_S: Final = 0.5  # longest duration of a jump of a filtered altimeter
-_STEADY_S: Final = 30.0  # time constant with which the camera's height follows the altimeter, if the climb is known
-_APART_M: Final = 3.0  # a larger difference of ground and climb means that the climb was lost
+_BASELINE: Final = 0.015  # offset per range that the vehicle must have reached before the range is known
+_JUMP_M: Final = 0.15  # maximum change of the vehicle's height at once, ...
+_JUMP_M_S: Final = 1.0  # ... and its maximum speed: otherwise the altimeter now measures to another object
+_JUMPING_S: Final = 0.5  # maximum duration of a jump of a filtered altimeter
+_STEADY_S: Final = 30.0  # time constant of the camera's height following the altimeter, if the climb is known
+_APART_M: Final = 3.0  # maximum difference of ground and climb; a larger one means that the climb was lost
 
 
 class RangeEstimator(TargetEstimator):
-    """The filters of one target that may or may not stand on the ground."""
+    """The filters for one target that may or may not be on the ground."""
 
     def __init__(
         self, traits: Traits, *, nominal_m: float = 4.0, relative: bool = False, before: TargetState | None = None
@@ -54,7 +54,7 @@ class RangeEstimator(TargetEstimator):
 
         Args:
             traits: Prior knowledge about the target.
-            nominal_m: Assumed initial distance if the vehicle does not know its own height.
+            nominal_m: Initial distance to assume if the vehicle does not know its own height.
             relative: As in :class:`TargetEstimator`.
             before: State of the target when it was lost, if its range was known.
         """
@@ -62,18 +62,18 @@ class RangeEstimator(TargetEstimator):
         self._seen_before = before
         self._guesses: list[TargetEstimator] = []
         self._weights = np.ones(0)
-        self._on_ground: TargetEstimator | None = None  # hypothesis that it stands on the ground, until dropped
+        self._on_ground: TargetEstimator | None = None  # hypothesis that the target is on the ground, until dropped
         self._sight = self._about = np.zeros(3)  # first line of sight; recent mean position of the vehicle
-        self._stirred_m = 0.0  # greatest distance from it so far, across that line
+        self._stirred_m = 0.0  # maximum distance from that position so far, across that line
         self._heights: deque[tuple[int, float]] = deque()  # recent times and heights
-        self._jumped_ns: int | None = None  # last jump of its height
-        self._base_m = 0.0  # long-term altimeter height from which the climb counts
+        self._jumped_ns: int | None = None  # time of the last jump of the height
+        self._base_m = 0.0  # long-term altimeter height from which the climb is measured
         self._size_known = self._known = self._learns = False
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
         """Start from the first box, as in :meth:`TargetEstimator.start`.
 
-        Without a known height nothing can distinguish the hypotheses: the range is the nominal one, and the law keeps
+        Without a known height, nothing can tell the hypotheses apart: the range is the nominal one, and the law keeps
         the apparent size.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
@@ -102,20 +102,20 @@ class RangeEstimator(TargetEstimator):
         self._judge(self.at(at_ns))
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
-        """Measure how badly a box fits, as :meth:`TargetEstimator.distance`: the best fit, and the mixture's."""
+        """Measure how badly a box fits, like :meth:`TargetEstimator.distance`: the best fit, and the mixture's."""
         seen_from = self._seen_from(camera, self._steady(camera))
         fits, costs = zip(*(guess.distance(view, one, at_ns) for guess, one in seen_from), strict=True)
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
     def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
-        """Update with a box, as :meth:`TargetEstimator.update`, and drop hypotheses that do not fit it.
+        """Update with a box like :meth:`TargetEstimator.update`, and drop hypotheses that don't fit it.
 
-        Restart when the vehicle's height jumps: someone walks below, it flies over a table, or its height is unknown
-        for a moment. Such an apparent motion would otherwise "prove" that the target is far away.
+        The filters restart if the vehicle's height jumps, because someone walks below it, it flies over a table, or its
+        height is unknown for a moment. Such apparent motion would otherwise "prove" that the target is far away.
         """
         if self.seen_ns is None:
-            return super().update(view, camera, at_ns)  # which raises the error
+            return super().update(view, camera, at_ns)  # raises the error
         apart_m, since_s = _off_climb(camera) - self._base_m, seconds(at_ns - self.seen_ns)
         if self._learns and (self._jumps(camera, at_ns) or abs(apart_m) > _APART_M):
             self._seen_before = self.at(at_ns) if self._known else self._seen_before
@@ -130,7 +130,7 @@ class RangeEstimator(TargetEstimator):
             self.refused += 1
             return False
         self.seen_ns, self.refused = max(at_ns, self.seen_ns), 0
-        # Boxes from a resting vehicle carry no information: the hypothesis of least motion would slowly win.
+        # Boxes from a resting vehicle carry no information: the one with the least motion would slowly win.
         stirred = self._stir(steady, since_s) / _STIRRED_M
         weight = 1.0 if self._size_known else within(stirred**2, 0.0, 1.0)
         worse = np.minimum(costs - costs.min(), _WORST)
@@ -140,9 +140,9 @@ class RangeEstimator(TargetEstimator):
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state, as :meth:`TargetEstimator.at`: the hypotheses' mean, with its deviation."""
+        """Predict the target's state like :meth:`TargetEstimator.at`: the hypotheses' mean, with its deviation."""
         if self.seen_ns is None:
-            return super().at(at_ns)  # which raises the error
+            return super().at(at_ns)  # raises the error
         states = [guess.at(at_ns) for guess in self._guesses]
         weights = self._weights
 
@@ -167,7 +167,7 @@ class RangeEstimator(TargetEstimator):
 
     @property
     def on_ground(self) -> bool | None:
-        """Whether it stands on the ground; None while unknown."""
+        """Whether the target is on the ground; None while unknown."""
         if self._on_ground is None:
             return False
         likeliest = self._guesses[int(np.argmax(self._weights))]
@@ -203,18 +203,18 @@ class RangeEstimator(TargetEstimator):
             self._on_ground = None
 
     def _steady(self, camera: Camera) -> Camera:
-        """Return the camera at the height that follows the vehicle's own climb."""
+        """Return the camera at a height that follows the vehicle's own climb."""
         if camera.rise_m is None:
             return camera
         x, y, _ = camera.position
         return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
 
     def _seen_from(self, camera: Camera, steady: Camera) -> list[tuple[TargetEstimator, Camera]]:
-        """Return each hypothesis with its camera; for a target on the ground, at the altimeter's height."""
+        """Return each hypothesis with its camera, which is at the altimeter's height for a target on the ground."""
         return [(guess, camera if guess is self._on_ground else steady) for guess in self._guesses]
 
     def _jumps(self, camera: Camera, at_ns: int) -> bool:
-        """Return whether the height jumps, or jumped a moment ago."""
+        """Return whether the height is jumping or jumped a moment ago."""
         height, heights = float(camera.position[2]), self._heights
         while len(heights) > 1 and abs(seconds(at_ns - heights[0][0])) > _JUMPING_S:
             heights.popleft()
@@ -224,7 +224,7 @@ class RangeEstimator(TargetEstimator):
         return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
     def _stir(self, camera: Camera, since_s: float) -> float:
-        """Return the vehicle's distance from its recent position, across the first line of sight [m]."""
+        """Return the vehicle's distance from its recent position, measured across the first line of sight [m]."""
         self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
         x, y, z = (camera.position - self._about).tolist()
         off_m = math.hypot(float(self._sight[0] * y - self._sight[1] * x), z)
@@ -232,7 +232,7 @@ class RangeEstimator(TargetEstimator):
         return off_m
 
     def _judge(self, state: TargetState) -> None:
-        """Decide whether the range is known, by the target's size or from the vehicle's own motion."""
+        """Decide whether the range is known, either from the target's size or from the vehicle's own motion."""
         share = state.range_deviation_m / state.range_m
         if self._known:
             self._known = share < _UNKNOWN or len(self._guesses) == 1
@@ -250,12 +250,12 @@ def _off_climb(camera: Camera) -> float:
 def estimator_of(
     class_name: str | None, traits: Traits | None, *, nominal_m: float = 4.0, relative: bool = False
 ) -> TargetEstimator:
-    """Create the filter of a target; call ``start`` on it.
+    """Create the filter for a target; call ``start`` on it.
 
     Args:
-        class_name: Class of the target; None: a person drew a box, without a class.
-        traits: Prior knowledge about the target; None: there is none.
-        nominal_m: Assumed initial distance if there is no cue.
+        class_name: Class of the target; None if a person drew a box without a class.
+        traits: Prior knowledge about the target; None if there is none.
+        nominal_m: Initial distance to assume if there is no cue.
         relative: Whether the vehicle does not know its own velocity.
     """
     if traits is not None and (class_name is not None or traits.on_ground is not None):

@@ -1,9 +1,9 @@
-"""Match detections to things, which keep their identity while they cross, hide and return. Pure.
+"""Match detections to objects, which keep their identity while they cross, hide and return. Pure.
 
-Detections are matched with filters of where things are now, not with their places in the last image, so the vehicle's
-own motion does no harm, and look-alikes are distinguished by place and motion. The pairs are the most likely overall
-assignment (SciPy's ``linear_sum_assignment``). A detection that another thing could explain nearly as well updates
-neither: both continue on their motion until they are apart.
+Detections are matched with filters of where the objects are now, not with their positions in the last image, so that
+the vehicle's own motion does no harm and look-alikes are distinguished by position and motion. The pairs are the most
+likely assignment overall (SciPy's ``linear_sum_assignment``). A detection that another object could explain nearly as
+well updates neither object: both continue on their predicted motion until they are apart.
 """
 
 from __future__ import annotations
@@ -26,50 +26,50 @@ from skyloop.vision.object_tracks import Detection
 Floats = NDArray[np.float32]
 
 _COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # L, a, b: light changes L most
-_OTHER: Final = 10.0  # unlikeness from which it is another thing; of the same thing mostly below 0.5, at times 3
-_OTHER_AGAIN: Final = 3.0  # the same for a thing unseen for a moment
-_MOMENT_S: Final = 0.3  # after which _OTHER_AGAIN applies
+_OTHER: Final = 10.0  # unlikeness of different objects; that of the same object is mostly below 0.5, at times 3
+_OTHER_AGAIN: Final = 3.0  # the same for an object that was briefly unseen
+_MOMENT_S: Final = 0.3  # time unseen after which _OTHER_AGAIN applies
 _UNLIKE: Final = 3.0  # weight of the unlikeness relative to the position
 _LEARNING: Final = 0.05  # learning rate of the colours per detection; the first ones are averaged
-_GATE: Final = 9.0  # greatest squared Mahalanobis distance per measurement
+_GATE: Final = 9.0  # maximum squared Mahalanobis distance per measurement
 _NEVER: Final = 1e6  # cost of a pair that must not match
-_AMBIGUOUS: Final = 4.0  # smaller differences of the doubled negative log-likelihood are ambiguous
-_LATELY_S: Final = 1.2  # a detection may show a thing seen this recently
-_TOGETHER_S: Final = 3.0  # two things detected as one for longer are taken for one
-_FAR_BEHIND: Final = 1.3  # ratio of ranges: a thing this far behind another is hidden, not part of the other's box
-_EARLIER_S: Final = 0.5  # this long before two meet, their merging boxes do not yet distort their velocities
-_APART_S: Final = 0.6  # this long after they part, their velocities are known
-_DIFFER_M_S: Final = 0.8  # difference of their velocities before, needed to distinguish them
-_TURNED: Final = 0.3  # share of that difference, reversed, from which they were confused
-_KEEP_S: Final = 2.0  # how long hidden things are remembered; a later newcomer may be another thing
-_YOUNG_S: Final = 0.5  # the same for things seen only once
-_CONFIRMED: Final = 3  # detections needed to confirm a thing
-_OF_A_PART: Final = 1.0  # unlikeness of a thing that the image cuts off: its colours differ
-_SETTLED: Final = 8  # detections below which a thing, perhaps two in one, contests no others
-_YOUNG: Final = 4.0  # extra cost of such a thing
-_WELL_KNOWN: Final = 15  # detections from which its colours are known
-_SURE: Final = 0.35  # least score of a detection that may be a new thing
+_AMBIGUOUS: Final = 4.0  # minimum difference of the doubled negative log-likelihood; smaller ones are ambiguous
+_LATELY_S: Final = 1.2  # maximum time unseen for an object that a detection may show
+_TOGETHER_S: Final = 3.0  # time after which two objects detected as one are considered one
+_FAR_BEHIND: Final = 1.3  # ratio of ranges from which an object behind another one is hidden, not in its box
+_EARLIER_S: Final = 0.5  # time before two meet at which their merging boxes don't distort their velocities yet
+_APART_S: Final = 0.6  # time after they part at which their velocities are known
+_DIFFER_M_S: Final = 0.8  # difference of the velocities before, needed to tell two objects apart
+_TURNED: Final = 0.3  # reversed fraction of that difference from which two objects were confused
+_KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different one
+_YOUNG_S: Final = 0.5  # the same for objects seen only once
+_CONFIRMED: Final = 3  # number of detections needed to confirm an object
+_OF_A_PART: Final = 1.0  # unlikeness of an object cut off by the image, because its colours differ
+_SETTLED: Final = 8  # number of detections below which an object, perhaps two in one, contests no others
+_YOUNG: Final = 4.0  # extra cost of a young object
+_WELL_KNOWN: Final = 15  # number of detections from which an object's colours are known
+_SURE: Final = 0.35  # minimum score of a detection that may be a new object
 
 
 @dataclass(slots=True, eq=False)
 class SceneObject:
-    """One detected thing.
+    """A detected object.
 
     Attributes:
-        number: Its identity; never reused.
-        class_name: Class of its detections.
-        estimator: Filter of its motion.
+        number: Number that identifies the object; never reused.
+        class_name: Class of the detections.
+        estimator: Filter for the motion.
         detection: The last detection.
-        looks: Its colours, (6,): see :func:`skyloop.vision.appearance.colours`.
-        places: Colours of the last detection that the image did not cut off, (n, 6).
-        whole: Whether the last detection was of the whole thing.
+        looks: Colours, (6,): see :func:`skyloop.vision.appearance.colours`.
+        places: Colours of the last detection that was not cut off by the image, (n, 6).
+        whole: Whether the last detection was of the whole object.
         hits: Number of detections.
         first_ns: Time of the first detection.
         last_ns: Time of the last detection.
-        seen: Whether it was detected in the newest image.
-        contested_ns: Time when it was last contested.
-        velocities: Its velocities in the last half second.
-        contested: Whether a detection in the newest image may show it or another thing.
+        seen: Whether the object was detected in the newest image.
+        contested_ns: Time when the object was last contested.
+        velocities: Velocities in the last half second.
+        contested: Whether a detection in the newest image may show either this or another object.
     """
 
     number: int
@@ -90,11 +90,11 @@ class SceneObject:
 
     @property
     def confirmed(self) -> bool:
-        """Whether it was detected often enough to be trusted."""
+        """Whether the object was detected often enough to be trusted."""
         return self.hits >= _CONFIRMED
 
     def learn(self, places: Floats) -> None:
-        """Update the colours with those of places in its newest detection, (n, 6)."""
+        """Update the colours with those of strips in the newest detection, (n, 6)."""
         self.places = places
         self.looks = self.looks + max(_LEARNING, 1.0 / self.hits) * (_nearest(self.looks, places) - self.looks)
 
@@ -106,11 +106,11 @@ class SceneObject:
 
     @property
     def earlier(self) -> NDArray[np.float64]:
-        """Its velocity about half a second before the last detection, (2,) [m/s]."""
+        """The velocity about half a second before the last detection, (2,) [m/s]."""
         return self.velocities[0][1] if self.velocities else np.zeros(2)
 
     def exchange(self, other: SceneObject) -> None:
-        """Exchange everything but the numbers."""
+        """Exchange everything but the numbers with another object."""
         for name in ("estimator", "detection", "hits", "last_ns", "seen", "contested", "velocities"):
             mine, its = getattr(self, name), getattr(other, name)
             setattr(self, name, its)
@@ -124,22 +124,22 @@ class _Seen(NamedTuple):
 
     @property
     def whole(self) -> bool:
-        """Whether the image shows both its upper and its lower end."""
+        """Whether the image shows both the upper and the lower end of the object."""
         return self.view.bottom is not None and self.view.top is not None
 
 
 def unlikeness(one: Floats, other: Floats) -> float:
-    """Return the squared colour difference of two things, in units of the changes by light and folds.
+    """Return the squared colour difference between two objects, in units of the changes caused by light and folds.
 
     Args:
-        one: Colours of a thing, (6,).
-        other: Colours of a thing (6,), or of places in a box (n, 6), of which the most similar counts.
+        one: Colours of an object, (6,).
+        other: Colours of an object (6,), or of strips of a box (n, 6), of which the most similar counts.
     """
     return float(np.min(_unlike(one, other)))
 
 
 def _nearest(one: Floats, places: Floats) -> Floats:
-    """Return the most similar colours among places in a box, (6,)."""
+    """Return the most similar colours among the strips of a box, (6,)."""
     places = np.atleast_2d(places)
     nearest: Floats = places[int(np.argmin(_unlike(one, places)))]
     return nearest
@@ -150,13 +150,13 @@ def _unlike(one: Floats, other: Floats) -> Floats:
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
-    """Return whether a thing was seen a moment ago, or may have been in view ever since."""
+    """Return whether an object was seen a moment ago, or may have been in view ever since."""
     seen_s = seconds(at_ns - (thing.estimator.seen_ns or 0))
     return seen_s < _LATELY_S or (seen_s < _TOGETHER_S and seconds(at_ns - thing.contested_ns) < _LATELY_S)
 
 
 def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
-    """Return whether a detection may show two things: the other's middle is in the box and not far behind."""
+    """Return whether a detection may show two objects: the other's middle is in the box and not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
     x, y, width, height = seen.detection.box
@@ -169,13 +169,13 @@ def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Came
 
 
 class Scene:
-    """The detected things.
+    """The detected objects.
 
     Attributes:
-        objects: Things by number.
-        kept: Numbers of things never forgotten, however long hidden.
-        dormant: Numbers of things not matched with detections; their return is decided elsewhere.
-        traits: Traits by class, for new things.
+        objects: Objects by number.
+        kept: Numbers of objects that are never forgotten, however long they are hidden.
+        dormant: Numbers of objects not matched with detections, because their return is decided elsewhere.
+        traits: Traits by class, for new objects.
     """
 
     def __init__(self, *, relative: bool = False, traits: dict[str, Traits] | None = None) -> None:
@@ -183,7 +183,7 @@ class Scene:
 
         Args:
             relative: Whether the vehicle does not know its own velocity.
-            traits: Traits by class, instead of :data:`~.target_estimate.TRAITS`.
+            traits: Traits by class to use instead of :data:`~.target_estimate.TRAITS`.
 
         Raises:
             MissingExtraError: SciPy is not installed.
@@ -200,13 +200,13 @@ class Scene:
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections of the next image.
+        """Match the detections in the next image.
 
         Args:
             detections: Detections in one image.
-            looks: Colours of each: (6,), or (n, 6) at n places from left to right.
-            camera: The camera that took it.
-            at_ns: Capture of the image.
+            looks: Colours of each detection: (6,), or (n, 6) for n strips from left to right.
+            camera: The camera that took the image.
+            at_ns: Capture time of the image.
             ground: Whether the camera's height above the ground is known.
         """
         self._forget(at_ns)
@@ -224,7 +224,7 @@ class Scene:
                 self._add(new, camera, at_ns, ground=ground)
 
     def _match(self, seen: list[_Seen], camera: Camera, at_ns: int) -> list[_Seen]:
-        """Update the things found among the detections; return the unmatched detections."""
+        """Update the objects that match a detection; return the unmatched detections."""
         things = [each for number, each in self.objects.items() if number not in self.dormant]
         if not things or not seen:
             return seen
@@ -237,7 +237,7 @@ class Scene:
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
                         costs[i, j] = cost + _UNLIKE * unlike + (0.0 if thing.hits >= _SETTLED else _YOUNG)
-        shift = float(costs.min())  # the assignment minimises sums: all costs must be better than no pair
+        shift = float(costs.min())  # the assignment minimises sums, so all costs must be better than no pair
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
         matched = {i for i, _ in pairs}
@@ -268,13 +268,13 @@ class Scene:
         return [seen[j] for j in range(len(seen)) if j not in used]
 
     def _meet(self, one: SceneObject, other: SceneObject) -> None:
-        """Remember two things' relative motion before they merged."""
+        """Remember the relative motion of two objects before they merged."""
         pair = frozenset({one.number, other.number})
         if len(pair) == 2 and pair not in self._met:
             self._met[pair] = one.number, other.number, one.earlier - other.earlier
 
     def _untangle(self, at_ns: int) -> None:
-        """Exchange two things that were confused: after they met, each moves on as the other did before.
+        """Exchange two objects that were confused: after they met, each moves on as the other did before.
 
         The vehicle's own motion adds equally to both velocities, so their difference is unaffected.
         """

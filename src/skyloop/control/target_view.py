@@ -1,7 +1,7 @@
-"""Directions of a thing from its box in an image. Pure.
+"""Directions of an object from its box in an image. Pure.
 
-Directions are in *odometry axes* (see :mod:`.airframe`): the attitude at the capture levels them, so neither roll nor
-pitch of the vehicle moves a thing. For an edge cut off by the image, only a bound is known.
+Directions are in *odometry axes* (see :mod:`.airframe`). They are levelled by the attitude at the time of capture, so
+the vehicle's roll and pitch don't move an object. For an edge cut off by the image, only a bound is known.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from skyloop.vision.tracking import Box
 
 Array = NDArray[np.float64]
 
-_CUT_PX: Final = 2.0  # a box closer than this to the image's edge, and than this share of its size, may be cut off
+_CUT_PX: Final = 2.0  # distance from the image's edge within which a box may be cut off ...
 _CUT: Final = 0.07
-_BESIDE: Final = 0.75  # in image sizes from the optical axis; 0.5 is the edge
-_STEEPEST: Final = 0.15  # cosine of the elevation; a thing nearly straight above or below has no azimuth
-_TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
-_YAW_RAD: Final = 0.006  # error of the yaw at the capture
-_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival: encoding, network and decoding
+_BESIDE: Final = 0.75  # distance from the optical axis in image sizes; 0.5 is the edge
+_STEEPEST: Final = 0.15  # minimum cosine of the elevation; an object almost straight above or below has no azimuth
+_TILT_RAD: Final = 0.008  # error of the attitude at the time of capture, which moves both edges equally
+_YAW_RAD: Final = 0.006  # error of the yaw at the time of capture
+_UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, from encoding, network and decoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +35,13 @@ class Camera:
     """The pose of a camera when it captured an image.
 
     Attributes:
-        position: In odometry axes, with the height above the ground, if known, as the third, (3,) [m].
+        position: Position in odometry axes, (3,) [m]; the third value is the height above the ground, if known.
         rotation: Rotation from optical axes to odometry axes, (3, 3).
         intrinsics: Intrinsics of the image.
         size: Width and height of the image [px].
-        yaw_rad: Standard deviation of its yaw at the capture.
-        tilt_rad: Standard deviation of its tilt.
-        rise_m: Climb by the vehicle's integrated velocity, wherever the ground is [m]; None: unknown.
+        yaw_rad: Standard deviation of the yaw at the time of capture.
+        tilt_rad: Standard deviation of the tilt.
+        rise_m: Climb by the vehicle's integrated velocity, regardless of the ground [m]; None if unknown.
     """
 
     position: Array
@@ -63,20 +63,20 @@ class Camera:
         rates_rad_s: tuple[float, float] = (0.0, 0.0),
         risen_m: float | None = None,
     ) -> Camera | None:
-        """Place a camera.
+        """Determine a camera's pose.
 
         Args:
-            mounting: The camera, with its mounting.
-            feedback: The vehicle's state at the capture.
-            body: Position of the vehicle, (3,) [m]; the third is its height above the ground, if known.
+            mounting: The camera, including its mounting.
+            feedback: The vehicle's state at the time of capture.
+            body: Position of the vehicle, (3,) [m]; the third value is its height above the ground, if known.
             intrinsics: Intrinsics, in pixels of the image.
             size: Width and height of the image [px].
-            rates_rad_s: Rates of yaw and tilt, for a vehicle whose images and attitude have no common clock: the faster
-                it turns, the less certain is its attitude at the capture.
-            risen_m: Climb by the vehicle's integrated velocity [m]; None: unknown.
+            rates_rad_s: Rates of yaw and tilt for a vehicle whose images and attitude have no common clock: the faster
+                it turns, the less certain its attitude at the time of capture is.
+            risen_m: Climb by the vehicle's integrated velocity [m]; None if unknown.
 
         Returns:
-            None while the attitude is unknown.
+            The camera; None if the attitude is unknown.
 
         Raises:
             UsageError: The camera's mounting is unknown.
@@ -92,9 +92,9 @@ class Camera:
         return cls(body + aside, rotation, intrinsics, size, yaw_rad, tilt_rad, rise_m)
 
     def pixel(self, point: Array) -> tuple[float, float] | None:
-        """Return the pixel of a point (3,), in the image or a little beside it [px]; None further out.
+        """Return the pixel of a point (3,) in the image or slightly outside it [px]; None if it is further out.
 
-        A lens model holds only within the image: far outside, the distortion's polynomial folds back into it.
+        A lens model is valid only within the image: far outside, the distortion's polynomial folds back into it.
         """
         ray = self.rotation.T @ (point - self.position)
         lens, (columns, rows) = self.intrinsics, self.size
@@ -105,7 +105,7 @@ class Camera:
         return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
     def shows(self, point: Array) -> bool:
-        """Return whether a point (3,) is within the image if nothing hides it."""
+        """Return whether a point (3,) is within the image, provided that nothing hides it."""
         pixel = self.pixel(point)
         return pixel is not None and 0.0 <= pixel[0] < self.size[0] and 0.0 <= pixel[1] < self.size[1]
 
@@ -117,11 +117,11 @@ class BoxView:
     Attributes:
         azimuth: Azimuth of the middle, counter-clockwise from x of odometry axes [rad].
         bottom: Tangent of the lower edge's elevation; None if the image cuts it off.
-        top: The same of the upper edge.
-        below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; else None.
-        above: If the image cuts off the upper edge: tangent of the elevation that the edge lies above; else None.
+        top: Tangent of the upper edge's elevation; None if the image cuts it off.
+        below: If the image cuts off the lower edge: tangent of the elevation that the edge lies below; otherwise None.
+        above: If the image cuts off the upper edge: tangent of the elevation that the edge lies above; otherwise None.
         azimuth_rad: Standard deviation of the azimuth.
-        edge: Standard deviation of each edge alone.
+        edge: Standard deviation of each edge, independent of the other.
         tilt: Standard deviation common to both edges.
     """
 
@@ -141,10 +141,10 @@ class BoxView:
         Args:
             box: x, y, width, height [px].
             camera: The camera that took the image.
-            noise: Standard deviation of an edge, as a share of the box's height; a pixel is added.
+            noise: Standard deviation of an edge, as a fraction of the box's height; one pixel is added.
 
         Returns:
-            None for a box that this camera can't show, or one nearly straight above or below.
+            The directions; None for a box that this camera can't show or that is almost straight above or below.
         """
         x, y, width, height = box
         columns, rows = camera.size
@@ -160,7 +160,7 @@ class BoxView:
         across = (1.0 + noise * width) / focal
         near = max(_CUT_PX, _CUT * height)
         if x < near or x + width > columns - near:
-            across += 0.3 * width / focal  # the middle of the visible part is not the thing's
+            across += 0.3 * width / focal  # the middle of the visible part is not the object's middle
         cut_below, cut_above = y + height > rows - near, y < near
         return cls(
             azimuth=math.atan2(rays[2, 1], rays[2, 0]),
@@ -175,16 +175,16 @@ class BoxView:
 
 
 def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
-    """Return the approximate box of an upright thing in the image: x, y, width, height [px].
+    """Return the approximate box of an upright object in the image: x, y, width, height [px].
 
     Args:
         camera: The camera that takes the image.
-        foot: Position of its foot, (3,) [m].
-        height_m: Its height.
-        share: Width of the box, as a share of its height.
+        foot: Position of the object's foot, (3,) [m].
+        height_m: Height of the object.
+        share: Width of the box as a fraction of its height.
 
     Returns:
-        None if the camera can't show all of it.
+        The box; None if the camera can't show all of it.
     """
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:

@@ -1,8 +1,8 @@
-"""Positions, position sources, and a law that flies to a position: position and yaw in, velocity out.
+"""Positions, their sources, and a law that flies to a position, turning position and yaw into a velocity.
 
-The law is proportional and pure. The speed is limited; near the goal it is at most the speed from which a given
-deceleration brings the vehicle to rest there. The yaw alone turns the error into the body's levelled axes, in which
-set-points are given (ROS REP 103).
+The law is proportional and pure. The speed is limited, and near the goal it is at most the speed from which the
+vehicle can come to rest at the goal with a given deceleration. Only the yaw is used to convert the error to the body's
+levelled axes, in which set-points are given (ROS REP 103).
 """
 
 from __future__ import annotations
@@ -60,17 +60,17 @@ class WaypointSettings:
 
     gain: float = 1.2  #: speed per distance [1/s]
     yaw_gain: float = 1.5  #: [1/s]
-    speed_m_s: float = 1.0  #: greatest horizontal speed
-    climb_m_s: float = 0.6  #: greatest vertical speed
-    turn_rad_s: float = 1.2  #: greatest yaw rate
+    speed_m_s: float = 1.0  #: maximum horizontal speed
+    climb_m_s: float = 0.6  #: maximum vertical speed
+    turn_rad_s: float = 1.2  #: maximum yaw rate
     slow_down_m_s2: float = 0.6  #: deceleration towards the goal
     near_m: float = 0.15  #: acceptance radius
     near_rad: float = 0.1
-    slow_m_s: float = 0.2  #: greatest speed at which the goal counts as reached, if the velocity is known
+    slow_m_s: float = 0.2  #: maximum speed at which the goal counts as reached, if the velocity is known
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position, and the remedy; empty if it can."""
+    """Return why a vehicle can't be flown to a position, and what to do about it; empty if it can."""
     if feedback.position_m is None or not all(map(math.isfinite, feedback.position_m)):
         return f"{NO_POSITION}: {POSITION_SOURCES}"
     yaw = feedback.yaw_rad
@@ -82,8 +82,8 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
     Args:
         goal: The waypoint to fly to.
-        feedback: The vehicle's newest feedback, with position and yaw.
-        settings: Gains and limits; None are the defaults.
+        feedback: The vehicle's newest feedback, including position and yaw.
+        settings: Gains and limits; None for the defaults.
 
     Returns:
         Set-point in the body's levelled axes [m/s, rad/s].
@@ -107,12 +107,12 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Return whether the vehicle is within the acceptance radius and nearly at rest.
+    """Return whether the vehicle is within the acceptance radius and almost at rest.
 
     Args:
         goal: The waypoint.
         feedback: The vehicle's newest feedback; without a velocity it counts as at rest.
-        settings: Acceptance radii; None are the defaults.
+        settings: Acceptance radii; None for the defaults.
 
     Raises:
         UsageError: Position or yaw is unknown.
@@ -125,7 +125,7 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 
 
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
-    """Return east, north, up [m] and yaw [rad] from the vehicle to the goal."""
+    """Return the difference between the vehicle and the goal: east, north, up [m] and yaw [rad]."""
     problem = lacking(feedback)
     if problem or feedback.position_m is None or feedback.yaw_rad is None:
         raise UsageError(f"can't fly to a waypoint: {problem}")
@@ -135,17 +135,17 @@ def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, fl
 
 
 def _approach(away: float, limit: float, s: WaypointSettings) -> float:
-    """Return the speed at a distance: by the gain, limited, and slow enough to stop at the goal."""
+    """Return the speed at a distance, from the gain, the limit and what still lets the vehicle stop at the goal."""
     return min(s.gain * away, limit, math.sqrt(2.0 * s.slow_down_m_s2 * away))
 
 
 class Fix(NamedTuple):
-    """A position in world axes (x east, y north, z up) at one time."""
+    """A position in world axes (x east, y north, z up) at a point in time."""
 
-    at_ns: int  #: on the proxy's clock
-    position_m: Vector  #: [m]
-    yaw_rad: float  #: counter-clockwise from x [rad]
-    velocity_m_s: Vector | None = None  #: in world axes [m/s]; None if unknown
+    at_ns: int  #: time on the proxy's clock
+    position_m: Vector  #: position [m]
+    yaw_rad: float  #: yaw, counter-clockwise from x [rad]
+    velocity_m_s: Vector | None = None  #: velocity in world axes [m/s]; None if unknown
 
     @property
     def finite(self) -> bool:
@@ -153,7 +153,7 @@ class Fix(NamedTuple):
         return all(map(math.isfinite, (*self.position_m, self.yaw_rad, *(self.velocity_m_s or ()))))
 
 
-#: Returns the newest position, or None while it is unknown; must not block.
+#: Function that returns the newest position, or None if it is unknown. It must not block.
 PositionSource = Callable[[], Fix | None]
 
 
@@ -161,7 +161,7 @@ def fix_of(feedback: Feedback) -> Fix | None:
     """Return the position reported by the vehicle itself.
 
     Returns:
-        The fix at the feedback's capture; None while position or yaw is unknown.
+        The fix at the feedback's capture time; None if the position or yaw is unknown.
     """
     if feedback.position_m is None or feedback.yaw_rad is None:
         return None
@@ -176,8 +176,8 @@ def fix_of(feedback: Feedback) -> Fix | None:
 class DeadReckoning:
     """Position source that integrates the velocity of a vehicle that reports no position.
 
-    The position drifts with the velocity's error. The height is the vehicle's altitude, if it reports one. Feedback is
-    handled on the thread that receives it.
+    The position drifts with the error of the velocity. The height is the vehicle's altitude, if it reports one.
+    Feedback is handled on the thread that receives it.
     """
 
     def __init__(self, drone: Drone, begin: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -185,7 +185,7 @@ class DeadReckoning:
 
         Args:
             drone: The drone.
-            begin: The current position, x and y [m].
+            begin: The vehicle's current position, x and y [m].
         """
         self._begin = begin
         self._airframe = Airframe()
@@ -204,7 +204,7 @@ class DeadReckoning:
         self._airframe.add(feedback)
         motion = self._airframe.newest
         if motion is None or motion.at_ns != feedback.captured_ns:
-            return  # nothing new, or nothing usable
+            return  # nothing new or nothing usable
         east, north, up = motion.position.tolist()
         height = up if feedback.altitude_m is None else feedback.altitude_m
         vx, vy, vz = motion.velocity.tolist()

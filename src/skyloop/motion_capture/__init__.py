@@ -1,4 +1,4 @@
-"""Motion capture: Vicon, OptiTrack and Qualisys by the ``motioncapture`` package, VRPN, and the simulator's truth."""
+"""Motion capture: Vicon, OptiTrack and Qualisys via the ``motioncapture`` package, VRPN, and the simulator's truth."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -
     Args:
         address: ``vicon://HOST``, ``optitrack://HOST`` or ``qualisys://HOST`` (extra ``[mocap]``), ``vrpn://HOST``, or
             ``sim://`` for the true poses of simulated drones.
-        bodies: Names of drones, mapped to the system's names of their bodies, ``{"alpha": "alpha_body"}``. With VRPN,
-            a body is a tracker, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
-        timeout_s: How long to wait for the first frame [s].
+        bodies: Names of drones, mapped to the names of their bodies in the system: ``{"alpha": "alpha_body"}``. With
+            VRPN, a body is a tracker, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
+        timeout_s: Maximum time to wait for the first frame [s].
 
     Raises:
-        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none is named.
+        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none was named.
         UnknownNameError: There is no such system or option.
         LinkError: No frame arrives within ``timeout_s``.
         MissingExtraError: The extra ``[mocap]`` is not installed.

@@ -22,19 +22,19 @@ from skyloop.motion_capture.source import RawFrame, System
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-LOOK_S: Final = 0.05  #: period of the check for lost bodies
-EVENT_DEPTH: Final = 256  #: how many events can wait for a slow callback
-MAX_UNKNOWN: Final = 1000  #: limit of remembered names of unrequested bodies
+LOOK_S: Final = 0.05  #: interval between checks for lost bodies
+EVENT_DEPTH: Final = 256  #: maximum number of events waiting for a slow callback
+MAX_UNKNOWN: Final = 1000  #: maximum number of remembered names of unrequested bodies
 T = TypeVar("T")
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class TrackEvent:
-    """A change of a body's tracking, or trouble with the system."""
+    """A change in the tracking of a body, or trouble with the system."""
 
-    at_ns: int  #: on this host's monotonic clock
-    body: str  #: empty if the event is about the system
+    at_ns: int  #: time on this host's monotonic clock
+    body: str  #: name of the body; empty if the event is about the system
     state: TrackState
     text: str
 
@@ -50,30 +50,30 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
-#: Creates a source from a system, its names of the bodies, and callbacks for frames and for problems (as text).
+#: Creates a source from a system, the system's names of the bodies, and callbacks for frames and problems (text).
 MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callable[[str], None]], Source]
 
 
 class MotionCapture:
-    """Poses of the bodies that a motion capture system tracks. A context manager; created by :func:`skyloop.mocap`.
+    """Poses of the bodies tracked by a motion capture system. A context manager created by :func:`skyloop.mocap`.
 
     Methods can be called from any thread. Callbacks have their own thread; with ``inline=True`` they run on the
-    receiving thread (events also on the thread that checks for lost bodies) and must be quick. A callback that raises
-    is counted and logged and does not affect the others.
+    receiving thread (event callbacks also on the thread that checks for lost bodies) and must be quick. An exception in
+    a callback is counted and logged and does not affect other callbacks.
 
     Attributes:
         system: The system.
-        bodies: Names of drones to the system's names of their bodies.
-        latency_ns: Age of a pose on arrival, from the address.
-        unknown: Bodies that the system sees but ``bodies`` does not name.
+        bodies: Names of drones, mapped to the system's names of their bodies.
+        latency_ns: Age of a pose on arrival, as given in the address.
+        unknown: Bodies that the system sees but that ``bodies`` does not name.
     """
 
     def __init__(self, system: System, bodies: Mapping[str, str], make: MakeSource) -> None:
-        """Initialise without connecting; :func:`skyloop.mocap` also opens it.
+        """Initialise without connecting; :func:`skyloop.mocap` also opens the connection.
 
         Args:
             system: The system.
-            bodies: Names of drones to the system's names of their bodies.
+            bodies: Names of drones, mapped to the system's names of their bodies.
             make: Creates the source of frames.
 
         Raises:
@@ -86,11 +86,11 @@ class MotionCapture:
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
-        self.unknown: set[str] = set()  #: bodies that the system sees but ``bodies`` does not name
+        self.unknown: set[str] = set()  #: bodies that the system sees but that ``bodies`` does not name
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
-        self._troubled = ""  # the last reported problem, until a frame arrives
+        self._troubled = ""  # last reported problem, cleared when a frame arrives
         self._calibrations: dict[str, Calibration] = {}
         self._measured: dict[str, list[BodyPose]] = {}  # uncalibrated poses, for a calibration in progress
         self._poses: Channel[BodyPose] = Channel()
@@ -107,12 +107,12 @@ class MotionCapture:
         """Connect and wait for the first frame.
 
         Args:
-            timeout_s: How long to wait.
+            timeout_s: Maximum time to wait [s].
 
         Raises:
-            LinkError: No frame arrived within that time.
+            LinkError: No frame arrived within ``timeout_s``.
             MissingExtraError: The extra ``[mocap]`` is not installed.
-            UsageError: A VRPN tracker has several sensors and none is named.
+            UsageError: A VRPN tracker has several sensors and none was named.
             UnsupportedError: A simulated drone does not report its true pose.
         """
         self._source.start(timeout_s)
@@ -145,14 +145,14 @@ class MotionCapture:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def pose(self, name: str) -> BodyPose | None:
-        """Return the newest pose of a body while it is tracked; None otherwise, never an old pose.
+        """Return the newest pose of a body if it is tracked now; otherwise None, never an old pose.
 
         Raises:
             UnknownNameError: ``bodies`` has no such name.
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns() - self.latency_ns)  # the watching thread may lag behind
+            track.look(monotonic_ns() - self.latency_ns)  # the checking thread may lag behind
             return track.pose
 
     def state(self, name: str) -> TrackState:
@@ -167,11 +167,11 @@ class MotionCapture:
         """Wait until a body is tracked and return its pose.
 
         Args:
-            name: One of ``bodies``.
-            timeout_s: How long to wait.
+            name: One of the names in ``bodies``.
+            timeout_s: Maximum time to wait [s].
 
         Raises:
-            NoAnswerError: It is not tracked within that time; the message lists the bodies that the system sees.
+            NoAnswerError: The body was not tracked within that time; the message lists the bodies that the system sees.
             ClosedError: This motion capture was closed.
             UnknownNameError: ``bodies`` has no such name.
         """
@@ -189,13 +189,13 @@ class MotionCapture:
     def on_pose(self, function: OnPose, *, depth: int = 1, inline: bool = False) -> Listener[BodyPose]:
         """Call ``function`` with the newest pose of any body.
 
-        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`; its ``cancel()``, or the
-        end of its ``with`` block, stops the calls.
+        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`. Call its ``cancel()`` or
+        leave its ``with`` block to stop the calls.
 
         Args:
-            function: Called on a separate thread; poses overtaken by newer ones are dropped and counted.
-            depth: Number of poses that can wait for it, such as one per body.
-            inline: Call it on the receiving thread instead, with every pose. It must be quick and must not block.
+            function: Called on a separate thread; poses superseded by newer ones are dropped and counted.
+            depth: Number of poses that can wait for the function, for example one per body.
+            inline: Whether to call it on the receiving thread, with every pose. It must be quick and must not block.
 
         Raises:
             UsageError: The function can't be called, or ``depth`` is less than 1.
@@ -204,13 +204,13 @@ class MotionCapture:
         return self._listen(self._poses, function, "pose", depth, inline)
 
     def on_event(self, function: OnEvent, *, inline: bool = False) -> Listener[TrackEvent]:
-        """Call ``function`` whenever a body is found or lost, or the system has trouble.
+        """Call ``function`` whenever a body is found or lost, or there is trouble with the system.
 
         Returns and raises like :meth:`on_pose`.
 
         Args:
-            function: Called on a separate thread; up to 256 events wait for it.
-            inline: Call it on the thread that detected the change instead.
+            function: Called on a separate thread, for which up to 256 events can wait.
+            inline: Whether to call it on the thread that detected the change instead.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 
@@ -241,18 +241,18 @@ class MotionCapture:
     # For drones and controllers ---------------------------------------------------------------------------------
 
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
-        """Log a drone's poses with the drone, so that recorders write them and the cockpit shows them.
+        """Log a drone's poses on the drone, so that recorders write them and the cockpit shows them.
 
-        Loss of tracking is also logged.
+        Loss of tracking is logged too.
 
         Args:
-            drone: Its proxy's name must be one of ``bodies``.
-            max_hz: Greatest rate of the logged poses, 1 to 1000.
+            drone: The drone, whose proxy's name must be in ``bodies``.
+            max_hz: Maximum rate of the logged poses, 1 to 1000.
             to_vehicle: Whether to also send the poses to the vehicle (:meth:`Drone.send_external_pose`), which may fly
                 by them.
 
         Returns:
-            A context manager; poses are logged within its block.
+            A context manager. Poses are logged within its block.
 
         Raises:
             UnknownNameError: ``bodies`` has no such name.
@@ -272,18 +272,18 @@ class MotionCapture:
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Measure the rotation between the tracked body's axes and the drone's, at rest on the ground.
+        """Measure the rotation between the tracked body's axes and the drone's while it rests on the ground.
 
-        Afterwards the poses of that body are the drone's; until then an earlier calibration stays in force.
+        From then on, the body's poses are the drone's. Until then an earlier calibration stays in force.
 
         Args:
-            drone: Its proxy's name must be one of ``bodies``.
+            drone: The drone, whose proxy's name must be in ``bodies``.
             heading: Heading of the drone's nose in the world [rad], counter-clockwise from x.
-            seconds: How long to collect poses.
+            seconds: Time to collect poses [s].
 
         Raises:
-            UsageError: The drone flies or moves, or there are too few poses.
-            NoAnswerError: It is not tracked.
+            UsageError: The drone is flying or moving, or there are too few poses.
+            NoAnswerError: The drone is not tracked.
             ClosedError: This motion capture was closed.
         """
         name = drone.name
@@ -306,7 +306,7 @@ class MotionCapture:
     # Called by the source -------------------------------------------------------------------------------------
 
     def _take(self, frame: RawFrame) -> None:
-        """Handle a frame of the system."""
+        """Handle a frame from the system."""
         self._troubled = ""
         captured_ns = frame.received_ns - self.latency_ns
         for theirs, (position, quaternion) in frame.bodies.items():
@@ -333,7 +333,7 @@ class MotionCapture:
             self._poses.publish(pose)
 
     def _trouble(self, text: str) -> None:
-        if text != self._troubled:  # a source retries all the time and fails for the same reason
+        if text != self._troubled:  # a source keeps retrying and failing for the same reason
             self._troubled = text
             self._publish_event("", TrackState.LOST, text)
 
@@ -341,11 +341,11 @@ class MotionCapture:
         while not self._ended.wait(LOOK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # a pose that arrives now is this old
+                    track.look(monotonic_ns() - self.latency_ns)  # a pose that arrives now has this age
                 self._report(track)
 
     def _report(self, track: Track) -> None:
-        """Emit one event for each change of a body's state."""
+        """Emit one event for each change in a body's state."""
         with self._changed:
             before, state = self._reported[track.body], track.state
             self._reported[track.body] = state
@@ -370,17 +370,17 @@ class MotionCapture:
 
 
 def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
-    """Do nothing: the listener's log suffices, because motion capture has no events for program errors."""
+    """Do nothing: the listener's log suffices because motion capture has no events for program errors."""
 
 
 class Linked:
-    """Logs each pose of a drone on the drone until closed. See :meth:`MotionCapture.link`."""
+    """Logs each of a drone's poses on the drone until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
-        """Initialise; the ``with`` block starts the logging.
+        """Initialise. The ``with`` block starts the logging.
 
         Raises:
-            UsageError: ``max_hz`` is not from 1 to 1000.
+            UsageError: ``max_hz`` is not between 1 and 1000.
         """
         if not 1.0 <= max_hz <= 1000.0:
             raise UsageError(f"max_hz is {max_hz!r} and must be from 1 to 1000")
@@ -409,11 +409,11 @@ class Linked:
     def _pose(self, pose: BodyPose) -> None:
         if pose.body != self._drone.name or pose.captured_ns < self._due_ns:
             return
-        # Accept poses a quarter of a period early: a rate near the system's own would otherwise be halved.
+        # Accept poses a quarter of a period early, because a rate near the system's own would otherwise be halved.
         self._due_ns = pose.captured_ns + self._period_ns * 3 // 4
         values = (*pose.position_m, *pose.quaternion, *(pose.velocity_m_s or ()))
         at_ns = pose.captured_ns + self._drone.clock_offset_ns
-        if self._to_vehicle:  # first, because the vehicle flies by it
+        if self._to_vehicle:  # first, because the vehicle uses it to fly
             self._drone.send_external_pose(pose.position_m, pose.quaternion, at_ns=at_ns)
         self._drone.log.array(MOCAP, values, at_ns=at_ns)
 
@@ -425,10 +425,10 @@ class Linked:
 
 
 def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
-    """Return a position source for controllers: a drone's newest pose, with its time on the proxy's clock.
+    """Return a position source for controllers, with a drone's newest pose and its time on the proxy's clock.
 
     Raises:
-        UnknownNameError: The capture has no body of the drone's name.
+        UnknownNameError: The capture has no body with the drone's name.
     """
     name = drone.name
     capture.state(name)  # raises here for an unknown name

@@ -1,8 +1,8 @@
-"""Poses of bodies from a motion capture system, in Skyloop's axes, tracked over time and calibrated. Pure.
+"""Poses of bodies from a motion capture system, converted to Skyloop's axes, tracked over time and calibrated. Pure.
 
 The calibration is the rotation between a tracked body's axes, as the system defines them, and the drone's. It follows
 MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is refused if they spread too
-much. The drone's own roll and pitch show its attitude at rest; its heading comes from the way it is put down: nose
+much. The drone's own roll and pitch give its attitude at rest. Its heading comes from how it is placed: with the nose
 along the world's x axis, or as given by ``heading``.
 """
 
@@ -32,21 +32,21 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """The pose of a body.
+    """A body's pose.
 
     World axes are those of the capture volume, with z up. Body axes are defined by the system or, after a calibration,
-    those of the drone: x forward, y left, z up (ROS REP 103).
+    are those of the drone: x forward, y left, z up (ROS REP 103).
     """
 
     body: str
-    captured_ns: int  #: on this host's monotonic clock
-    position_m: Vector  #: [m]
-    quaternion: Quaternion  #: x, y, z, w: turns body axes into world axes
-    velocity_m_s: Vector | None = None  #: [m/s], world axes; None until there are enough poses
+    captured_ns: int  #: capture time on this host's monotonic clock
+    position_m: Vector  #: position [m]
+    quaternion: Quaternion  #: rotation from body to world axes: x, y, z, w
+    velocity_m_s: Vector | None = None  #: velocity in world axes [m/s]; None until there are enough poses
 
     @property
     def yaw_rad(self) -> float:
-        """Heading of the body's x axis [rad], from the world's x axis, counter-clockwise seen from above."""
+        """Heading of the body's x axis from the world's x axis, counter-clockwise as seen from above [rad]."""
         x, y, z, w = self.quaternion
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -55,17 +55,17 @@ class BodyPose:
         """Rotation from body axes to world axes.
 
         Raises:
-            MissingExtraError: SciPy is not installed, or too old.
+            MissingExtraError: SciPy is not installed or too old.
         """
         found: Rotation = scipy_types().Rotation.from_quat(self.quaternion)
         return found
 
     @property
     def transform(self) -> RigidTransform:
-        """The body's pose in the world.
+        """Pose of the body in the world.
 
         Raises:
-            MissingExtraError: SciPy is not installed, or too old.
+            MissingExtraError: SciPy is not installed or too old.
         """
         found: RigidTransform = scipy_types().RigidTransform.from_components(self.position_m, self.rotation)
         return found
@@ -84,9 +84,9 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
-    """Convert from axes with y up (x right, y up, z backward, as Motive streams by default) to axes with z up.
+    """Convert from axes with y up (x right, y up, z backward, Motive's streaming default) to axes with z up.
 
-    Turns both world and body by a quarter about x, so that an upright body stays upright.
+    Rotates both world and body a quarter turn about x, so that an upright body stays upright.
 
     Args:
         position: [m]
@@ -98,7 +98,7 @@ def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
 
 
 def plausible(position: Vector, quaternion: Quaternion) -> bool:
-    """Return whether the values can be a pose: finite, with a quaternion of length 1 within 1 %."""
+    """Return whether the values can be a pose: finite, and with a quaternion whose length is 1 within 1 %."""
     if not all(map(math.isfinite, (*position, *quaternion))):
         return False
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
@@ -120,7 +120,7 @@ def scipy_types() -> Any:
     """Import SciPy's module of rotations and transforms.
 
     Raises:
-        MissingExtraError: SciPy is not installed, or older than 1.16.
+        MissingExtraError: SciPy is not installed or older than 1.16.
     """
     try:
         from scipy.spatial import transform
@@ -131,24 +131,24 @@ def scipy_types() -> Any:
     return transform
 
 
-REST_S: Final = 2.0  #: how long poses are collected for a calibration
-MAX_SPREAD_M: Final = 0.005  #: spread of poses at rest: more means motion or poor tracking
-MAX_SPREAD_RAD: Final = math.radians(1.0)  #: the same for their rotation
-MIN_POSES: Final = 20  #: for a calibration
+REST_S: Final = 2.0  #: time to collect poses for a calibration
+MAX_SPREAD_M: Final = 0.005  #: maximum spread of poses at rest: more means motion or poor tracking
+MAX_SPREAD_RAD: Final = math.radians(1.0)  #: maximum spread of their rotations
+MIN_POSES: Final = 20  #: minimum number of poses for a calibration
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """Turns the poses of a tracked body into those of the drone."""
+    """Converts the poses of a tracked body to those of the drone."""
 
-    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: from the drone's axes to the tracked body's; x, y, z, w
+    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: rotation from the drone's axes to the tracked body's; x, y, z, w
     spread_m: float = 0.0  #: root mean square distance of the poses from their mean
     spread_rad: float = 0.0  #: root mean square angle between the poses and their mean
     poses: int = 0  #: number of poses averaged
-    yaw_offset: float | None = None  #: the drone's own yaw minus its heading in the world [rad], if it reports its yaw
+    yaw_offset: float | None = None  #: the drone's own yaw minus its heading in the world [rad]; None without a yaw
 
     def apply(self, pose: BodyPose) -> BodyPose:
-        """Return the drone's pose for a pose of the tracked body."""
+        """Convert a pose of the tracked body to the drone's pose."""
         return replace(pose, quaternion=multiply(pose.quaternion, self.turn))
 
 
@@ -165,16 +165,16 @@ def calibrate(
     """Compute the calibration from poses at rest.
 
     Args:
-        poses: At least 20.
+        poses: At least 20 poses.
         roll: The drone's reported roll, averaged over the same time [rad]; right side down is positive.
         pitch: The drone's reported pitch [rad]; nose down is positive.
-        yaw: The drone's reported yaw [rad]; None if it reports none.
-        heading: Heading of its nose in the world [rad], counter-clockwise from x.
-        max_spread_m: Greatest root mean square distance of the poses from their mean.
-        max_spread_rad: Greatest root mean square angle between the poses and their mean.
+        yaw: The drone's reported yaw [rad]; None if it doesn't report one.
+        heading: Heading of the drone's nose in the world [rad], counter-clockwise from x.
+        max_spread_m: Maximum root mean square distance of the poses from their mean.
+        max_spread_rad: Maximum root mean square angle between the poses and their mean.
 
     Raises:
-        UsageError: There are too few poses, or they spread beyond the limits: the drone moved, or the tracking is
+        UsageError: There are too few poses, or they spread beyond the limits because the drone moved or the tracking is
             poor.
     """
     if len(poses) < MIN_POSES:
@@ -200,9 +200,9 @@ def conjugate(quaternion: Quaternion) -> Quaternion:
 
 
 def mean_quaternion(quaternions: Sequence[Quaternion]) -> Quaternion:
-    """Return the mean rotation, whatever the signs of the quaternions.
+    """Return the mean rotation, regardless of the signs of the quaternions.
 
-    The largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
+    This is the largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
     """
     parts = np.array(quaternions)
     _, vectors = np.linalg.eigh(parts.T @ parts)
@@ -219,10 +219,10 @@ def _spread(places: NDArray[np.float64]) -> float:
     return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
-LOST_AFTER_S: Final = 0.2  #: a body is lost after this long without a pose: ten poses at 50 Hz
-FROZEN_AFTER_S: Final = 0.5  #: a pose identical to the last bit for this long is not a measurement
-WINDOW_S: Final = 0.1  #: time window of the poses from which the velocity is computed
-LEAST_POSES: Final = 4  #: poses needed for a velocity
+LOST_AFTER_S: Final = 0.2  #: time without a pose after which a body is lost (ten poses at 50 Hz)
+FROZEN_AFTER_S: Final = 0.5  #: time after which a pose that is identical to the last bit is not a measurement
+WINDOW_S: Final = 0.1  #: time window of poses from which the velocity is computed
+LEAST_POSES: Final = 4  #: minimum number of poses for a velocity
 
 
 class TrackState(StrEnum):
@@ -230,32 +230,32 @@ class TrackState(StrEnum):
 
     WAITING = "waiting"  #: not seen yet
     TRACKED = "tracked"
-    LOST = "lost"  #: seen before, but no new pose arrives
+    LOST = "lost"  #: seen before, but without new poses
     ENDED = "ended"  #: the motion capture was closed
 
 
 class Track:
-    """Poses of one body.
+    """Poses of a body over time.
 
     The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
-    by half the window and has much less noise than a difference of two poses.
+    by half the window and has much less noise than the difference between two poses.
 
     Attributes:
         body: The body's name.
         state: Whether the body is tracked.
-        pose: The newest pose while the body is tracked, else None.
+        pose: The newest pose while the body is tracked, otherwise None.
     """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """Initialise a body not seen yet.
+        """Initialise a body that has not been seen yet.
 
         Args:
-            body: Its name.
-            may_freeze: Whether an unchanging pose is possible, as from a simulator without noise.
+            body: Name of the body.
+            may_freeze: Whether the pose may stay constant, as in a simulator without noise.
         """
         self.body = body
         self.state = TrackState.WAITING
-        self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, else None
+        self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
         self._may_freeze = may_freeze
         self._recent: deque[tuple[int, Vector]] = deque()
         self._seen_ns = 0
@@ -266,12 +266,12 @@ class Track:
         """Update with a new pose.
 
         Args:
-            captured_ns: Time of the capture.
+            captured_ns: Capture time.
             position: [m]
             quaternion: x, y, z, w.
 
         Returns:
-            The pose with its velocity; None if it is not newer than the last, or frozen.
+            The pose with its velocity; None if it is no newer than the last one or is frozen.
         """
         if captured_ns <= self._seen_ns:
             return None
@@ -297,7 +297,7 @@ class Track:
         return True
 
     def end(self) -> None:
-        """End the track: no more poses will arrive."""
+        """End the track, because no more poses will arrive."""
         self.state, self.pose = TrackState.ENDED, None
 
     def _velocity(self) -> Vector | None:

@@ -1,8 +1,8 @@
-"""Addresses of motion capture systems, and the child process that receives from one: :func:`main`.
+"""Addresses of motion capture systems, and :func:`main`, the child process that receives from one.
 
 The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
-process it can block nothing else and can be killed at any time. Each frame goes to standard output as a msgpack array,
-preceded by its length: time of reception, and position and quaternion of each visible body.
+process it can't block anything else and can be killed at any time. Each frame goes to standard output as a msgpack
+array preceded by its length: time of reception, then position and quaternion of each visible body.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 
-#: By scheme of the address: the system's name in the ``motioncapture`` package, and its default up axis. VRPN has its
-#: own client here.
+#: System's name in the ``motioncapture`` package and default up axis, by scheme of the address. VRPN has its own client
+#: here.
 SYSTEMS: Final = {
     "vicon": ("vicon", "z"),
     "optitrack": ("optitrack", "y"),  # Motive streams with y up by default
@@ -59,13 +59,13 @@ class System:
     host: str
     up: str = "z"
     latency_s: float = 0.0
-    settings: tuple[tuple[str, str], ...] = ()  #: further settings for the package
+    settings: tuple[tuple[str, str], ...] = ()  #: additional settings for the package
     port: int | None = None  #: port after the host in the address
-    sensor: int | None = None  #: sensor of VRPN trackers whose body name gives none
+    sensor: int | None = None  #: sensor for VRPN trackers whose body name gives none
 
     @property
     def configuration(self) -> dict[str, str]:
-        """The settings with which the ``motioncapture`` package connects."""
+        """Settings with which the ``motioncapture`` package connects."""
         host = self.host if self.port is None else f"{self.host}:{self.port}"
         return {"hostname": host, **dict(self.settings)}
 
@@ -150,16 +150,16 @@ def _port(address: str, options: dict[str, str]) -> str | None:
 
 
 LENGTH: Final = struct.Struct("<I")
-MAX_FRAME: Final = 1 << 20  #: bytes; enough for thousands of bodies
-MISSING: Final = 3  #: exit code if the package is missing
+MAX_FRAME: Final = 1 << 20  #: maximum size of a frame in bytes; enough for thousands of bodies
+MISSING: Final = 3  #: exit code for a missing package
 
 Seen = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 
 class RawFrame(msgspec.Struct, frozen=True, array_like=True):
-    """The bodies seen by a system at one time, in its own axes."""
+    """The bodies that a system sees at a point in time, in the system's own axes."""
 
-    received_ns: int  #: ``time.monotonic_ns`` of this host
+    received_ns: int  #: time of reception, ``time.monotonic_ns`` of this host
     bodies: dict[str, Seen]  #: position [m] and quaternion (x, y, z, w) of each tracked body
 
 
@@ -170,7 +170,7 @@ def read(stream: BinaryIO) -> RawFrame | None:
         The frame; None at the end of the stream.
 
     Raises:
-        msgspec.DecodeError: The data are not a frame.
+        msgspec.DecodeError: The data is not a frame.
     """
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
@@ -200,7 +200,7 @@ def seen(bodies: Any) -> dict[str, Seen]:
 
 
 def open_output() -> BinaryIO:
-    """Reserve standard output for frames, and redirect native code's prints to standard error."""
+    """Reserve standard output for frames and redirect native code's prints to standard error."""
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     return output
@@ -211,10 +211,10 @@ def main(kind: str, settings: str) -> int:
 
     Args:
         kind: The system's name in the ``motioncapture`` package.
-        settings: JSON object of strings, for its ``connect``.
+        settings: JSON object of strings for the package's ``connect``.
 
     Returns:
-        Exit code: 0 when the reader is gone, :data:`MISSING` without the package, 1 for any other error.
+        Exit code: 0 when the reader is gone, :data:`MISSING` if the package is missing, 1 for any other error.
     """
     try:
         import motioncapture
@@ -229,7 +229,7 @@ def main(kind: str, settings: str) -> int:
             write(output, RawFrame(time.monotonic_ns(), seen(system.rigidBodies)))
     except BrokenPipeError:
         return 0  # the reader is gone
-    except Exception as error:  # noqa: BLE001  whatever the native code throws
+    except Exception as error:  # noqa: BLE001  native code may throw anything
         print(error, file=sys.stderr)
         return 1
 
@@ -242,7 +242,7 @@ class TruthSource:
 
         Args:
             proxies: Names of the drones' proxies.
-            take: Called on the thread that receives feedback with each frame.
+            take: Called with each frame on the thread that receives feedback.
         """
         self._proxies = tuple(proxies)
         self._take = take
@@ -252,7 +252,7 @@ class TruthSource:
         """Connect to all proxies.
 
         Args:
-            timeout_s: How long to wait for each connection.
+            timeout_s: Maximum time to wait for each connection [s].
 
         Raises:
             UnsupportedError: A vehicle does not report its true pose.
@@ -271,7 +271,7 @@ class TruthSource:
             self._open = opening.pop_all()
 
     def close(self) -> None:
-        """Disconnect from all. Idempotent."""
+        """Disconnect from all proxies. Idempotent."""
         self._open.close()
 
     def _taking(self, name: str, drone: Drone) -> Callable[[Feedback], None]:
@@ -298,21 +298,21 @@ def true_pose(
     return (x, y, z), quaternion_from_euler(roll, pitch, yaw)
 
 
-#: Not ``-m``: the package imports this module, and Python would warn about that in each child.
+#: Not ``-m``, because the package imports this module, and Python would warn about that in each child.
 WORKER: Final = (
     sys.executable,
     "-c",
     "import sys; from skyloop.motion_capture.source import main; sys.exit(main(*sys.argv[1:]))",
 )
-AGAIN_S: Final = 0.5  #: pause before restarting a child that ended
-SILENT_S: Final = 3.0  #: a child silent for this long is killed: its system may have restarted
-FIRST_S: Final = 10.0  #: the same before its first frame
+AGAIN_S: Final = 0.5  #: delay before restarting a child that ended
+SILENT_S: Final = 3.0  #: time after which a silent child is killed, because its system may have restarted
+FIRST_S: Final = 10.0  #: the same time before a child's first frame
 
 
 class ChildSource:
     """Runs :func:`main` in a child process and forwards each frame on a separate thread.
 
-    Replaces a child that ends or falls silent, until :meth:`close`.
+    A child that ends or falls silent is replaced until :meth:`close`.
     """
 
     def __init__(
@@ -327,9 +327,9 @@ class ChildSource:
 
         Args:
             system: The system to connect to.
-            take: Called on the reading thread with each frame.
-            trouble: Called with a description when the child fails, on one of this object's threads.
-            command: The child's command line, before kind and settings.
+            take: Called with each frame on the reading thread.
+            trouble: Called with a description on one of this object's threads when the child fails.
+            command: The beginning of the child's command line; kind and settings are added to it.
         """
         self._system = system
         self._take = take
@@ -337,7 +337,7 @@ class ChildSource:
         self._received_s = 0.0
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._last_words = ""  # end of the last child's standard error
+        self._last_words = ""  # end of the last child's output on standard error
         settings = msgspec.json.encode(system.configuration).decode()
         self._runner = RestartingChild(
             [*command, system.kind, settings],
@@ -351,14 +351,14 @@ class ChildSource:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child; None before the first."""
+        """Process id of the child; None before the first one."""
         return None if self._runner.child is None else self._runner.child.pid
 
     def start(self, timeout_s: float) -> None:
         """Start the child and wait for the first frame.
 
         Raises:
-            LinkError: No frame arrived within that time.
+            LinkError: No frame arrived within ``timeout_s``.
             MissingExtraError: The ``motioncapture`` package is not installed.
         """
         self._runner.start()

@@ -1,8 +1,8 @@
-"""VRPN, the Virtual-Reality Peripheral Network, as a source of frames: its protocol, and a client over TCP.
+"""VRPN, the Virtual-Reality Peripheral Network, as a source of frames: the protocol, and a client over TCP.
 
-Server and client each send a cookie of 24 bytes that names the protocol version. Everything after it is a message: a
-header of 24 bytes, then the payload, padded to a multiple of 8 bytes. The length in the header counts the header and
-the payload without its padding. All numbers are big endian.
+Server and client each send a 24-byte cookie that names the protocol version. Everything after it is a message: a
+24-byte header, then the payload, padded to a multiple of 8 bytes. The length in the header counts the header and the
+payload without its padding. All numbers are big-endian.
 
 ======  =====  ====================================================================================
 offset  type   meaning
@@ -14,9 +14,9 @@ offset  type   meaning
 20      u32    sequence number, for sniffers only
 ======  =====  ====================================================================================
 
-A description (type -1: of a sender, -2: of a type) has the number in the sender field, and as payload the length of the
-name (u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``,
-and as payload the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
+A description (type -1 for a sender, -2 for a type) has the number in the sender field. Its payload is the length of the
+name (u32, including the final NUL) and the name. A tracker's pose has the type described as ``vrpn_Tracker Pos_Quat``.
+Its payload is the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the quaternion x, y, z, w (7 doubles).
 
 
 A client that never sends a UDP port gets everything over TCP.
@@ -41,14 +41,14 @@ from skyloop.motion_capture.source import RawFrame, Seen, System
 
 DEFAULT_PORT: Final = 3883
 COOKIE_SIZE: Final = 24
-COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: 0: request no logging by the server
+COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: the 0 requests no logging by the server
 SENDER_DESCRIPTION: Final = -1
 TYPE_DESCRIPTION: Final = -2
 DISCONNECT: Final = -5
 POS_QUAT: Final = "vrpn_Tracker Pos_Quat"
-MAX_PAYLOAD: Final = 64_000  #: bytes; the reference implementation's buffer
-MAX_NAMES: Final = 2_000  #: senders, and types, as in the reference implementation
-MAX_NAME: Final = 100  #: bytes of a name, including the NUL
+MAX_PAYLOAD: Final = 64_000  #: maximum payload in bytes; the reference implementation's buffer
+MAX_NAMES: Final = 2_000  #: maximum number of senders and of types, as in the reference implementation
+MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 
 _HEADER: Final = struct.Struct(">IIIiiI")
 _NAME_LENGTH: Final = struct.Struct(">I")
@@ -58,18 +58,18 @@ _SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
 
 @dataclass(frozen=True, slots=True)
 class TrackerPose:
-    """The pose of a tracker's sensor in the server's own axes. Values may be NaN or infinite."""
+    """The pose of a tracker's sensor in the server's own axes. Values can be NaN or infinite."""
 
     tracker: str
     sensor: int
     position: tuple[float, float, float]  #: x, y, z [m]
-    quaternion: tuple[float, float, float, float]  #: x, y, z, w: turns the sensor's axes into the server's
+    quaternion: tuple[float, float, float, float]  #: rotation from the sensor's axes to the server's: x, y, z, w
 
 
 class Decoder:
-    """Decodes a server's stream, cookie first, however it is cut into pieces.
+    """Decodes a server's stream, starting with the cookie, in pieces of any size.
 
-    Holds at most one incomplete message, and the names that the server has described.
+    It holds at most one incomplete message and the names that the server has described.
     """
 
     def __init__(self) -> None:
@@ -81,10 +81,10 @@ class Decoder:
         """Decode the next bytes of the stream.
 
         Returns:
-            The poses completed by these bytes, in the order sent; everything else is skipped.
+            The poses completed by these bytes, in the order sent. Everything else is skipped.
 
         Raises:
-            DecodeError: The bytes are not VRPN, or the server ends the connection. The decoder is then unusable.
+            DecodeError: The bytes are not VRPN, or the server ends the connection. The decoder is unusable afterwards.
         """
         self._pending += data
         if not self._greeted:
@@ -132,13 +132,13 @@ class Decoder:
 
 
 def encode_message(sender: int, kind: int, payload: bytes, *, seconds: int = 0, microseconds: int = 0) -> bytes:
-    """Encode one message with its padding; the time is that of the report, since 1970."""
+    """Encode a message with its padding. The time is that of the report, since 1970."""
     head = _HEADER.pack(_HEADER.size + len(payload), seconds, microseconds, sender, kind, 0)
     return head + payload + bytes(-len(payload) % 8)
 
 
 def encode_description(kind: int, number: int, name: str) -> bytes:
-    """Encode the name of a sender (``SENDER_DESCRIPTION``) or type (``TYPE_DESCRIPTION``) of this number."""
+    """Encode the name of the sender (``SENDER_DESCRIPTION``) or type (``TYPE_DESCRIPTION``) with this number."""
     text = name.encode() + b"\0"
     return encode_message(number, kind, _NAME_LENGTH.pack(len(text)) + text)
 
@@ -153,8 +153,8 @@ def encode_pose(
     seconds: int = 0,
     microseconds: int = 0,
 ) -> bytes:
-    """Encode a pose; ``kind`` is the number described as ``vrpn_Tracker Pos_Quat``."""
-    payload = _POSE.pack(sensor, sensor, *position, *quaternion)  # twice: the reference pads with it
+    """Encode a pose, where ``kind`` is the number described as ``vrpn_Tracker Pos_Quat``."""
+    payload = _POSE.pack(sensor, sensor, *position, *quaternion)  # the sensor twice, because the reference pads with it
     return encode_message(sender, kind, payload, seconds=seconds, microseconds=microseconds)
 
 
@@ -171,21 +171,21 @@ def _decode_name(payload: bytes) -> str:
     return name if name.isprintable() else name.encode("unicode_escape").decode()
 
 
-CONNECT_S: Final = 1.0  #: how long a server can take to accept
-AGAIN_S: Final = 0.5  #: pause before the next attempt to connect
-SILENT_S: Final = 3.0  #: drop a connection without a pose for this long: the server may have restarted
-SETTLE_S: Final = 0.3  #: how long to wait for other sensors of a tracker before taking its sensor 0 for the body
-POLL_S: Final = 0.1  #: how often an idle reader checks whether to end
-CHUNK: Final = 65_536  #: bytes received at a time
-MAX_SENSORS: Final = 1_000  #: sensors remembered per tracker
+CONNECT_S: Final = 1.0  #: maximum time for a server to accept a connection
+AGAIN_S: Final = 0.5  #: delay before the next attempt to connect
+SILENT_S: Final = 3.0  #: time without a pose after which a connection is dropped: the server may have restarted
+SETTLE_S: Final = 0.3  #: time to wait for a tracker's other sensors before using its sensor 0 for the body
+POLL_S: Final = 0.1  #: interval at which an idle reader checks whether to end
+CHUNK: Final = 65_536  #: maximum number of bytes received at a time
+MAX_SENSORS: Final = 1_000  #: maximum number of sensors remembered per tracker
 
 
 class SensorSelection:
-    """Decides which sensor of which tracker belongs to which body. Pure: the time is an argument.
+    """Decides which tracker's sensor belongs to which body. Pure: the time is an argument.
 
-    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor named in the address. If neither names one, it is
-    sensor 0, as long as no other sensor of that tracker has ever reported. Otherwise the choice is ambiguous, and the
-    body has no pose.
+    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor given in the address. If neither gives one,
+    sensor 0 is used as long as no other sensor of that tracker has ever reported. Otherwise the choice is ambiguous and
+    the body has no pose.
     """
 
     def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
@@ -193,14 +193,14 @@ class SensorSelection:
 
         Args:
             names: Names of the bodies.
-            sensor: Sensor of bodies whose name gives none; None if the address names none.
+            sensor: Sensor for bodies whose name gives none; None if the address doesn't give one.
 
         Raises:
-            UsageError: Two names mean the same sensor.
+            UsageError: Two names refer to the same sensor.
         """
         self._bodies: dict[tuple[str, int], str] = {}
-        self._unnamed: set[str] = set()  # trackers without a named sensor
-        self._reported: dict[str, tuple[int, set[int]]] = {}  # of those: first report, and sensors seen
+        self._unnamed: set[str] = set()  # trackers whose sensor is not named
+        self._reported: dict[str, tuple[int, set[int]]] = {}  # their first report and the sensors seen
         for name in names:
             tracker, named = split_name(name)
             number = sensor if named is None else named
@@ -218,10 +218,10 @@ class SensorSelection:
 
         Args:
             poses: Poses in order of arrival.
-            now_ns: The time of their arrival.
+            now_ns: The time of arrival.
 
         Returns:
-            Poses by body name; a sensor that belongs to no body is named ``TRACKER:SENSOR``.
+            Poses by body name; for sensors that don't belong to a body the name is ``TRACKER:SENSOR``.
         """
         poses = list(poses)
         for pose in poses:
@@ -234,7 +234,7 @@ class SensorSelection:
             name = self._bodies.get((pose.tracker, pose.sensor))
             if name is None:
                 name = f"{pose.tracker}:{pose.sensor}"
-                if name in self._wanted:  # it collides with another body's name
+                if name in self._wanted:  # the name collides with another body's
                     continue
             elif name in self._unnamed and not self._certain(name, now_ns):
                 continue
@@ -242,12 +242,12 @@ class SensorSelection:
         return found
 
     def settled(self, now_ns: int) -> bool:
-        """Return whether it is known for every reporting tracker if its sensor must be named."""
+        """Return whether it is known, for every reporting tracker, if its sensor must be named."""
         return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
 
     @property
     def refused(self) -> dict[str, str]:
-        """Return the trackers whose sensor must be named but is not, with reason and remedy."""
+        """Return the trackers whose sensor must be named but isn't, with the reason and a remedy."""
         return {
             tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and the body's is not named: name it "
             f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
@@ -263,8 +263,8 @@ class SensorSelection:
 class VrpnSource:
     """Receives from a VRPN server and forwards each frame on a separate thread.
 
-    Replaces a connection that ends, falls silent or carries data other than VRPN, until :meth:`close`. Backlog in the
-    socket counts as one frame: the newest pose of each body.
+    A connection that ends, falls silent or carries data other than VRPN is replaced until :meth:`close`. A backlog in
+    the socket counts as one frame with the newest pose of each body.
     """
 
     def __init__(
@@ -275,17 +275,17 @@ class VrpnSource:
         Args:
             system: The server's address.
             names: Names of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
-            take: Called on the reading thread with each frame.
-            trouble: Called on the reading thread with a description of each problem.
+            take: Called with each frame on the reading thread.
+            trouble: Called with a description of each problem on the reading thread.
 
         Raises:
-            UsageError: Two names mean the same sensor.
+            UsageError: Two names refer to the same sensor.
         """
         self._system = system
         self._selection = SensorSelection(names, system.sensor)
         self._take = take
         self._trouble = trouble
-        self._refused: dict[str, str] = {}  # copy of the selection's, for other threads
+        self._refused: dict[str, str] = {}  # copy of the selection's refused trackers for other threads
         self._failure = ""  # why the last connection ended
         self._ended = threading.Event()
         self._ready = threading.Event()  # set once poses arrive or are refused
@@ -295,8 +295,8 @@ class VrpnSource:
         """Connect and wait for the first frame.
 
         Raises:
-            LinkError: No frame arrives.
-            UsageError: A tracker has several sensors, and none is named.
+            LinkError: No frame arrived.
+            UsageError: A tracker has several sensors and none was named.
         """
         self._reader.start()
         ready = self._ready.wait(timeout_s)
@@ -326,7 +326,7 @@ class VrpnSource:
             self._ended.wait(AGAIN_S)
 
     def _receive(self) -> None:
-        """Run one connection from its start to its end."""
+        """Run one connection from start to end."""
         address = self._system.host, self._system.port or DEFAULT_PORT
         with socket.create_connection(address, CONNECT_S) as connection:
             connection.settimeout(POLL_S)
@@ -340,7 +340,7 @@ class VrpnSource:
                     data = connection.recv(CHUNK)
                 except TimeoutError:
                     continue
-                except ConnectionResetError:  # a server that ends with unread data resets the connection
+                except ConnectionResetError:  # a server that exits with unread data resets the connection
                     data = b""
                 received_ns = monotonic_ns()
                 if not data:
@@ -362,7 +362,7 @@ class VrpnSource:
 
 
 def split_name(name: str) -> tuple[str, int | None]:
-    """Split a body's name into tracker and sensor; the sensor is None if no number follows a colon."""
+    """Split a body's name into tracker and sensor. The sensor is None unless a number follows a colon."""
     tracker, _, number = name.rpartition(":")
     if tracker and number.isascii() and number.isdigit() and len(number) <= 9:
         return tracker, int(number)

@@ -1,4 +1,4 @@
-"""Several workers on this host, each in its own process; a worker that dies is restarted."""
+"""Several workers on this host, each in its own process. A worker that dies is restarted."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ import msgspec
 from skyloop.child_process import GRACE_S, ChildProcess, RestartingChild, on_parent_end
 from skyloop.processing.worker import Status, together
 
-_PAUSE_S: Final = 1.0  #: time before a worker that died is restarted
-USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all; it prints the reason
+_PAUSE_S: Final = 1.0  #: delay before restarting a worker that died
+USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all, after printing the reason
 
 
 class Worker:
-    """The process of one worker, restarted when it dies.
+    """The process of a worker, which is restarted when it dies.
 
     Args:
-        number: Number of the worker, from 1, for people.
-        command: Its command line; it prints a :class:`Status` as a JSON line on standard output from time to time.
-        report: Called on its thread with a text for people when the worker dies.
-        pause_s: Time before a restart [s].
+        number: Number of the worker for display, from 1.
+        command: Command line of the worker, which regularly prints a :class:`Status` as a JSON line on standard output.
+        report: Called on the worker's thread with a human-readable text when the worker dies.
+        pause_s: Delay before a restart [s].
     """
 
     def __init__(self, number: int, command: Sequence[str], report: Callable[[str], None], pause_s: float) -> None:
         self.status: Status | None = None
-        self.code: int | None = None  #: exit code, once it has exited for good or can't run at all
+        self.code: int | None = None  #: exit code, once the worker has exited permanently or can't run at all
         self._number = number
         self._report = report
         self._pause_s = pause_s
@@ -55,7 +55,7 @@ class Worker:
 
 
 class Group:
-    """Several children that run the same command. A context manager that ends them."""
+    """Several children running the same command. A context manager that ends them."""
 
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
@@ -65,14 +65,14 @@ class Group:
         Args:
             command: Command line of each child.
             count: Number of children.
-            tell: Called on a child's thread with a text for people when that child dies.
-            pause_s: Time before a dead child is restarted [s].
+            tell: Called on a child's thread with a human-readable text when that child dies.
+            pause_s: Delay before restarting a dead child [s].
         """
         self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
 
     @property
     def status(self) -> Status | None:
-        """Combined statistics of all children; None until one has reported."""
+        """Combined statistics of all children; None until one of them has reported."""
         return together(worker.status for worker in self._workers if worker.status is not None)
 
     @property
@@ -83,7 +83,7 @@ class Group:
 
     @property
     def code(self) -> int | None:
-        """Exit code once all have exited, or one has reported that it can't run; None before."""
+        """Exit code once all children have exited or one has reported that it can't run; None before that."""
         codes = [worker.code for worker in self._workers]
         if USAGE_ERROR in codes:
             return USAGE_ERROR
@@ -104,7 +104,7 @@ class Group:
 
 
 def end_with_parent(stop: Callable[[], None]) -> None:
-    """Call ``stop`` in this child process when its standard input closes, and exit if it still runs 2 s later.
+    """Call ``stop`` in this child process when its standard input closes; exit if it is still running 2 s later.
 
     ``stop`` runs on a separate thread.
     """
@@ -112,7 +112,7 @@ def end_with_parent(stop: Callable[[], None]) -> None:
     def end() -> None:
         stop()
         time.sleep(GRACE_S / 2)
-        os._exit(1)  # the user's code hangs, and the parent can no longer end this process
+        os._exit(1)  # the user's code is hanging, and the parent can no longer end this process
 
     on_parent_end(end)
 

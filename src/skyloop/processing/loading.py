@@ -1,4 +1,4 @@
-"""Load the user's processor from a module or a file, with errors that name the place and the problem."""
+"""Loading of the user's processor from a module or a file, with errors that name the place and the problem."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from skyloop.control.loading import load_module
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 
 _WANTED: Final = "a class with a method process(self, frame)"
-_DIGITS: Final = 16  #: digits of the code's hash
+_DIGITS: Final = 16  #: number of digits of the code's hash
 
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """The class of a processor, and a mark that distinguishes it from other code of that name."""
+    """A processor's class, and a mark that distinguishes it from other code with the same name."""
 
     kind: type[Any]
     mark: str  #: name of the class and a hash of the file that defines it
@@ -30,7 +30,7 @@ class Code:
         """Return the code of a class.
 
         Raises:
-            UsageError: It has no plain method ``process(self, frame)``.
+            UsageError: The class has no plain method ``process(self, frame)``.
         """
         _check(kind)
         digits = hashlib.sha256(_source(kind)).hexdigest()[:_DIGITS]
@@ -38,7 +38,7 @@ class Code:
 
     @property
     def name(self) -> str:
-        """Default name of the processor: the class's in lower case."""
+        """Default name of the processor: the name of the class in lower case."""
         return self.kind.__name__.lower()[:64]
 
     def make(self) -> Any:
@@ -59,13 +59,13 @@ def load_processor(target: str) -> Code:
     """Load a processor's class.
 
     Args:
-        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if it has only one processor. Modules are searched
-            in the current directory too.
+        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if it has only one processor. The current directory
+            is searched for modules too.
 
     Raises:
         UsageError: ``target`` names no processor, there is no such module, or the class is not a processor.
         UnknownNameError: There is no such class.
-        FileFormatError: Loading fails, or the file has no processor.
+        FileFormatError: Loading fails, or the file contains no processor.
     """
     place, colon, class_name = target.rpartition(":")
     if not colon:
@@ -95,7 +95,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """Return the class of that name, or else the only class with a method ``process``."""
+    """Return the class with that name or, without a name, the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -127,7 +127,7 @@ def _check(kind: type[Any]) -> None:
 
 
 def _source(kind: type[Any]) -> bytes:
-    """Return the source file of a class; without one, as in a notebook, its compiled code."""
+    """Return the source file of a class or, if there is none (as in a notebook), its compiled code."""
     try:
         return Path(inspect.getsourcefile(kind) or "").read_bytes()
     except (TypeError, OSError):

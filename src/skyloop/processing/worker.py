@@ -1,4 +1,4 @@
-"""One worker of a processor: takes its share of the frames, calls the user's class and publishes the results."""
+"""A worker of a processor: takes its share of the frames, calls the user's class and publishes the results."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from skyloop.extend import join_processor, video_channel
 from skyloop.messages import ProcessorShare, Severity
 from skyloop.messages.relayed import MAX_LOG_TEXT, Shape
 
-_LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame arrives
-_REPORT_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
-_KEPT: Final = 1024  #: newest results and frames kept for rates and ages
+_LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
+_REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
+_KEPT: Final = 1024  #: number of newest results and frames kept for rates and ages
 #: Fields summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
 
 class Output:
-    """A value, and shapes to draw over the frame for people: ``return Output(boxes, [Polyline(…)])``."""
+    """A value, with shapes to draw over the frame for viewers: ``return Output(boxes, [Polyline(…)])``."""
 
     __slots__ = ("shapes", "value")
 
@@ -50,19 +50,19 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Options of a processor's run.
+    """Options for running a processor.
 
     Raises:
         UsageError: A name, an age or a limit is out of range.
     """
 
     name: str  #: name of the processor and of its results
-    code: str  #: identifies the code, the same for all workers
-    camera: str | None = None  #: name of the camera; None: the vehicle's first
-    shared: bool = True  #: each frame goes to one worker; if False, each worker gets all frames
-    max_age_s: float | None = 1.0  #: skip frames older than this at their turn; None: skip none
-    max_fps: float | None = None  #: frame rate limit of this worker; None: no limit
-    stuck_s: float = 2.0  #: a longer call of ``process`` gives this worker's share to the others
+    code: str  #: identifier of the code, the same for all workers
+    camera: str | None = None  #: name of the camera; None for the vehicle's first one
+    shared: bool = True  #: whether each frame goes to only one worker, instead of to all
+    max_age_s: float | None = 1.0  #: skip frames older than this when their turn comes; None skips none
+    max_fps: float | None = None  #: frame rate limit of this worker; None for no limit
+    stuck_s: float = 2.0  #: duration of a ``process`` call after which the other workers get this one's share
 
     def __post_init__(self) -> None:
         checked_name(self.name)
@@ -75,24 +75,24 @@ class Settings:
 class Worker:
     """Runs a processor on a drone's frames: ``Worker(drone, Detector(), settings).run()``.
 
-    Exceptions of ``process`` and results that can't be sent are counted and reported through ``drone.log`` and
-    ``tell``; the worker then continues with the next frame.
+    Exceptions in ``process`` and results that can't be sent are counted and reported through ``drone.log`` and
+    ``tell``. The worker then continues with the next frame.
     """
 
     def __init__(
         self, drone: Drone, processor: Any, settings: Settings, tell: Callable[[str], None] = lambda _: None
     ) -> None:
-        """Join the processor's workers; frames are processed only in :meth:`run`.
+        """Join the processor's workers. Frames are processed only in :meth:`run`.
 
         Args:
             drone: Source of the frames, and destination of the results.
             processor: Object with a method ``process(frame)``, called on the thread of :meth:`run`.
-            settings: Options of the run.
-            tell: Called on the thread of :meth:`run` with each report, a text for people.
+            settings: Options for the run.
+            tell: Called on the thread of :meth:`run` with each report, a human-readable text.
 
         Raises:
-            NameTakenError: Another application runs other code under this name.
-            SkyloopError: Any other error of :func:`skyloop.extend.join_processor`.
+            NameTakenError: Another application is running different code under this name.
+            SkyloopError: Any other error from :func:`skyloop.extend.join_processor`.
         """
         self.settings = settings
         self._drone = drone
@@ -114,11 +114,11 @@ class Worker:
         """Process frames until :meth:`stop` is called or the drone closes, then leave the processor's workers.
 
         Args:
-            seconds: Longest duration [s]; None: no limit.
+            seconds: Maximum duration [s]; None for no limit.
 
         Raises:
-            NameTakenError: Other code took the name meanwhile, as it can while the proxy is away.
-            RefusedError: The proxy refuses this worker for another reason.
+            NameTakenError: Different code has taken the name since, which is possible while the proxy is away.
+            RefusedError: The proxy refuses this worker for a different reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
         try:
@@ -132,12 +132,12 @@ class Worker:
             self.membership.close()
 
     def stop(self) -> None:
-        """End :meth:`run` after the current call. Any thread."""
+        """End :meth:`run` after the current call. Can be called from any thread."""
         self._stopped.set()
 
     @property
     def status(self) -> Status:
-        """Current statistics. Any thread."""
+        """Current statistics. Can be read from any thread."""
         membership = self.membership
         return self._tally.status(membership.processor, membership.camera, membership.share, self._frames.dropped)
 
@@ -158,7 +158,7 @@ class Worker:
         began_s = self._busy_since_s = time.monotonic()
         try:
             found = self._process(frame)
-        except Exception as error:  # noqa: BLE001  (the user's code may raise anything)
+        except Exception as error:  # noqa: BLE001  (user code may raise anything)
             self._failed(error)
             return
         finally:
@@ -169,7 +169,7 @@ class Worker:
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Return whether the worker can take frames: not while a call of ``process`` exceeds ``stuck_s``."""
+        """Return whether the worker can take frames, which it can't while a call of ``process`` exceeds ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -191,7 +191,7 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._reported_refusal:  # further results probably have the same type
+        if not self._reported_refusal:  # further results are likely to have the same type
             self._reported_refusal = True
             self._emit(f"{self.settings.name}: {error}. Further ones are counted but not reported.")
 
@@ -201,7 +201,7 @@ class Worker:
         if now_s - self._reported_s < _REPORT_EVERY_S:
             return
         self._reported_s = now_s
-        inner = error.__traceback__.tb_next if error.__traceback__ is not None else None  # without our own line
+        inner = error.__traceback__.tb_next if error.__traceback__ is not None else None  # skip our own line
         lines = "".join(traceback.format_exception(type(error), error, inner))
         self._emit(f"{self.settings.name} failed ({self._tally.errors} times so far):\n{lines.rstrip()}")
 
@@ -211,9 +211,9 @@ class Worker:
 
 
 class Frames:
-    """The newest unprocessed frame of a worker's share. A context manager: subscribed while open.
+    """The newest unprocessed frame in a worker's share. A context manager that is subscribed while open.
 
-    Requests only the share's frames, and follows changes of the share, so that no others travel over a network.
+    It requests only the share's frames and follows changes of the share, so that no other frames travel over a network.
     """
 
     def __init__(
@@ -223,9 +223,9 @@ class Frames:
 
         Args:
             drone: Source of the frames.
-            membership: The membership with the share.
-            came: Called on the receiving thread with each frame of the share.
-            max_fps: Frame rate limit; None: no limit.
+            membership: The membership that has the share.
+            came: Called on the receiving thread for each frame in the share.
+            max_fps: Frame rate limit; None for no limit.
         """
         self._drone = drone
         self._membership = membership
@@ -251,7 +251,7 @@ class Frames:
 
     @property
     def dropped(self) -> int:
-        """Frames of the share that newer ones replaced."""
+        """Number of the share's frames that were replaced by newer ones."""
         return self._buffer.dropped
 
     def wait(self, timeout_s: float) -> Arrival | None:
@@ -259,7 +259,7 @@ class Frames:
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
-        """Decode the frame; None if that fails, which its channel counts."""
+        """Decode the frame; None if that fails (its channel counts failures)."""
         return (self._channel or self._usual).picture(arrival)
 
     # On the receiving thread, except while entering --------------------------------------------------------------
@@ -287,27 +287,27 @@ class Frames:
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """Statistics of one worker, or of several of one processor together.
+    """Statistics of one worker, or of several workers of one processor combined.
 
-    Counts are since the start; rates and ages cover the last second.
+    Counts are totals since the start; rates and ages cover the last second.
     """
 
     processor: str
     camera: str
-    processes: int = 1  #: workers that these statistics cover
+    processes: int = 1  #: number of workers that these statistics cover
     part: int = 0  #: index of the worker's part of the frames; 0 for several workers
-    parts: int = 0  #: number of parts, 0: none now; for several workers: how many of them have a part
-    workers: int = 0  #: workers of this processor and camera known to the proxy
-    frames: int = 0  #: frames of the worker's part
+    parts: int = 0  #: number of parts, 0 if there is none now; for several workers, how many have a part
+    workers: int = 0  #: number of workers of this processor and camera that the proxy knows
+    frames: int = 0  #: number of frames in the worker's part
     results: int = 0
-    dropped: int = 0  #: frames replaced by newer ones before the worker was ready
-    stale: int = 0  #: frames too old at their turn
-    errors: int = 0  #: calls of ``process`` that raised
-    refused: int = 0  #: results that can't be sent
-    unsent: int = 0  #: results that the transport did not accept
+    dropped: int = 0  #: number of frames replaced by newer ones before the worker was ready
+    stale: int = 0  #: number of frames that were too old when their turn came
+    errors: int = 0  #: number of ``process`` calls that raised
+    refused: int = 0  #: number of results that can't be sent
+    unsent: int = 0  #: number of results that the transport did not accept
     frames_hz: float = 0.0
     results_hz: float = 0.0
-    age_s: float | None = None  #: median time from a frame's capture to its result
+    age_s: float | None = None  #: median time between a frame's capture and its result
     age_max_s: float | None = None
     took_s: float | None = None  #: median duration of ``process``
 
@@ -334,7 +334,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 def together(found: Iterable[Status]) -> Status | None:
     """Combine the statistics of several workers of one processor; None if there are none.
 
-    Counts and rates are summed; ages are the worst.
+    Counts and rates are sums; ages are the worst ones.
     """
     each = list(found)
     if len(each) < 2:
@@ -355,7 +355,7 @@ def together(found: Iterable[Status]) -> Status | None:
 
 
 class Tally:
-    """Counters of one worker. One thread counts frames, another results; any thread can read."""
+    """Counters of a worker. One thread counts frames, another one results; any thread can read them."""
 
     def __init__(self, clock: Clock) -> None:
         self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0
@@ -364,7 +364,7 @@ class Tally:
         self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # time, age [s], duration [s]
 
     def came(self) -> None:
-        """Count a frame of the worker's part; on the receiving thread."""
+        """Count a frame in the worker's part. Called on the receiving thread."""
         self.frames += 1
         self._came.append(self._clock())
 
@@ -384,8 +384,8 @@ class Tally:
         Args:
             processor: Name of the processor.
             camera: Name of the camera.
-            share: Share of the frames; None while unknown.
-            dropped: Frames replaced by newer ones.
+            share: The worker's share of the frames; None if unknown.
+            dropped: Number of frames replaced by newer ones.
         """
         since_ns = self._clock() - NS_PER_S
         made = [one for one in self._made.copy() if one[0] > since_ns]

@@ -1,7 +1,7 @@
-"""The drones' flight logic: apply commands, follow a table of states, and set the control loops' set-points.
+"""The drones' flight logic, which applies commands, follows a table of states and controls the loops' set-points.
 
-A :class:`Happening` changes a state. One that is not in :data:`TRANSITIONS` for the present state is ignored, as in
-firmware. The charge of the :class:`Batteries` causes some of them.
+A :class:`Happening` changes a state. If :data:`TRANSITIONS` does not list it for the current state, it is ignored, as
+in firmware. Some are caused by the charge of the :class:`Batteries`.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from skyloop.sim.streams import Floats
 
 
 class Happening(Enum):
-    """Causes of state changes: the pilot's commands first, then the vehicle's own observations."""
+    """Causes of state changes: first the pilot's commands, then the vehicle's own observations."""
 
     TAKEOFF = auto()
     LAND = auto()
     HOVER = auto()
     SET_POINT = auto()
     STOP = auto()
-    RESET = auto()  # only on the ground, which the caller checks
+    RESET = auto()  # only on the ground; the caller checks this
     HEIGHT_REACHED = auto()
     TOUCHED_GROUND = auto()
     CRASHED = auto()
@@ -75,7 +75,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
     _S.HOVERING: _IN_FLIGHT,
     _S.FLYING: _IN_FLIGHT,
     _S.LANDING: {
-        _H.HOVER: _S.HOVERING,  # aborts the landing, as in real autopilots
+        _H.HOVER: _S.HOVERING,  # aborts the landing, like real autopilots
         _H.TAKEOFF: _S.TAKING_OFF,
         _H.TOUCHED_GROUND: _S.LANDED,
         _H.STOP: _S.EMERGENCY,
@@ -87,7 +87,7 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """Return the next state, or None if the happening is ignored."""
+    """Return the next state; None if the happening is ignored."""
     return TRANSITIONS[state].get(happening)
 
 
@@ -96,7 +96,7 @@ class Batteries:
 
     Attributes:
         charge: Remaining charge, 0 to 1, (n,).
-        voltage: At the terminals, (n,) [V].
+        voltage: Voltage at the terminals, (n,) [V].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], charge: Floats) -> None:
@@ -108,30 +108,30 @@ class Batteries:
         self.voltage = self.open_voltage()
 
     def drain(self, power: Floats, period_s: float) -> None:
-        """Discharge by ``power``, (n,) [W], over a period."""
+        """Discharge the batteries by ``power``, (n,) [W], over a period."""
         current = power / np.maximum(self.voltage, 1.0)
         np.maximum(self.charge - current * period_s / self._capacity, 0.0, out=self.charge)
         self.voltage = self.open_voltage() - current * self._resistance
 
     def strength(self) -> Floats:
-        """Return the available share of the full battery's thrust, (n,): thrust grows with voltage squared."""
+        """Return the available fraction of a full battery's thrust, (n,): thrust grows with the voltage squared."""
         share: Floats = np.clip(self.voltage / self._full, 0.0, 1.0) ** 2
         return share
 
     def open_voltage(self) -> Floats:
-        """Return the voltage without load, (n,) [V]."""
+        """Return the voltage without a load, (n,) [V]."""
         voltage: Floats = self._empty + (self._full - self._empty) * self.charge
         return voltage
 
 
-LOW_BATTERY = 0.03  # share of the charge below which the vehicle lands
-_HEIGHT_TOLERANCE_M = 0.08  # below its target height, a take-off counts as finished
-_STANDING_S = 0.05  # time since the last ground contact below which a drone counts as standing
+LOW_BATTERY = 0.03  # charge below which the vehicle lands, 0 to 1
+_HEIGHT_TOLERANCE_M = 0.08  # distance below its target height at which a take-off counts as finished
+_STANDING_S = 0.05  # time since the last ground contact up to which a drone counts as standing
 _KEPT_OCCURRENCES = 1000
 
 
 class Autopilot:
-    """Flight states and set-points of all drones. Times are of the simulation."""
+    """Flight states and set-points of all drones. Times are simulation times."""
 
     def __init__(
         self,
@@ -149,16 +149,16 @@ class Autopilot:
         self.states = [FlightState.LANDED for _ in parameters]
         self.reasons = ["" for _ in parameters]
         self.occurrences: deque[Occurrence] = deque(maxlen=_KEPT_OCCURRENCES)
-        self._stood_s = [0.0 for _ in parameters]  # time of each drone's last support from below
-        self._rising: dict[int, float] = {}  # drones that are taking off, and the altitude where the take-off ends
+        self._stood_s = [0.0 for _ in parameters]  # time when each drone was last supported from below
+        self._rising: dict[int, float] = {}  # drones that are taking off, with the altitude at which the take-off ends
         self._warned: set[int] = set()
-        self.handed_over: set[int] = set()  #: drones flown by firmware
+        self.handed_over: set[int] = set()  #: numbers of drones flown by firmware
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point in force is clamped only when it is sent again; the loops' own tilt, climb and altitude follow at
-        once.
+        A set-point in force is only clamped when it is sent again. The loops' own tilt, climb and altitude change
+        immediately.
         """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
@@ -166,7 +166,7 @@ class Autopilot:
             self._loops.set_ceiling(drone, limits.altitude_m)
 
     def command(self, drone: int, action: AnyAction, time_s: float) -> AnyAction:
-        """Apply a command; return the applied action, :class:`Idle` if it was ignored."""
+        """Apply a command and return the applied action, which is :class:`Idle` if the command was ignored."""
         if isinstance(action, Takeoff):
             if self._batteries.charge[drone] <= LOW_BATTERY:
                 return Idle()
@@ -187,12 +187,12 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """Hover at a flying drone's new position, without any estimate of the wind there."""
+        """Hover at a flying drone's new position without any estimate of the wind there."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
     def grounded(self, drone: int, time_s: float) -> bool:
-        """Return whether a drone is on the ground: landed, or fallen in an emergency."""
+        """Return whether a drone is on the ground, either landed or after falling in an emergency."""
         fallen = time_s - self._stood_s[drone] <= _STANDING_S
         return self.states[drone] is FlightState.LANDED or (self.states[drone] is FlightState.EMERGENCY and fallen)
 
@@ -204,26 +204,26 @@ class Autopilot:
         self.handed_over.add(drone)
 
     def take_back(self, drone: int, time_s: float) -> None:
-        """Take a drone back whose rotors were stopped."""
+        """Take back a drone whose rotors have been stopped."""
         self.handed_over.discard(drone)
         flew, self.states[drone] = self.states[drone].airborne, FlightState.LANDED
         if flew:
             self._advance(drone, Happening.STOP, EmergencyStop(), time_s, "taken from its firmware in the air")
 
     def watch_firmware(self, rotors: RotorBodies, time_s: float) -> None:
-        """Follow the states of drones flown by firmware; called once per step."""
+        """Update the states of drones flown by firmware. Called once per step."""
         for drone in self.handed_over:
             stands = time_s - self._stood_s[drone] <= _STANDING_S and rotors.idles(drone)
             self.states[drone] = FlightState.LANDED if stands else FlightState.FLYING
 
     def supervise(self, time_s: float) -> None:
-        """End the take-off of drones at its target height; called once per period of the loops."""
+        """End the take-off of drones that have reached their target height. Called once per period of the loops."""
         for drone, height in list(self._rising.items()):
             if self._sensors.altitude[drone] >= height - _HEIGHT_TOLERANCE_M:
                 self._advance(drone, Happening.HEIGHT_REACHED, Hover(), time_s)
 
     def watch_batteries(self, time_s: float) -> None:
-        """Land drones with a low battery, and stop those with an empty one; called periodically."""
+        """Land drones whose battery is low and stop those whose battery is empty. Called periodically."""
         self._loops.set_strength(self._batteries.strength())
         low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
         self._warned.intersection_update(low)  # warn again after a battery change
@@ -238,7 +238,7 @@ class Autopilot:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
     def feel(self, contacts: Contacts, time_s: float) -> None:
-        """React to the contacts of a step."""
+        """React to the contacts in a step."""
         for drone, speed, what in contacts.impacts:
             text = f"hit {what} at {speed:.1f} m/s"
             self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)
@@ -273,7 +273,7 @@ class Autopilot:
         return action
 
     def _enter(self, drone: int, state: FlightState, before: FlightState, action: AnyAction) -> None:
-        """Set the loops for a state."""
+        """Set up the loops for a state."""
         parameters, loops = self._parameters[drone], self._loops
         if state is not FlightState.TAKING_OFF and self._rising.pop(drone, None) is not None:
             loops.set_ceiling(drone, self.limits[drone].altitude_m)

@@ -1,7 +1,7 @@
-"""Cameras of simulated drones: lens and mounting, rate, latency and the flaws of the sensor.
+"""Cameras of simulated drones: lens and mounting, rate, latency and flaws of the sensor.
 
-Pixels follow OpenCV: x right, y down, the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
-forward. Body axes: x forward, y left, z up. A rotation "body from optical" turns optical into body vectors.
+Pixels follow OpenCV: x right, y down, with the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
+forward. Body axes: x forward, y left, z up. A rotation "body from optical" converts optical vectors to body vectors.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ Vec3 = tuple[float, float, float]
 Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
 
-_BLOCK: Final = 16384  #: points undistorted at a time
+_BLOCK: Final = 16384  #: number of points to undistort at a time
 
-#: Body from optical of a camera that looks forward, level, with the image's top up.
+#: Rotation "body from optical" of a level camera that looks forward, with the image's top up.
 LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-#: Body from optical of a camera that looks straight down, with the image's top forward.
+#: Rotation "body from optical" of a camera that looks straight down, with the image's top forward.
 LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 def looking_up(tilt_rad: float) -> Rotation9:
-    """Return body from optical of a camera that looks forward and up by an angle, with the image's top up."""
+    """Return "body from optical" for a camera that looks forward, tilted up by an angle, with the image's top up."""
     s, c = math.sin(tilt_rad), math.cos(tilt_rad)
     return (0.0, s, c, -1.0, 0.0, 0.0, 0.0, -c, s)
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return world from optical axes (x right, y down, z forward) of a camera at one point that looks at another."""
+    """Return "world from optical" (x right, y down, z forward) for a camera at one point that looks at another."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -47,9 +47,9 @@ class CameraPose:
     """The pose of a camera in the world.
 
     Attributes:
-        position_m: Optical centre, shape (3,).
-        rotation: World from optical axes, shape (3, 3).
-        drone: Number of the drone that carries it, whose own body is not rendered; None for a free camera.
+        position_m: Position of the optical centre, shape (3,).
+        rotation: Rotation from optical to world axes, shape (3, 3).
+        drone: Number of the drone that carries the camera and is not rendered itself; None for a free camera.
     """
 
     position_m: NDArray[np.float64]
@@ -66,21 +66,21 @@ class CameraModel:
     """
 
     name: str
-    width: int  #: pixels
-    height: int  #: pixels
+    width: int  #: width of the image [px]
+    height: int  #: height of the image [px]
     fps: float
-    fx: float  #: focal lengths and principal point, pixels
+    fx: float  #: focal lengths and principal point [px]
     fy: float
     cx: float
     cy: float
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 in OpenCV's order
     position_m: Vec3 = (0.0, 0.0, 0.0)  #: position of the optical centre in body axes
     rotation: Rotation9 = LOOKING_FORWARD  #: body from optical, row by row
-    latency_s: float = 0.0  #: from the middle of the exposure until the frame is delivered
-    noise_sigma: float = 0.0  #: standard deviation per channel of each pixel, in steps of 0 … 255
+    latency_s: float = 0.0  #: time from the middle of the exposure until the frame is delivered
+    noise_sigma: float = 0.0  #: standard deviation of each pixel's channels, on the scale of 0 … 255
     exposure_s: float = 0.0  #: opening time of the shutter, which blurs the image of a turning drone
     exposure_gain: float = 1.0  #: brightness relative to the scene's own
-    vignetting: float = 0.0  #: share of light lost in the corners, 0 … 1
+    vignetting: float = 0.0  #: fraction of the light lost in the corners, 0 … 1
 
     def __post_init__(self) -> None:
         if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
@@ -108,16 +108,16 @@ class CameraModel:
 
     @property
     def rotation_matrix(self) -> NDArray[np.float64]:
-        """Body from optical, shape (3, 3)."""
+        """Rotation "body from optical", shape (3, 3)."""
         return np.array(self.rotation, dtype=np.float64).reshape(3, 3)
 
     @property
     def distorted(self) -> bool:
-        """Whether the lens bends straight lines."""
+        """Return the intrinsics, as given with each frame."""
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """Return the intrinsics, as in each frame."""
+        """Return the camera's description as drivers report it before the first frame."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 
@@ -139,18 +139,18 @@ class CameraModel:
         """Return the camera's pose for a pose of its drone.
 
         Args:
-            body_position_m: World axes, shape (3,).
-            body_rotation: World from body, shape (3, 3).
-            drone: Number of the drone that carries it.
+            body_position_m: Position of the body in world axes, shape (3,).
+            body_rotation: Rotation from body to world axes, shape (3, 3).
+            drone: Number of the drone that carries the camera.
         """
         position = np.asarray(body_position_m, dtype=np.float64) + body_rotation @ np.asarray(self.position_m)
         return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
 
     def scaled(self, factor: float) -> CameraModel:
-        """Return the same lens with another image size: factor 2 turns 320×240 into 640×480.
+        """Return the same lens with a different image size: a factor of 2 turns 320×240 into 640×480.
 
         Raises:
-            UsageError: The factor is not finite and above 0.
+            UsageError: The factor is not a finite number greater than 0.
         """
         if not (math.isfinite(factor) and factor > 0.0):
             raise UsageError(f"a camera can't be scaled by {factor}; the factor must be finite and above 0")
@@ -168,7 +168,7 @@ class CameraModel:
         """Project points into the image.
 
         Args:
-            points: In optical axes [m], shape (n, 3), all in front of the camera (z > 0).
+            points: Points in optical axes [m], shape (n, 3), all in front of the camera (z > 0).
 
         Returns:
             Pixels, shape (n, 2).
@@ -191,7 +191,7 @@ class CameraModel:
 
 
 def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
-    """Return where a lens maps x/z, y/z, shape (n, 2). Source: the Brown-Conrady model as in OpenCV's ``calib3d``."""
+    """Map x/z, y/z, shape (n, 2), through a lens. Source: the Brown-Conrady model as in OpenCV's ``calib3d``."""
     k1, k2, p1, p2, k3 = distortion
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y
@@ -202,9 +202,9 @@ def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.f
 
 
 def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
-    """Invert :func:`distort` by Newton's method; return None without an inverse near the optical axis."""
+    """Invert :func:`distort` by Newton's method; return None if there is no inverse near the optical axis."""
     straight = np.empty_like(points)
-    for first in range(0, len(points), _BLOCK):  # in blocks, so that intermediate values stay in the CPU cache
+    for first in range(0, len(points), _BLOCK):  # in blocks that keep intermediate values in the CPU cache
         part = slice(first, first + _BLOCK)
         if (block := _undistort(points[part], distortion)) is None:
             return None
@@ -235,8 +235,8 @@ def _undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[n
     return guess if np.abs(distort(guess, distortion) - points).max(initial=0.0) < 1e-9 else None
 
 
-# Pictures of 320×240 with Parrot's diagonal fields of view for its AR.Drone: 92° forward and 64° down.
-# The forward lens is wide: with this barrel distortion its focal length matches that of calibrations.
+# 320×240 images with Parrot's diagonal fields of view for its AR.Drone: 92° forward and 64° down.
+# The forward lens is a wide one: with this barrel distortion its focal length matches published calibrations.
 FRONT_CAMERA = CameraModel(
     name="front",
     width=320,
@@ -270,8 +270,8 @@ BOTTOM_CAMERA = CameraModel(
     exposure_s=0.006,
     vignetting=0.15,
 )
-# A racing pilot's view: 100° by 76° and 120° across the corners, as of a wide 2.1 mm lens, at the tilt of a fast
-# flight; rate, latency and short exposure are estimates for an analogue camera.
+# A racing pilot's view: 100° by 76° and 120° across the corners, like a wide 2.1 mm lens, tilted as for fast
+# flight. Rate, latency and short exposure are estimates for an analogue camera.
 FPV_CAMERA = CameraModel(
     name="fpv",
     width=320,

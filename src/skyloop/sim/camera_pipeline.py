@@ -1,4 +1,4 @@
-"""The cameras of simulated drones: their exposure times, and the thread that renders and delivers their frames."""
+"""The cameras of simulated drones: exposure times, and the thread that renders and delivers frames."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, Senso
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
-#: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that picks
+#: Factor on the rendered frame rate if fewer frames are used than the camera takes, so that a consumer that selects
 #: frames by its own count always finds one in time.
 RATE_MARGIN: Final = 1.25
 
 
 class Screen(Protocol):
-    """The recipient of a drone's frames."""
+    """Receives a drone's frames."""
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
 
@@ -33,7 +33,7 @@ class Screen(Protocol):
 
 
 class Exposing(Protocol):
-    """Renders exposures, and delivers the frames when they are due."""
+    """Renders exposures and delivers the frames when they are due."""
 
     def expose(self, exposures: list[Exposure]) -> None: ...
 
@@ -43,15 +43,15 @@ class Exposing(Protocol):
 
 
 class Shutter:
-    """Decides when a camera exposes, by absolute simulation times. Pure."""
+    """Decides when a camera exposes, using absolute simulation times. Pure."""
 
     def __init__(self, offset_s: float = 0.0) -> None:
         """Set the time of the first exposure [s]."""
         self._next_s = offset_s
-        self.count = 0  #: exposures so far, including those without an observer
+        self.count = 0  #: number of exposures so far, including those without an observer
 
     def due(self, now_s: float, fps: float) -> bool:
-        """Return whether to expose now. After a pause, missed exposures are not made up for."""
+        """Return whether to expose now. Exposures missed during a pause are not made up for."""
         if now_s < self._next_s:
             return False
         self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
@@ -61,15 +61,15 @@ class Shutter:
 
 @dataclass(eq=False, slots=True)
 class Camera:
-    """One camera of one drone."""
+    """A camera of a drone."""
 
     model: CameraModel
     drone: int
     screen: Screen
     seed: int
     shutter: Shutter
-    dropped: int = 0  #: exposures replaced by a newer one before rendering
-    gone: bool = False  #: whether its observer was detached
+    dropped: int = 0  #: number of exposures replaced by newer ones before rendering
+    gone: bool = False  #: whether the camera's observer was detached
     _effects: tuple[CameraModel, SensorEffects] | None = field(default=None, init=False)
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
@@ -77,8 +77,8 @@ class Camera:
         """Return whether the exposure that is due now is worth rendering.
 
         Args:
-            captured_ns: Its time.
-            fps: How many frames per second are used; 0: none; infinity: all.
+            captured_ns: Time of the exposure.
+            fps: Number of frames per second in use: 0 for none, infinity for all.
         """
         if not fps:
             return False
@@ -95,7 +95,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """A camera's view at one time, to be rendered."""
+    """A camera's view at a point in time, to be rendered."""
 
     camera: Camera
     model: CameraModel
@@ -104,11 +104,11 @@ class Exposure:
     rates_rad_s: NDArray[np.float64]
     number: int
     captured_ns: int
-    due_ns: int  #: when to deliver the frame
+    due_ns: int  #: time at which to deliver the frame
 
 
 class _Frames:
-    """Rendered frames, each delivered when due."""
+    """Rendered frames, each delivered when it is due."""
 
     def __init__(self) -> None:
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
@@ -116,7 +116,7 @@ class _Frames:
         self._handing = threading.RLock()
 
     def hand_out(self, now_ns: int) -> None:
-        """Deliver the frames that are due at this time."""
+        """Deliver the frames that are due by now."""
         while self._finished and self._finished[0][0] <= now_ns:
             _, _, exposure, picture = heapq.heappop(self._finished)
             with self._handing:
@@ -124,7 +124,7 @@ class _Frames:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames of these cameras; after it returns, no other thread delivers one."""
+        """Stop delivering frames from these cameras. After this returns, no other thread delivers one."""
         with self._handing:
             for camera in cameras:
                 camera.gone = True
@@ -136,9 +136,9 @@ class _Frames:
 
 
 class CameraPipeline(_Frames):
-    """Renders each camera's newest exposure on a separate thread, and delivers each frame when it is due.
+    """Renders each camera's newest exposure on a separate thread and delivers each frame when it is due.
 
-    Creating the scene takes some tenths of a second: start the pipeline when the first frame is requested.
+    Creating the scene takes some tenths of a second, so start the pipeline when the first frame is requested.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -146,7 +146,7 @@ class CameraPipeline(_Frames):
 
         Args:
             world: The world.
-            drones: Their number.
+            drones: Number of drones.
             quality: Image quality: ``fast``, ``smooth`` or ``best``.
         """
         super().__init__()
@@ -154,16 +154,16 @@ class CameraPipeline(_Frames):
         self._drones = drones
         self._quality = quality
         self._changed = threading.Condition()
-        self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
+        self._waiting: dict[Camera, Exposure] = {}  # the camera that has waited longest comes first
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
 
     def start(self) -> None:
-        """Start the thread. It first creates the scene; newer exposures replace older ones meanwhile."""
+        """Start the thread. It first creates the scene, during which newer exposures replace older ones."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; undelivered frames are lost."""
+        """End the thread. Undelivered frames are lost."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -171,7 +171,7 @@ class CameraPipeline(_Frames):
             self._thread.join()
 
     def expose(self, exposures: list[Exposure]) -> None:
-        """Queue exposures; each replaces a waiting one of the same camera."""
+        """Queue exposures. Each replaces one of the same camera that is still waiting."""
         with self._changed:
             for exposure in exposures:
                 if exposure.camera in self._waiting:
@@ -182,7 +182,7 @@ class CameraPipeline(_Frames):
     def _run(self) -> None:
         try:
             renderer = make_renderer(self._world, self._drones, self._quality)
-        except Exception as error:  # noqa: BLE001  reported to the drivers: no frames will follow
+        except Exception as error:  # noqa: BLE001  reported to the drivers, because no more frames will follow
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
             for screen in screens:
@@ -195,7 +195,7 @@ class CameraPipeline(_Frames):
                 exposure.camera.screen.failed(error)
 
     def _next(self) -> Exposure | None:
-        """Return the next exposure to render, and deliver due frames meanwhile; None to stop."""
+        """Return the next exposure to render, delivering due frames while waiting; None to stop."""
         while True:
             self.hand_out(monotonic_ns())
             with self._changed:
@@ -211,9 +211,9 @@ class CameraPipeline(_Frames):
 
 
 class SteppedCameraPipeline(_Frames):
-    """Renders each exposure at once, and delivers due frames on request, all on one thread.
+    """Renders each exposure immediately and delivers due frames on request, all on one thread.
 
-    For a world whose time advances only by explicit steps.
+    Intended for a world whose time advances only in explicit steps.
     """
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
@@ -232,14 +232,14 @@ class SteppedCameraPipeline(_Frames):
 
 
 def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
-    """Create a renderer. Call it on the rendering thread, to which the renderer belongs."""
+    """Create a renderer. Call this on the rendering thread, which owns the renderer."""
     return PlanarRenderer(Scene(world, drones), Quality(quality))
 
 
 def expose(
     camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
-    """Expose a camera to a state; the frame is due after the camera's latency."""
+    """Expose a camera to a state. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone
     pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
     due_ns = captured_ns + nanoseconds(model.latency_s / speed)

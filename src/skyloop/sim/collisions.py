@@ -1,7 +1,7 @@
-"""Collisions of drones with the floor, solids and one another: contact, bounce and friction.
+"""Collisions of drones with the floor, solids and each other: contact, bounce and friction.
 
-Every few steps, a broad phase finds everything within each drone's reach until the next one. The steps until
-then check only those pairs: as arrays if there are many, one at a time if there are few.
+Every few steps, a broad phase finds everything within each drone's reach until the next broad phase. The steps in
+between then check only those pairs, as arrays if there are many and one at a time if there are few.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from skyloop.sim.solids import Indices, Overlap, Solids, overlapping
 from skyloop.sim.streams import Floats
 from skyloop.sim.world import Vec3
 
-_STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or nothing would come to rest
-_PASSES = 6  # attempts per step to push a drone out of solids
-_TOUCH_M = 1e-9  # overlaps up to this count as touching: rounding leaves some that no push removes
-#: Steps between two broad phases. With few drones one costs as much, but leaves fewer pairs to check.
+_STILL_M_S = 0.3  # speed along the normal below which contacts don't bounce, or nothing would come to rest
+_PASSES = 6  # number of attempts per step to push a drone out of solids
+_TOUCH_M = 1e-9  # maximum overlap that counts as touching: rounding leaves some that no push removes
+#: Number of steps between broad phases. With few drones one costs as much but leaves fewer pairs to check.
 BROAD_PHASE_STEPS, BROAD_PHASE_STEPS_OF_FEW = 15, 30
-_SLACK_M = 0.03  # extra reach in a broad phase, for drones that are pushed
-#: Up to this many pairs are faster to check one at a time.
+_SLACK_M = 0.03  # extra reach in a broad phase, to allow for drones being pushed
+#: Maximum number of pairs that are faster to check one at a time.
 FEW_PAIRS = 6
 
 
 @dataclass(slots=True)
 class Contacts:
-    """The contacts of a step.
+    """The contacts in a step.
 
     Attributes:
         standing: Drones supported from below by something other than a drone.
-        upon: Drones on drones, the upper one first.
+        upon: Pairs of a drone standing on another, the upper one first.
         impacts: Drone, speed along the normal [m/s], and the name of the other object.
     """
 
@@ -47,21 +47,21 @@ class Contacts:
 
 @dataclass(slots=True)
 class _Near:
-    """Everything within the drones' reach until the next broad phase.
+    """Everything that is within the drones' reach until the next broad phase.
 
     Attributes:
-        one: The first drone of each pair of drones within reach, with the lower number.
-        other: The second.
-        across: The square of the sum of their radii.
-        upright: The square of the sum of their half heights.
-        solids: The solids within reach, by drone; drones near only a wall or the ceiling have none.
-        who: The drone of each pair of a drone and a solid.
-        what: The solid.
-        sizes: See :meth:`Solids.sizes`.
-        moving: Whether one of these solids moves.
+        one: The first drone of each pair of drones within reach; it has the lower number.
+        other: The second drone of each pair.
+        across: The square of the sum of the pair's radii.
+        upright: The square of the sum of the pair's half heights.
+        solids: The solids within reach, by drone; drones that are only near a wall or the ceiling have none.
+        who: Number of the drone in each pair of a drone and a solid.
+        what: Number of the solid in each of these pairs.
+        sizes: Sizes of the solids; see :meth:`Solids.sizes`.
+        moving: Whether one of these solids is moving.
         walled: Drones that can reach a wall or the ceiling.
-        room_low: Least coordinates of their centres, (3, walled).
-        room_high: Greatest coordinates.
+        room_low: Minimum coordinates of the centres of those drones, (3, walled).
+        room_high: Maximum coordinates.
     """
 
     one: Indices
@@ -79,7 +79,7 @@ class _Near:
 
 
 class Collisions:
-    """Keeps drones out of solids and of one another; called once per step."""
+    """Keeps drones out of solids and away from one another. Called once per step."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], bodies: BodyTable, solids: Solids) -> None:
         self._bodies = bodies
@@ -88,27 +88,27 @@ class Collisions:
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
         self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
-        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # of centres in the room
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # for the centres
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
         self._floor_constants = np.array(self._bounce), np.array(self._friction)
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
         self._feet = self._hull[2]
-        # Rows: writing single numbers is faster than writing columns.
+        # Rows, because writing single numbers is faster than writing columns.
         self._x, self._y, self._z = bodies.position
         self._vx, self._vy, self._vz = bodies.velocity
-        self._free = bodies.position.copy()  # each drone's last position clear of all fixed objects
+        self._free = bodies.position.copy()  # last position of each drone clear of all fixed objects
         self._broad_phase_steps = BROAD_PHASE_STEPS_OF_FEW if few(len(parameters)) else BROAD_PHASE_STEPS
         self._span_m = _span(bodies.most_acceleration_m_s2, self._broad_phase_steps)
-        self._next = 0  # the step of the next broad phase
+        self._next = 0  # step of the next broad phase
         self._reach = np.zeros(len(parameters))  # how far each drone can move until then
-        self._extra_reach = [0.0 for _ in parameters]  # additional movement from pushes and impacts
+        self._extra_reach = [0.0 for _ in parameters]  # additional movement caused by pushes and impacts
         self._run_broad_phase(0)
         self._next = 0
 
     def resolve(self, step: int) -> Contacts | None:
-        """Resolve the overlaps of the last step; return the contacts, or None without any."""
+        """Resolve the overlaps after the last step; return the contacts, or None if there were none."""
         contacts: Contacts | None = None
         np.less(self._z, self._feet, out=self._on_floor)
         if np.count_nonzero(self._on_floor):
@@ -135,7 +135,7 @@ class Collisions:
                 self._next = step + 1
 
     def moved(self, drone: int) -> None:
-        """Record that a drone was moved elsewhere."""
+        """Record that a drone was moved to another position."""
         self._free[:, drone] = self._bodies.position[:, drone]
         self._next = 0
 
@@ -182,7 +182,7 @@ class Collisions:
         )
 
     def _extend_reach(self, drone: int, metres: float) -> bool:
-        """Extend a drone's possible movement; return whether it leaves the reach of the last broad phase."""
+        """Extend how far a drone may move; return whether this exceeds the reach of the last broad phase."""
         self._extra_reach[drone] += metres
         return self._extra_reach[drone] > _SLACK_M
 
@@ -226,7 +226,7 @@ class Collisions:
         return sorted(found)
 
     def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
-        """Push a drone out of solids; return whether it may leave the broad phase's reach in the remaining time."""
+        """Push a drone out of solids; return whether it may exceed the broad phase's reach in the remaining time."""
         bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
         x, y, z = start = bodies.position[:, drone].tolist()
         height, climb = z, float(self._vz[drone])
@@ -246,31 +246,31 @@ class Collisions:
             z = max(z + normal_z * overlap.depth_m, half_height)
             impact, more_x, more_y, faster = self._rebound(drone, overlap)
             carried += faster
-            # Friction also acts on this step's motion, or a drone that stands in wind would creep.
+            # Friction also acts on this step's motion; otherwise a drone standing in wind would creep.
             x, y = x + more_x * STEP_S, y + more_y * STEP_S
             if normal_z > 0.5:
                 contacts.standing.add(drone)
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
-            # (A moving platform may overlap it afterwards; being clear of both is impossible.)
+            # (A moving platform may overlap the drone afterwards, because it can't be clear of both.)
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
         self._x[drone], self._y[drone], self._z[drone] = x, y, z
         return self._extend_reach(drone, math.dist(start, (x, y, z)) + carried * left_s)
 
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
-        """Return the position of a wedged drone: pushing it out of one object leads into another.
+        """Return the position of a wedged drone, which can't be pushed out of one object without entering another.
 
-        Horizontally it returns to its last clear position; vertically it stays free, since nothing it is wedged between
-        supports it. It has no friction: in a narrow enough corner the pressure would grow without limit and hold the
-        drone in the air forever.
+        Horizontally the drone returns to its last clear position. Vertically it stays free, because nothing that it is
+        wedged between supports it. There is no friction: in a narrow enough corner the pressure would grow without
+        limit and hold the drone in the air forever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
         self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
-        # All faces are horizontal or vertical, so there is one above or below.
+        # All faces are horizontal or vertical, so one of them is above or below.
         self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
@@ -281,10 +281,10 @@ class Collisions:
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
     def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
-        """Remove the velocity into the surface, and apply friction.
+        """Remove the velocity into the surface and apply friction.
 
         Returns:
-            That velocity [m/s]; the changes of the velocity east and north; and the increase in speed.
+            The velocity into the surface [m/s], the changes of velocity east and north, and the increase in speed.
         """
         vx, vy, vz = self._bodies.velocity[:, drone].tolist()
         nx, ny, nz = overlap.normal
@@ -307,9 +307,9 @@ class Collisions:
         return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
-        """Let a turning surface take a drone on it along: friction over the whole contact disk.
+        """Make a turning surface take the drone on it along, by friction over the whole contact disk.
 
-        With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
+        With pressure p = F / πR², the torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
         most = self._friction[drone] * impulse_m_s * (4 / 3) / self._radii[drone]
         self._bodies.turn(drone, clamped(spin_rad_s - float(self._bodies.rates[2, drone]), most))
@@ -317,7 +317,7 @@ class Collisions:
     # Drones ----------------------------------------------------------------------------------------------------
 
     def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
-        """Separate overlapping drones; return whether one may leave the broad phase's reach in the remaining time."""
+        """Separate overlapping drones; return whether one may exceed the broad phase's reach in the remaining time."""
         strayed = False
         for one, other in self._close_pairs():
             if self._separate(one, other, left_s, contacts):
@@ -325,7 +325,7 @@ class Collisions:
         return strayed
 
     def _close_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of drones that overlap."""
+        """Return the pairs of overlapping drones."""
         near, position = self._near, self._bodies.position
         apart = position.take(near.one, axis=1) - position.take(near.other, axis=1)
         np.multiply(apart, apart, out=apart)
@@ -338,7 +338,7 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one may leave the broad phase's reach in the remaining time."""
+        """Separate two drones; return whether one may exceed the broad phase's reach in the remaining time."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -348,7 +348,7 @@ class Collisions:
         upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
         depth = -max(across, upright)
         if depth <= 0.0:
-            return False  # a third drone's push has separated them
+            return False  # pushed apart by a third drone
         if across > upright:
             nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
         else:
@@ -357,7 +357,7 @@ class Collisions:
         mine = self._mass[other] / (self._mass[one] + self._mass[other])
         theirs = 1.0 - mine
         one_z, other_z = one_z + nz * depth * mine, other_z - nz * depth * theirs
-        # Neither may be pushed into the floor: both are lifted instead.
+        # Neither drone may be pushed into the floor, so both are lifted instead.
         up = max(self._half_heights[one] - one_z, self._half_heights[other] - other_z, 0.0)
         self._x[one], self._y[one], self._z[one] = one_x + nx * depth * mine, one_y + ny * depth * mine, one_z + up
         self._x[other], self._y[other] = other_x - nx * depth * theirs, other_y - ny * depth * theirs
@@ -388,5 +388,5 @@ def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, 
 
 
 def _span(acceleration_m_s2: float, steps: int) -> float:
-    """Return the largest distance that a drone covers from rest in this many steps [m]."""
+    """Return the maximum distance that a drone covers from rest in a number of steps [m]."""
     return acceleration_m_s2 * STEP_S * STEP_S * steps * (steps + 1) / 2

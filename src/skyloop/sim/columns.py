@@ -1,8 +1,8 @@
 """Tables with one column per drone, which can also be read and written drone by drone as plain floats.
 
 NumPy takes as long for three numbers as for three hundred. A few drones are therefore faster one by one in plain
-floats, many together in arrays. Both ways give the same bits: they do the same operations in the same order, and sines
-and cosines are NumPy's in both.
+floats, and many drones together in arrays. Both give the same bits, because they do the same operations in the same
+order and both use NumPy's sines and cosines.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ import numpy as np
 
 from skyloop.sim.streams import Floats
 
-N: TypeAlias = Any  #: a number of one drone, or an array with one of each
-FEW = 3  #: up to this many drones are computed one by one
+N: TypeAlias = Any  #: a number for one drone, or an array with one for each
+FEW = 3  #: maximum number of drones that are computed one by one
 
 
 def few(drones: int) -> bool:
-    """Return whether this many drones are computed one by one."""
+    """Return whether this number of drones is computed one by one."""
     return drones <= FEW
 
 
 def columns(rows: int, drones: int) -> Floats:
-    """Return zeros of shape (rows, drones), in the memory layout for this many drones."""
+    """Return zeros of shape (rows, drones), in the memory layout for this number of drones."""
     return np.zeros((drones, rows)).T if few(drones) else np.zeros((rows, drones))
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns` for a few drones, as plain floats.
+    """Consecutive rows of an array made by :func:`columns`, as plain floats for a few drones.
 
     Attributes:
-        read: One function per drone, which returns its numbers.
-        write: One function per drone, which replaces them; takes as many numbers.
+        read: One function per drone that returns the drone's numbers.
+        write: One function per drone that replaces its numbers; it takes as many numbers.
     """
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
@@ -51,13 +51,13 @@ class Fields:
 
 @dataclass(frozen=True, slots=True)
 class Operations:
-    """Operations that differ between numbers and arrays, so that one formula serves both.
+    """Operations that differ between numbers and arrays, so that one formula works for both.
 
     Attributes:
         least: The smaller of two values.
         most: The larger of two values.
         root: The square root.
-        choose: The second value where the first is true, else the third.
+        choose: The second value where the first is true, otherwise the third.
     """
 
     least: Callable[[N, N], N]

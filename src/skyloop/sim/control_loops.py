@@ -1,6 +1,6 @@
-"""The firmware's outer loops: turn set-points and estimates into attitude and thrust, for all drones.
+"""The firmware's outer loops, which turn set-points and estimates into attitude and thrust for all drones.
 
-The formulas serve both the numbers of one drone and arrays of all.
+The formulas work both for the numbers of one drone and for arrays of all drones.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
 
-_REFERENCE_LEAD_M = 0.5  # the altitude reference gets no further ahead of the vehicle than this
-_HELD_M = 0.25  # a landing drone this far behind its descent counts as held
-_HELD_CLIMB_M_S = 0.15  # a drone that climbs faster is not held, but still on its way
+_REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehicle
+_HELD_M = 0.25  # distance behind its descent from which a landing drone counts as held
+_HELD_CLIMB_M_S = 0.15  # maximum climb rate of a held drone; a faster one is still on its way
 _HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre further behind
-_HELD_REGAIN = 4.0  # how much faster it counts as free again, or it would drop when released
-_INTEGRATED_ERROR_M_S = 0.25  # clamp of the integrated error: braking from speed must not wind the integral up
-_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, for a drone held by a wall
+_HELD_REGAIN = 4.0  # factor by which it recovers faster; otherwise it would drop when released
+_INTEGRATED_ERROR_M_S = 0.25  # limit of the integrated error: braking must not wind up the integral
+_MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, in case a wall holds the drone
 
 
-_ROWS = 15  # of the table of set-points, limits and, from this row on, the loops' state:
-_STATE = 11  # first row of the state
-_LANDING = 10  # row that is above 0 while landing
+_ROWS = 15  # rows of the table: set-points, limits and the loops' state
+_STATE = 11  # first row of the loops' state
+_LANDING = 10  # row that is greater than 0 while landing
 
 
 @dataclass(frozen=True, slots=True)
 class _Gains:
-    """Gains of one drone, or of all."""
+    """Gains of one drone or of all drones."""
 
     velocity: N
     integral: N
@@ -43,7 +43,7 @@ class _Gains:
 
 
 class ControlLoops:
-    """Set-points and state of the loops, one column per drone. Written by the flight logic between updates."""
+    """Set-points and state of the loops, one column per drone. The flight logic writes them between updates."""
 
     def __init__(
         self, parameters: Sequence[VehicleParameters], limits: Sequence[Limits], bodies: BodyTable, period_s: float
@@ -55,7 +55,7 @@ class ControlLoops:
         self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
         self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
         self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
-        # The last row is a landing drone's distance above its expected descent.
+        # The last row is how far a landing drone is above its expected descent.
         self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
         self._rows = tuple(table)
         self._by_velocity[:] = 1.0
@@ -87,33 +87,33 @@ class ControlLoops:
         self._climb_limit[drone] = limits.climb_m_s
 
     def set_ceiling(self, drone: int, altitude_m: float) -> None:
-        """Set the greatest altitude of the reference [m]."""
+        """Set the maximum altitude of the reference [m]."""
         self._ceiling[drone] = altitude_m
 
     def set_strength(self, share: Floats) -> None:
-        """Set the available share of the full thrust, (n,)."""
+        """Set the available fraction of the full thrust, (n,)."""
         np.multiply(self._full_thrust, share, out=self.most_thrust)
 
     def follow_velocity(self, drone: int, forward: float, left: float, climb: float, yaw_rate: float) -> None:
-        """Follow a velocity: levelled body axes [m/s], yaw rate [rad/s]."""
+        """Follow a velocity in levelled body axes [m/s], with a yaw rate [rad/s]."""
         self._set_point[:, drone] = (forward, left, climb, yaw_rate)
         self._by_velocity[drone] = 1.0
         self._landing[drone] = 0.0
 
     def follow_attitude(self, drone: int, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
-        """Follow an attitude: roll right side down, pitch nose down [rad], climb [m/s], yaw rate [rad/s]."""
+        """Follow an attitude: roll (right side down) and pitch (nose down) [rad], climb [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (roll, pitch, climb, yaw_rate)
         self._by_velocity[drone] = 0.0
         self._landing[drone] = 0.0
 
     def land(self, drone: int, descent_m_s: float) -> None:
-        """Descend on the spot, whatever the set-point in force."""
+        """Descend on the spot, whatever the set-point in force is."""
         self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
         self._landing[drone] = 1.0
         self._behind[drone] = 0.0
 
     def start(self, drone: int, altitude_m: float) -> None:
-        """Start the motors, with the altitude reference at ``altitude_m``, the estimated altitude."""
+        """Start the motors with the altitude reference at ``altitude_m``, the estimated altitude."""
         self._running[drone] = 1.0
         self._reference[drone] = altitude_m
         self._integral[:, drone] = 0.0
@@ -126,11 +126,11 @@ class ControlLoops:
         self._bodies.cut(drone)
 
     def rest(self, drone: int) -> None:
-        """Stand on the legs, which hold the body level."""
+        """Rest on the legs, which keep the body level."""
         self._bodies.steady(drone)
 
     def update(self, sensors: Sensors) -> None:
-        """Compute the inputs of attitude loops and motors for one period."""
+        """Compute the inputs of the attitude loops and motors for one period."""
         bodies = self._bodies
         turned: Sequence[N]
         estimate: Sequence[N]
@@ -159,14 +159,14 @@ class ControlLoops:
         estimate: Sequence[N],
         landing: bool,
     ) -> tuple[tuple[N, N, N, N], tuple[N, N, N, N]]:
-        """Return roll, pitch, yaw rate, thrust, and the loops' state after the period."""
+        """Return roll, pitch, yaw rate, thrust and the loops' state after the period."""
         first, second, climb, yaw_rate, tilt_limit, climb_limit, *rest = inputs
         ceiling, most_thrust, running, by_velocity, held, reference, east, north, behind = rest
         sin_yaw, cos_roll, cos_pitch, cos_yaw = turned
         altitude, forward, left, climbing = estimate
         period, least_tilt = self._period_s, -tilt_limit
 
-        # Roll and pitch for the horizontal velocity. The integral is in world axes, in which wind stays in turns.
+        # Roll and pitch for the horizontal velocity. The integral is in world axes, where turning leaves wind as is.
         ahead, aside = first - forward, second - left
         learn = gains.integral * running * by_velocity
         most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S
@@ -177,7 +177,7 @@ class ControlLoops:
         pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
         roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
-        if self._any_level_brake:  # lean against the speed, for drones flown by attitude
+        if self._any_level_brake:  # drones flown by attitude lean against their speed
             brake = gains.level_brake
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
@@ -197,7 +197,7 @@ class ControlLoops:
         return commands, (reference, east, north, behind)
 
     def _fall_behind(self, do: Operations, climbing: N, descent: N, behind: N) -> N:
-        """Return how far a held landing drone is behind its descent [m]; its thrust falls with it."""
+        """Return how far a held landing drone is behind its descent [m], which reduces its thrust."""
         error = climbing - descent
         held = do.choose(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
         most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2
@@ -205,6 +205,6 @@ class ControlLoops:
 
 
 def _brake(do: Operations, lean: N, set_point: N, tilt_limit: N) -> N:
-    """Return the additional lean against the speed in one axis, beyond the set-point."""
+    """Return the additional lean against the speed on one axis, beyond the set-point."""
     share = do.most(1.0 - abs(set_point) / tilt_limit, 0.0)
     return do.least(do.most(lean, -tilt_limit), tilt_limit) * share

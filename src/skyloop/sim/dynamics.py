@@ -1,6 +1,6 @@
-"""Dynamics of quadrotors and the wind in fixed steps: many drones at once as array columns, a few one by one.
+"""Dynamics of quadrotors and wind in fixed steps, for many drones at once as array columns or for a few one by one.
 
-Both ways give the same bits; ``tests/sim/test_columns.py`` checks it.
+Both give the same bits, as ``tests/sim/test_columns.py`` checks.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose
 from skyloop.sim.world import Wind
 
-STEP_S = 0.004  # of the simulation: 250 Hz
+STEP_S = 0.004  # time step of the simulation (250 Hz)
 
-# As arrays, since NumPy computes faster with them than with numbers.
+# Stored as arrays, because NumPy computes faster with them than with numbers.
 _STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)
 _ROWS = 32  # rows of the table of a body's state and inputs
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
-_MOST_TILTING_AIRSPEED_M_S = 3.0  # no additional tilt above this airspeed, as no recording is faster
+_MOST_TILTING_AIRSPEED_M_S = 3.0  # the additional tilt stays constant above this airspeed, which no recording exceeds
 
 
 def column(parameters: Sequence[VehicleParameters], value: Callable[[VehicleParameters], float]) -> Floats:
@@ -31,27 +31,27 @@ def column(parameters: Sequence[VehicleParameters], value: Callable[[VehiclePara
 
 
 class BodyTable(ABC):
-    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns drones.
+    """State and inputs of the bodies, whatever their dynamics. Rows are axes, columns are drones.
 
     Attributes:
         position: Position of the body's centre, world axes, (3, n) [m].
         velocity: Velocity of the body's centre, world axes, (3, n) [m/s].
-        velocity_before: The same before the last step.
+        velocity_before: Velocity before the last step.
         angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
         rates: Derivatives of the angles.
         sin: Sines of the angles.
         cos: Cosines of the angles.
-        thrust: Per mass, (n,) [m/s²].
+        thrust: Thrust per mass, (n,) [m/s²].
         attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
-        thrust_command: Input: per mass, (n,).
+        thrust_command: Input: thrust per mass, (n,).
         air: Input: velocity of the air, (3, n).
         commands: For a few drones: the inputs attitude_command and thrust_command.
         turned: For a few drones: sine of yaw; cosines of roll, pitch, yaw.
         moved: For a few drones: height of the centre [m], velocity [m/s].
-        most_acceleration_m_s2: An upper bound for every body without collisions.
+        most_acceleration_m_s2: Upper bound of every body's acceleration, excluding collisions.
     """
 
-    most_acceleration_m_s2 = 60.0  # above thrust, gravity and drag in a headwind of 10 m/s together
+    most_acceleration_m_s2 = 60.0  # more than thrust, gravity and drag in a headwind of 10 m/s combined
 
     def __init__(self, positions: Floats, yaws: Floats) -> None:
         n = len(yaws)
@@ -75,7 +75,7 @@ class BodyTable(ABC):
 
     @abstractmethod
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, with running motors or with legs on the ground."""
+        """Hold the attitude again, with the motors running or the legs on the ground."""
 
     @abstractmethod
     def step(self) -> None:
@@ -87,10 +87,10 @@ class BodyTable(ABC):
 
     @abstractmethod
     def power(self) -> Floats:
-        """Return each drone's present battery power, (n,) [W]."""
+        """Return each drone's current battery power, (n,) [W]."""
 
     def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
-        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
+        """Move a body, level and at rest; ``position_m`` has shape (3,), and ``thrust`` is an acceleration [m/s²]."""
         self.position[:, drone] = position_m
         for still in (self.velocity, self.velocity_before, self.angles, self.rates):
             still[:, drone] = 0.0
@@ -104,7 +104,7 @@ class BodyTable(ABC):
         return np.array(body_rates(self.rates, self.sin, self.cos))
 
     def body_rates_of(self, drone: int) -> tuple[float, float, float]:
-        """Return the angular velocity of one drone about its body's axes [rad/s]."""
+        """Return a drone's angular velocity about its body's axes [rad/s]."""
         p, q, r = body_rates(*(rows[:, drone].tolist() for rows in (self.rates, self.sin, self.cos)))
         return p, q, r
 
@@ -113,7 +113,7 @@ class BodyTable(ABC):
         return rotations(self.sin, self.cos)
 
     def specific_force(self) -> Floats:
-        """Return the readings of ideal accelerometers, body axes, (3, n) [m/s²]: at rest, +g along z."""
+        """Return the readings of ideal accelerometers in body axes, (3, n) [m/s²]: +g along z at rest."""
         change = (self.velocity - self.velocity_before) / STEP_S
         change[2] += GRAVITY_M_S2
         force: Floats = np.einsum("nji,jn->in", self.rotations(), change)
@@ -121,7 +121,7 @@ class BodyTable(ABC):
 
 
 class Bodies(BodyTable):
-    """Bodies whose attitude follows the command as a second-order response, with Euler angles as their state."""
+    """Bodies whose attitude follows the command as a second-order response, with Euler angles as the state."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
         super().__init__(positions, yaws)
@@ -132,7 +132,7 @@ class Bodies(BodyTable):
             self._moving, self._moved = Fields(table, 12, 17), Fields(table, 22, 10)
             self._each = list(enumerate(self._constants()))
         else:
-            # Make a step's views and constants once: making one takes as long as computing with it.
+            # Create a step's views and constants only once, because creating one takes as long as computing with it.
             self._a, self._b, self._squares = (np.empty((3, n)) for _ in range(3))
             self._a_rows, self._b_rows, self._square_rows = tuple(self._a), tuple(self._b), tuple(self._squares)
             self._c, self._d = np.empty(n), np.empty(n)
@@ -145,8 +145,8 @@ class Bodies(BodyTable):
         damping = column(parameters, lambda p: p.attitude_damping)
         yaw_rate = 1.0 / column(parameters, lambda p: p.yaw_time_constant_s)
         ones, zeros = np.ones_like(frequency), np.zeros_like(frequency)
-        # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. In yaw
-        # the angle isn't held, and the command is a rate.
+        # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. For yaw
+        # the angle isn't held and the command is a rate.
         self._held = np.array([ones, ones, zeros])
         self._stiff_running = np.array([frequency**2, frequency**2, yaw_rate]) * STEP_S
         self._stiff[:] = self._stiff_running
@@ -169,7 +169,7 @@ class Bodies(BodyTable):
         self._electronics_power = column(parameters, lambda p: p.electronics_power_w)
 
     def _constants(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-        """Return each drone's constants of rotation and translation as plain floats."""
+        """Return each drone's constants for rotation and translation as plain floats."""
         turning = [*self._damp[1:], *self._most_change[1:], self._airspeed_tilt]
         moving = [self._motor_share, self._rotor_offset, self._rotor_height, self._ground_effect]
         moving += [*self._linear[1:], *self._quadratic[1:]]
@@ -183,7 +183,7 @@ class Bodies(BodyTable):
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, with running motors or with legs on the ground."""
+        """Hold the attitude again, with the motors running or the legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
     def turn(self, drone: int, change_rad_s: float) -> None:
@@ -192,7 +192,7 @@ class Bodies(BodyTable):
         self.angles[2, drone] += change_rad_s * STEP_S
 
     def power(self) -> Floats:
-        """Return each drone's present battery power, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
+        """Return each drone's current battery power, (n,) [W]: P ~ T^1.5, by momentum theory in hover."""
         power: Floats = self._hover_power * (self.thrust / GRAVITY_M_S2) ** 1.5 + self._electronics_power
         return power
 
@@ -205,7 +205,7 @@ class Bodies(BodyTable):
             self._move()
 
     def _step_each(self) -> None:
-        """Do the work of :meth:`_turn` and :meth:`_move` drone by drone."""
+        """Do the work of :meth:`_turn` and :meth:`_move`, drone by drone."""
         for drone, (constants, _) in self._each:
             self._turn_one(drone, *constants)
         np.sin(self.angles, out=self.sin)
@@ -290,7 +290,7 @@ class Bodies(BodyTable):
         np.cos(self.angles, out=self.cos)
 
     def _tilt_by_airspeed(self) -> Floats:
-        """Return the roll and pitch that the air adds to the commanded ones, shape (2, n): the leading side rises."""
+        """Return the roll and pitch that the air adds to the commands, shape (2, n): the leading side rises."""
         east, north = self.velocity[:2] - self.air[:2]
         sin_yaw, cos_yaw = self.sin[2], self.cos[2]
         forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
@@ -334,7 +334,7 @@ class Bodies(BodyTable):
         np.add(self.position, total, out=self.position)
 
     def _lift(self) -> Floats:
-        """Return thrust with the motors' lag, raised near the floor by 1 / (1 - (R / 4h)²): Cheeseman, Bennett 1955."""
+        """Return the lagged thrust, near the floor times 1 / (1 - (R / 4h)²): Cheeseman, Bennett 1955."""
         lift, shortfall = self._c, self._d
         np.subtract(self.thrust_command, self.thrust, out=lift)
         np.multiply(lift, self._motor_share, out=lift)
@@ -349,12 +349,12 @@ class Bodies(BodyTable):
 
 
 def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
-    """Return angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
+    """Return the angular velocities about a body's axes [rad/s] for the rates of its Euler angles.
 
     Args:
         rates: Rates of roll, pitch, yaw: three numbers, or three arrays.
         sin: Sines of roll, pitch, yaw.
-        cos: Cosines.
+        cos: Cosines of roll, pitch, yaw.
     """
     roll_rate, pitch_rate, yaw_rate = rates
     sin_roll, sin_pitch, _ = sin
@@ -367,7 +367,7 @@ def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
 
 
 def rotations(sin: Floats, cos: Floats) -> Floats:
-    """Return world-from-body rotations, (n, 3, 3), from sines and cosines of roll, pitch, yaw, each (3, n)."""
+    """Return world-from-body rotations, (n, 3, 3), from sines and cosines of roll, pitch and yaw, each (3, n)."""
     sr, sp, sy = sin
     cr, cp, cy = cos
     rows = [
@@ -379,7 +379,7 @@ def rotations(sin: Floats, cos: Floats) -> Floats:
 
 
 class WindField:
-    """Velocity of the air at each drone: the world's mean and independent gusts, as gusts are small in extent.
+    """Air velocity at each drone: the world's mean wind and independent gusts, because gusts are small in extent.
 
     Gusts are a first-order Gauss-Markov process per axis (the low-pass part of the Dryden gust model of MIL-F-8785C).
     """
@@ -394,7 +394,7 @@ class WindField:
         self._gust: Floats = np.zeros((3, drones)) if self._calm else deviation * self._normals.take()
 
     def blow(self, air: Floats) -> None:
-        """Advance by one period, and write the air's velocity, world axes, shape (3, drones) [m/s]."""
+        """Advance by one period and write the air's velocity in world axes, shape (3, drones) [m/s]."""
         if not self._calm:
             np.multiply(self._gust, self._keep, out=self._gust)
             np.add(self._gust, self._fresh * self._normals.take(), out=self._gust)

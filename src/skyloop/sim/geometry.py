@@ -1,4 +1,4 @@
-"""A simulated world's geometry for maps."""
+"""The geometry of a simulated world, for maps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from skyloop.sim.world import World
 
 
 def geometry_of(world: World) -> WorldGeometry:
-    """Return a world's fixed geometry, without textures and moving objects."""
+    """Return the fixed geometry of a world, without textures and moving objects."""
     x, y, z = world.room.size_m
     return WorldGeometry(
         name=world.name[:64],

@@ -1,4 +1,4 @@
-"""A world with drones that keeps time and is rendered, for the drones' observers: drivers and emulators."""
+"""A world with drones that keeps time and is rendered, for the drones' observers (drivers and emulators)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TICK_S: Final = 0.008  #: simulated time per batch of steps
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A drone's estimated and true state, and the targets, at one time."""
+    """A drone's estimated and true state, and the targets, at a point in time."""
 
     believed: VehicleFeedback
     truth: VehicleTruth
@@ -35,17 +35,17 @@ class Report:
 
 
 class Observer(Protocol):
-    """Callbacks of a host, on the thread that steps the world. They must return quickly and never raise."""
+    """Callbacks of a host, called on the thread that steps the world. They must return quickly and never raise."""
 
     def report(self, report: Report) -> None: ...
 
     def happened(self, occurrence: Occurrence) -> None: ...
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many frames per second of this camera are used; 0: none; infinity: all."""
+        """Return how many frames per second from this camera are in use: 0 for none, infinity for all."""
 
     def failed(self, error: Exception) -> None:
-        """Handle a failure of the simulation, after which no reports follow."""
+        """Handle a failure of the simulation, after which there are no more reports."""
 
 
 class SimHost:
@@ -55,25 +55,25 @@ class SimHost:
 
     Attributes:
         options: Options of the world and its drones.
-        wind: The present wind.
-        simulation: The world.
+        wind: The current wind.
+        simulation: The simulation of the world.
     """
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
-        """Load the world and place the drones.
+        """Load the world and place the drones in it.
 
         Args:
-            options: Options of the world and its drones; None takes the defaults.
-            drones: Their number.
+            options: Options of the world and its drones; None for the defaults.
+            drones: Number of drones.
 
         Raises:
-            UsageError: The world has no room for this many drones.
+            UsageError: The world has no room for that many drones.
             UnknownNameError: There is no such world.
             FileFormatError: The world's file is invalid.
         """
         self.options = options or SimOptions()
         world = self.options.load_world()
-        self.wind = self.options.blowing(world.wind)  #: the present wind
+        self.wind = self.options.blowing(world.wind)  #: the current wind
         self.simulation = Simulation(
             world,
             drones,
@@ -82,36 +82,36 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held by the stepping thread, as one that is ending may be in a step
+        self.stepping = threading.Lock()  #: held by the stepping thread: an ending one may still be in a step
         self._lock = threading.Lock()
-        self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
+        self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never modified
         self._stepper: Stepper | None = None
 
     @property
     def drones(self) -> int:
-        """The number of drones."""
+        """Number of drones."""
         return self.simulation.drones
 
     def set_wind(self, wind: Wind) -> None:
-        """Change the wind, for all drones."""
+        """Change the wind for all drones."""
         self.wind = wind
         self.simulation.set_wind(wind)
 
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
-        """Start reporting a drone to an observer and rendering its cameras; the first observer starts the world.
+        """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
         Args:
-            drone: Its number.
-            observer: Called on the thread that steps the world.
-            screen: Receives the cameras' frames, on the rendering thread.
+            drone: The drone's number.
+            observer: Receives reports on the thread that steps the world.
+            screen: Receives the cameras' frames on the rendering thread.
             models: The drone's cameras.
 
         Returns:
             The cameras.
 
         Raises:
-            UsageError: No such drone, or it already has an observer.
-            MissingExtraError: Cameras are requested, and their renderer's libraries are not installed.
+            UsageError: There is no such drone, or it already has an observer.
+            MissingExtraError: Cameras are requested, but their renderer's libraries are not installed.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -125,11 +125,11 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; no report is running when this returns. The last observer stops the world.
+        """Stop reporting to an observer. No report is running when this returns. The last observer stops the world.
 
         Args:
-            drone: Its number.
-            observer: The attached one; any other is ignored.
+            drone: The drone's number.
+            observer: The attached observer; any other one is ignored.
         """
         with self._lock:
             entry = self._observers.get(drone)
@@ -147,7 +147,7 @@ class SimHost:
 
     @property
     def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
-        """Observer and cameras by drone."""
+        """Observers and cameras by drone."""
         return self._observers
 
     def _make_stepper(self) -> Stepper:
@@ -173,18 +173,18 @@ class Stepper(Protocol):
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Wait for the running round of reports; afterwards no frame of these cameras is delivered."""
+        """Wait for the current round of reports. Afterwards no frames from these cameras are delivered."""
 
 
 class ReportPublisher:
-    """Reports to a host's observers and exposes due cameras after each batch of steps."""
+    """Publishes reports to a host's observers and exposes due cameras after each batch of steps."""
 
     def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
         """Initialise the publisher.
 
         Args:
-            host: The host of the observers.
-            make_pipeline: Creates the pipeline of cameras when the first frame is requested.
+            host: The observers' host.
+            make_pipeline: Creates the camera pipeline when the first frame is requested.
         """
         self.pipeline: Exposing | None = None  #: created when the first frame is requested
         self._host = host
@@ -193,10 +193,10 @@ class ReportPublisher:
         self._report_ns = 0
 
     def publish(self, captured_ns: int) -> None:
-        """Publish due reports and exposures.
+        """Publish the reports and exposures that are due.
 
         Args:
-            captured_ns: The time of the simulation's state, on the observers' clock.
+            captured_ns: Time of the simulation's state on the observers' clock.
         """
         simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
@@ -234,7 +234,7 @@ class ReportPublisher:
 
 
 class _RealTimeStepper:
-    """A world in real time: one thread steps it and reports, another renders."""
+    """A world in real time: one thread steps it and publishes reports, another one renders."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
@@ -274,7 +274,7 @@ class _RealTimeStepper:
                 with self._publishing:
                     self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
                     self._report_slowness()
-        except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not end silently
+        except Exception as error:  # noqa: BLE001  reported to every driver so that the thread does not end silently
             for observer, _ in self._host.observers.values():
                 observer.failed(error)
 

@@ -1,7 +1,7 @@
-"""Recorded pitch steps of a real vehicle, and the same commands flown by simulated vehicles.
+"""Pitch steps recorded from a real vehicle, and the same commands flown by simulated vehicles.
 
-A recording is a folder of three text files from the control characterisation of rc500/ardrone_archive_aarons_laptop,
-with one sample per line: Unix time of receipt [s] and a value.
+A recording is a folder with three text files from the control characterisation of rc500/ardrone_archive_aarons_laptop.
+Each line has one sample: Unix time of receipt [s] and a value.
 
 ==================  ==================================================================================================
 ``command_dump``    pitch command, -1 to 1 of the drone's own limit, negative nose down; stamped when sent
@@ -29,20 +29,20 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.streams import Floats
 from skyloop.sim.world_file import parse_world
 
-#: Length of the comparison from the beginning of a step.
+#: Duration of the comparison, from the beginning of a step.
 WINDOW_S = 3.0
-_MAX_BYTES = 16 << 20  # size limit of a track; an hour at 200 Hz takes 15 MB
-SAMPLE_PERIOD_S = 0.005  #: between samples of the recorded drone
-#: Half a command tilted the recorded drone as far as a whole one: from this magnitude on it tilts fully.
+_MAX_BYTES = 16 << 20  # size limit of a track; an hour at 200 Hz is 15 MB
+SAMPLE_PERIOD_S = 0.005  #: interval between samples of the recorded drone
+#: Half a command tilted the recorded drone as far as a full one: it tilts fully from this magnitude on.
 FULL_TILT_COMMAND = 0.5
 
 _HALL = parse_world("[room]\nsize = [30, 30, 10]\n", "hall")
-_SETTLED_S = 4.0  # after this the simulated drones have taken off and hover
+_SETTLED_S = 4.0  # time after which the simulated drones have taken off and are hovering
 
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """Samples of one quantity: ``times_s`` and ``values``, both of shape (n,), times never falling."""
+    """Samples of one quantity: ``times_s`` and ``values``, both of shape (n,), with times that never decrease."""
 
     times_s: Floats
     values: Floats
@@ -55,13 +55,13 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A flight. Times are seconds of the clock that stamped them.
+    """A recorded flight. Times are in seconds of the clock that stamped them.
 
     Attributes:
         name: The folder's name.
-        command: As recorded, but positive nose down.
-        pitch: Positive nose down [rad].
-        forward: Speed [m/s].
+        command: Command as recorded, but positive for nose down.
+        pitch: Pitch, positive for nose down [rad].
+        forward: Forward speed [m/s].
     """
 
     name: str
@@ -70,24 +70,24 @@ class Recording:
     forward: Track
 
     def steps(self) -> list[float]:
-        """When the command changed [s]."""
+        """Times at which the command changed [s]."""
         changes = np.flatnonzero(np.diff(self.command.values)) + 1
         return [float(time) for time in self.command.times_s[changes]]
 
     def since(self, begin_s: float) -> Recording:
-        """Return the same recording with times relative to this one."""
+        """Return the same recording with times relative to this time."""
         tracks = (self.command, self.pitch, self.forward)
         return Recording(self.name, *(Track(track.times_s - begin_s, track.values) for track in tracks))
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """The motion of simulated vehicles, one row each.
+    """The motion of simulated vehicles, with one row per vehicle.
 
     Attributes:
-        times_s: After the start of the step.
-        pitch: Shape (vehicles, samples) [rad].
-        forward: Shape (vehicles, samples) [m/s].
+        times_s: Times after the start of the step.
+        pitch: Pitch, shape (vehicles, samples) [rad].
+        forward: Forward speed, shape (vehicles, samples) [m/s].
     """
 
     times_s: Floats
@@ -101,7 +101,7 @@ class SpeedEstimate:
 
     Attributes:
         lag_s: Time constant [s].
-        scale: Factor of the estimate. The recordings can't tell it from a pitch that reads too small by the same share.
+        scale: Factor of the estimate. In the recordings, a pitch that reads too small by as much looks the same.
     """
 
     lag_s: float
@@ -118,15 +118,15 @@ class SpeedEstimate:
         return self.scale * reported
 
 
-#: Fitted together with the vehicle by ``scripts/identify_ardrone.py``.
+#: Fitted, together with the vehicle, by ``scripts/identify_ardrone.py``.
 AR_DRONE_ESTIMATE = SpeedEstimate(lag_s=0.124, scale=1.15)
 
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """Simulated minus recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s].
+    """Simulated minus recorded values at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s].
 
-    The speed is the reported one.
+    The speed is the one that the vehicle reports.
     """
 
     pitch: Floats
@@ -134,12 +134,12 @@ class Misfit:
 
     @property
     def pitch_rms(self) -> float:
-        """Root mean square of the pitch's misfit [rad]."""
+        """Root mean square of the misfit in pitch [rad]."""
         return float(np.sqrt(np.mean(self.pitch**2)))
 
     @property
     def forward_rms(self) -> float:
-        """Root mean square of the speed's misfit [m/s]."""
+        """Root mean square of the misfit in speed [m/s]."""
         return float(np.sqrt(np.mean(self.forward**2)))
 
 
@@ -147,8 +147,8 @@ def read_recording(folder: Path, *, as_stamped: bool = False) -> Recording:
     """Read the recording in a folder.
 
     Args:
-        folder: With the files ``command_dump.dat``, ``theta_dump.dat`` and ``vx_dump.dat``.
-        as_stamped: Whether samples keep their times of receipt; otherwise they get plausible sampling times, see
+        folder: Folder with the files ``command_dump.dat``, ``theta_dump.dat`` and ``vx_dump.dat``.
+        as_stamped: Whether samples keep their times of receipt; otherwise they get plausible sampling times from
             :func:`sample_times`.
 
     Raises:
@@ -177,7 +177,7 @@ def _read(path: Path) -> Track:
 
 
 def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Floats:
-    """Estimate the latest possible sampling times from the times of receipt.
+    """Estimate the latest possible sampling times from times of receipt.
 
     Each sample was taken at least one period before the next one. A radio link that stalls and then delivers everything
     at once makes times of receipt useless for dynamics.
@@ -188,18 +188,18 @@ def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Float
 
 
 def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: float = WINDOW_S) -> Response:
-    """Fly a command with simulated vehicles in calm air, with sensors without errors.
+    """Fly a command with simulated vehicles in calm air, using sensors without errors.
 
-    Each vehicle hovers, and from time 0 on gets the command as its pitch set-point: magnitudes from
-    :data:`FULL_TILT_COMMAND` on are the tilt limit. A command of 0 is a level set-point, which differs from hovering.
+    Each vehicle hovers and, from time 0 on, gets the command as its pitch set-point. Magnitudes from
+    :data:`FULL_TILT_COMMAND` on mean the tilt limit. A command of 0 is a level set-point, which differs from hovering.
 
     Args:
-        command: Positive nose down.
-        vehicles: At least one.
-        duration_s: Length of the flight.
+        command: The command, positive for nose down.
+        vehicles: The vehicles, at least one.
+        duration_s: Duration of the flight.
 
     Raises:
-        UsageError: No vehicles, or more than fit into the world.
+        UsageError: There are no vehicles, or more than fit into the world.
     """
     if not vehicles:
         raise UsageError("give at least one vehicle")
@@ -227,7 +227,7 @@ def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: fl
 
 
 def _held(command: Track, times_s: Floats) -> list[float]:
-    """Return the command in force at these times: the last one before, none before the first."""
+    """Return the command in force at these times: the last one before each, or 0 before the first one."""
     last = np.searchsorted(command.times_s, times_s + 1e-9, side="right") - 1
     values = np.where(last < 0, 0.0, command.values[np.maximum(last, 0)])
     return [float(value) for value in values]
@@ -240,7 +240,7 @@ def compare(
     end_s: float = WINDOW_S,
     estimate: SpeedEstimate = AR_DRONE_ESTIMATE,
 ) -> list[Misfit]:
-    """Return how each vehicle differs from a recording with times like the response's, between two of them."""
+    """Return how each vehicle differs from a recording, with times like the response's, between two times."""
     pitch, forward = recorded.pitch.between(begin_s, end_s), recorded.forward.between(begin_s, end_s)
     return [
         Misfit(

@@ -1,6 +1,6 @@
-"""The instruments of one rotor-level drone as read by its firmware, with their noise, bias, rate and delay.
+"""A rotor-level drone's instruments as read by its firmware, with noise, bias, rate and delay.
 
-Every world's origin is the same place on Earth, in Zürich, where PX4's simulations start by default.
+The origin of every world is the same place on Earth: in Zürich, where PX4's simulations start by default.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from skyloop.sim.world import Vec3
 
 
 class GpsFix(msgspec.Struct, frozen=True, gc=False):
-    """A satellite receiver's fix, with its error and delay. Altitude is above mean sea level."""
+    """A fix from a satellite receiver, with its error and delay. Altitude is above mean sea level."""
 
-    time_s: float  #: simulation time at which the receiver was there
+    time_s: float  #: simulation time at which the receiver was at this position
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    velocity_m_s: Vec3  #: east, north, up
-    horizontal_error_m: float  #: one standard deviation, as reported by the receiver
+    velocity_m_s: Vec3  #: velocity east, north, up
+    horizontal_error_m: float  #: one standard deviation of the horizontal position, as reported by the receiver
     vertical_error_m: float
     satellites: int
 
@@ -35,58 +35,58 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
 class FlowSample(msgspec.Struct, frozen=True, gc=False):
     """Motion seen by a camera that looks down, over an interval.
 
-    Angles are about the body's forward and left axes, as if the vehicle had turned by them over very distant ground. A
-    drone at height h that flies forward at v and turns at the rate ω about its left axis sees ω - v/h; one that flies
-    left at v and turns at ω about its forward axis sees ω + v/h.
+    Angles are about the body's forward and left axes, as if the vehicle had rotated by them above very distant ground.
+    A drone at height h that flies forward at v and rotates at ω about its left axis sees ω - v/h; one that flies left
+    at v and rotates at ω about its forward axis sees ω + v/h.
     """
 
     interval_s: float
     about_forward_rad: float
     about_left_rad: float
-    gyro_forward_rad: float  #: the gyro's rotation in the interval, about the same axes
+    gyro_forward_rad: float  #: rotation measured by the gyro in the interval, about the same axes
     gyro_left_rad: float
-    quality: float  #: 0 to 1; at 0 nothing is visible and the angles are 0
+    quality: float  #: quality of the image, 0 to 1; at 0 nothing is visible and the angles are 0
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Readings of one drone's instruments at one time, together with its true state.
+    """The readings of a drone's instruments at a point in time, together with its true state.
 
-    Body axes are forward, left, up; world axes east, north, up. Barometer, magnetometer and range finder keep their
-    newest sample until the next one.
+    Body axes are forward, left, up; world axes are east, north, up. The barometer, magnetometer and range finder keep
+    their newest sample until the next one.
     """
 
     time_s: float  #: simulation time
     gyro_rad_s: Vec3
-    acceleration_m_s2: Vec3  #: specific force: at rest, +g along z
+    acceleration_m_s2: Vec3  #: specific force: +g along z at rest
     pressure_pa: float
     temperature_c: float
-    magnetic_gauss: Vec3  #: body axes
-    gps: GpsFix | None  #: a new fix, only in the step of its arrival
-    range_m: float | None  #: down along the body's axis to the floor or a solid; None out of range
-    flow: FlowSample | None  #: a new sample, only in the step of its arrival
+    magnetic_gauss: Vec3  #: magnetic field in body axes
+    gps: GpsFix | None  #: a new fix, only in the step in which it arrives
+    range_m: float | None  #: distance down along the body's axis to the floor or a solid; None if out of range
+    flow: FlowSample | None  #: a new sample, only in the step in which it arrives
     battery_v: float
     battery_a: float
-    position_m: Vec3  #: true, of the body's centre
-    velocity_m_s: Vec3  #: true, world axes
-    quaternion: tuple[float, float, float, float]  #: true: w, x, y, z, world from body
-    rates_rad_s: Vec3  #: true, about the body's axes
+    position_m: Vec3  #: true position of the body's centre
+    velocity_m_s: Vec3  #: true velocity in world axes
+    quaternion: tuple[float, float, float, float]  #: true rotation, world from body: w, x, y, z
+    rates_rad_s: Vec3  #: true rates about the body's axes
 
 
 class Firmware(Protocol):
-    """Flies one drone of a simulation: see :meth:`~skyloop.sim.simulation.Simulation.fly_by`."""
+    """Flies one drone of a simulation; see :meth:`~skyloop.sim.simulation.Simulation.fly_by`."""
 
     def exchange(self, readings: Readings) -> Sequence[float] | None:
-        """Process the readings of a step and return the rotor commands for it.
+        """Process a step's readings and return the rotor commands for the step.
 
-        Called once per step of the plant (1 ms) on the thread that steps the simulation, with the simulation's lock
-        held: it must return in bounded time and call no method of the simulation.
+        Called once per step of the plant (1 ms) on the thread that steps the simulation, which holds the simulation's
+        lock. It must return in bounded time and call no method of the simulation.
 
         Args:
             readings: The readings at the beginning of the step.
 
         Returns:
-            Commands of the rotors, 0 (stopped) to 1 (full): front left, front right, rear left, rear right; values
-            beyond are clamped. None keeps the last commands.
+            Rotor commands, 0 (stopped) to 1 (full): front left, front right, rear left, rear right. Values outside this
+            range are clamped. None keeps the last commands.
 
         Raises:
             Exception: Any exception ends the step, and :meth:`Simulation.step` raises it.
@@ -98,7 +98,7 @@ LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
 LONGITUDE_DEG: Final = 8.545594
 ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
-#: The Earth's field there, east, north, up: the World Magnetic Model 2025, at the beginning of 2026.
+#: The Earth's magnetic field there, east, north, up, from the World Magnetic Model 2025 for early 2026.
 MAGNETIC_FIELD_GAUSS: Final[Vec3] = (0.01334, 0.21523, -0.43290)
 
 _EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
@@ -106,7 +106,7 @@ _SEA_LEVEL_PA, _SEA_LEVEL_K, _LAPSE_K_M, _EXPONENT = 101325.0, 288.15, 0.0065, 5
 
 
 def _radii_m() -> tuple[float, float]:
-    """Return the Earth's radii of curvature at the origin: along the meridian, and across it."""
+    """Return the Earth's radii of curvature at the origin, along the meridian and across it."""
     squared = _FLATTENING * (2 - _FLATTENING)
     bulge = 1 - squared * math.sin(math.radians(LATITUDE_DEG)) ** 2
     return _EQUATOR_M * (1 - squared) / bulge**1.5, _EQUATOR_M / math.sqrt(bulge)
@@ -118,44 +118,44 @@ _DEG_PER_EAST_M = math.degrees(1 / ((_NORMAL_M + ALTITUDE_M) * math.cos(math.rad
 
 
 def geodetic(position_m: Vec3) -> Vec3:
-    """Return latitude, longitude [deg] and altitude above mean sea level [m] of a position in world axes.
+    """Return the latitude, longitude [deg] and altitude above mean sea level [m] of a position in world axes.
 
-    The Earth counts as flat; at a distance of one kilometre the error is below 0.1 m.
+    The Earth is treated as flat; at a distance of one kilometre the error is below 0.1 m.
     """
     east, north, up = position_m
     return LATITUDE_DEG + north * _DEG_PER_NORTH_M, LONGITUDE_DEG + east * _DEG_PER_EAST_M, ALTITUDE_M + up
 
 
 def local(latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vec3:
-    """Return the position in world axes: the inverse of :func:`geodetic`."""
+    """Return the position in world axes, as the inverse of :func:`geodetic`."""
     north = (latitude_deg - LATITUDE_DEG) / _DEG_PER_NORTH_M
     return (longitude_deg - LONGITUDE_DEG) / _DEG_PER_EAST_M, north, altitude_m - ALTITUDE_M
 
 
 def pressure_pa(height_m: float) -> float:
-    """Return the air's pressure at a height above the worlds' floor, in the standard atmosphere."""
+    """Return the air pressure at a height above the worlds' floor, in the standard atmosphere."""
     share = 1 - _LAPSE_K_M * (ALTITUDE_M + height_m) / _SEA_LEVEL_K
     return float(_SEA_LEVEL_PA * share**_EXPONENT)
 
 
-#: Distance from a point along a unit vector, both in world axes, to the first solid; infinite without one.
+#: Distance from a point to the first solid along a unit vector (both in world axes); infinite if there is none.
 Ranging = Callable[[Vec3, Vec3], float]
 
-_NOISE_BLOCK = 256  # number of samples with noise drawn in one call
-_WANDER_STEPS = 100  # biases change at 10 Hz
-_LEAST_FLOW_M = 0.08  # closer than this, the image is out of focus
-_GPS_VERTICAL = 1.7  # factor of the vertical error over the horizontal one
+_NOISE_BLOCK = 256  # number of samples whose noise is drawn in one call
+_WANDER_STEPS = 100  # interval between changes of the biases (10 Hz), in steps
+_LEAST_FLOW_M = 0.08  # minimum height; any lower, the image is out of focus
+_GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal one
 _SATELLITES = 14
 
 
 class Instruments:
-    """One drone's instruments, each with its own stream of random numbers.
+    """A drone's instruments, each with its own stream of random numbers.
 
     Args:
         vehicle: The drone, with rotors.
-        drone: Its number.
+        drone: The drone's number.
         seed: The simulation's seed.
-        ranging: Measures distances to the surroundings.
+        ranging: Function that measures distances to the surroundings.
     """
 
     def __init__(self, vehicle: VehicleParameters, drone: int, seed: int, ranging: Ranging) -> None:
@@ -189,7 +189,7 @@ class Instruments:
             )
         )
         self._delay_steps = round(errors.gps_delay_s / PLANT_STEP_S)
-        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step of its arrival
+        self._fixes: deque[tuple[int, GpsFix]] = deque()  # each with the step in which it arrives
         self._magnetic: Vec3 = (0.0, 0.0, 0.0)
         self._pressure_pa = 0.0
         self._below_m = math.inf
@@ -208,7 +208,7 @@ class Instruments:
         battery_v: float,
         battery_a: float,
     ) -> Readings:
-        """Return the readings of a step of the plant; call it for every step in order."""
+        """Return the readings for a step of the plant. Call this for every step in order."""
         if step % _WANDER_STEPS == 0:
             self._bias = next(self._wandering)
         errors, bias = self._errors, self._bias
@@ -319,7 +319,7 @@ def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[
 def _wandering(
     seed: int, drone: int, deviations: np.typing.NDArray[np.float64], constants_s: np.typing.NDArray[np.float64]
 ) -> Iterator[list[float]]:
-    """Yield biases endlessly: first-order Gauss-Markov processes, every :data:`_WANDER_STEPS`."""
+    """Yield biases endlessly: first-order Gauss-Markov processes, updated every :data:`_WANDER_STEPS`."""
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + 7)
     keep = np.exp(-_WANDER_STEPS * PLANT_STEP_S / constants_s)
     fresh = np.sqrt(1.0 - keep * keep)

@@ -1,7 +1,7 @@
-"""True image boxes of objects in a simulated camera's view, with their visible share: for training, tests, benchmarks.
+"""True image boxes of objects in a simulated camera's view, with their visible part, for training, tests, benchmarks.
 
-Drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the pixels that
-each would cover without occlusion.
+They are drawn with the renderer's own geometry, without colours: the target or crate visible at each pixel, and the
+pixels that each would cover if nothing occluded it.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from skyloop.sim.streams import Purpose, stream
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import FigureTarget, TargetState, World
 
-CLASS_NAMES = ("person", "car", "box")  #: label classes; boards and platforms have other ones
-_CLEAR_M = 0.35  # between a camera and solids
-_LONGEST_STEP_S = 20.0  # between two pictures of ``pictures``; tracks keep only 60 s
+CLASS_NAMES = ("person", "car", "box")  #: label classes; those of boards and platforms are not included
+_CLEAR_M = 0.35  # minimum distance between a camera and solids
+_LONGEST_STEP_S = 20.0  # maximum time between two images of ``pictures``; tracks keep only 60 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +35,11 @@ class TargetBox:
     """An object's box in an image.
 
     Attributes:
-        name: Name of the target or box in its world.
+        name: Name of the target or box in the world.
         class_name: ``person``, ``car``, ``box`` for a crate, ``board`` or ``platform``.
-        box: x, y of the upper left corner, width and height [pixel], of its whole extent within the image.
-        visible: Share of its pixels within the image that are not occluded, 0 to 1.
-        cut: Whether the image's edge may cut it off: it reaches the outermost pixels.
+        box: x, y of the upper left corner, width and height [px] of the object's whole extent within the image.
+        visible: Fraction of the object's pixels within the image that are not occluded, 0 to 1.
+        cut: Whether the image's edge may cut the object off, because it reaches the outermost pixels.
     """
 
     name: str
@@ -50,7 +50,7 @@ class TargetBox:
 
 
 class Labeller:
-    """Finds the boxes in one scene. Reuses buffers, so use it from one thread at a time.
+    """Finds the boxes in a scene. It reuses buffers, so use it from one thread at a time.
 
     Args:
         scene: The scene.
@@ -68,7 +68,7 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate with a pixel in the image, hidden or not; targets first.
+        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first.
 
         Args:
             state: The poses of all moving objects.
@@ -107,7 +107,7 @@ class Labeller:
 
 
 def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-    """Return the box of every target and crate with a pixel in the image; see :meth:`Labeller.boxes`."""
+    """Return the box of every target and crate with a pixel in the image, as :meth:`Labeller.boxes` does."""
     return Labeller(scene).boxes(state, pose, model)
 
 
@@ -123,17 +123,17 @@ def pictures(
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
     """Yield labelled images of a world from random positions at random times.
 
-    Cameras are 0.7 to 3 m high, outside of solids; two thirds look roughly at a target. Pitch is at most 15° and roll
-    small, unless ``tilt_rad`` sets both.
+    Cameras are 0.7 to 3 m high and outside of solids; two thirds of them look roughly at a target. Pitch is at most 15°
+    and roll is small, unless ``tilt_rad`` sets both.
 
     Args:
         world: The world.
-        seed: Determines positions and times.
+        seed: Seed of the positions and times.
         count: Number of images.
-        size: Width and height [pixel].
-        focal_share: Focal length as a share of the width.
-        camera: The camera, instead of ``size`` and ``focal_share``; without the flaws of its sensor.
-        tilt_rad: Pitch and roll are random within ± this.
+        size: Width and height of the images [px].
+        focal_share: Focal length as a fraction of the width.
+        camera: Camera to use instead of ``size`` and ``focal_share``; its sensor's flaws are left out.
+        tilt_rad: Maximum random pitch and roll, in either direction.
 
     Raises:
         UsageError: An argument is out of its range, or the world has no room for a camera.

@@ -1,4 +1,4 @@
-"""Options of a simulated world and its drones, and the pacing of a simulation by a clock."""
+"""Options for a simulated world and its drones, and the pacing of a simulation by a clock."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from skyloop.sim.parameters import VehicleParameters, with_scaled_flaws
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-#: The simulated vehicles' own actions; for positions and the return to the start the proxy flies them.
+#: The simulated vehicles' own actions; the proxy flies them to positions and back to the start.
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
-MOST_LAG_S: Final = 0.25  #: default lag behind the clock beyond which steps are skipped
+MOST_LAG_S: Final = 0.25  #: default for the lag behind the clock beyond which steps are skipped
 
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """Options of a simulated world and its drones.
+    """Options for a simulated world and its drones.
 
     Attributes:
-        world: Name of a shipped world, or path of a world file.
-        seed: Seed of all noise and gusts.
-        speed: Simulated time per real time.
+        world: Name of a built-in world, or path of a world file.
+        seed: Seed for all noise and gusts.
+        speed: Ratio of simulated to real time.
         cameras: The cameras of each drone.
-        noise: Factor of the sensors' noise and biases.
-        wind: Factor of the world's wind.
+        noise: Factor on the sensors' noise and biases.
+        wind: Factor on the world's wind.
         battery: Charge at the start, 0 to 1.
         quality: Image quality: ``fast``, ``smooth`` or ``best``.
         native: Actions that the drone's driver supports natively.
         position: Whether the drone reports its position.
-        velocity: Whether the drone reports its velocity, which it uses for its flight in any case.
+        velocity: Whether the drone reports its velocity, which it always uses for its own flight.
         truth: Whether the drone also reports its true state.
-        rate_hz: Reports per second.
-        most_lag_s: How far the world may fall behind the clock before it skips the rest [s].
+        rate_hz: Number of reports per second.
+        most_lag_s: Maximum lag of the world behind the clock before it skips steps [s].
         parameters: The vehicles' parameters.
-        autopilot: The real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
-        autopilot_folder: The folder for the firmware's settings; None: they last as long as the drone.
+        autopilot: Real firmware that flies the drones: ``ardupilot``, ``betaflight`` or ``px4``.
+        autopilot_folder: Folder for the firmware's settings; None to keep them only as long as the drone exists.
     """
 
     world: str = "room"
@@ -68,7 +68,7 @@ class SimOptions:
         """Load the world.
 
         Raises:
-            UnknownNameError: No such world.
+            UnknownNameError: There is no such world.
             FileFormatError: The world's file is invalid.
         """
         return load_world(self.world, self.seed)
@@ -80,21 +80,21 @@ class SimOptions:
         return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
 
     def vehicle(self) -> VehicleParameters:
-        """Return the vehicle, with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
+        """Return the vehicle with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
         return with_scaled_flaws(self.parameters, self.noise)
 
 
-_LONGEST_RUN_STEPS = 25  # per call at real time
-SLOW_SHARE = 0.95  #: a simulation below this share of its speed is too slow,
-SLOW_NS = 5 * NS_PER_S  #: measured over this time;
-SLOW_AGAIN_NS = 60 * NS_PER_S  #: interval between warnings
+_LONGEST_RUN_STEPS = 25  # maximum number of steps per call at real time
+SLOW_SHARE = 0.95  #: fraction of its speed below which a simulation is too slow,
+SLOW_NS = 5 * NS_PER_S  #: the time over which that is measured,
+SLOW_AGAIN_NS = 60 * NS_PER_S  #: and the interval between warnings
 
 
 class Pacer:
-    """Runs the due steps by absolute deadlines: step k is due at start + k · STEP_S / speed.
+    """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are caught up. Beyond a lag of ``most_lag_s`` the rest is skipped, counted in ``lost_s``, and the
-    deadlines move. Not thread-safe: one thread owns it::
+    Small delays are made up for. If the lag exceeds ``most_lag_s``, the rest is skipped and counted in ``lost_s``, and
+    the deadlines move. Not thread-safe: one thread owns the pacer::
 
         while not stop.wait(pacer.run_due()):
             publish()
@@ -108,7 +108,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Take ``step(n)``, which does n steps, and ``speed``, the seconds of simulation per second of the clock."""
+        """Store ``step(n)``, which does n steps, and ``speed``, the seconds of simulation per second of the clock."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step
@@ -121,10 +121,10 @@ class Pacer:
         self.lost_s = 0.0  # clock time skipped so far
 
     def run_due(self) -> float:
-        """Run the due steps in batches.
+        """Run the steps that are due, in batches.
 
         Returns:
-            The time until the next step [s]; 0 if one is due.
+            The time until the next step [s]; 0 if one is due already.
         """
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
@@ -134,7 +134,7 @@ class Pacer:
             self._start_ns += round(excess)
             self.lost_s += excess / NS_PER_S
             behind -= round(excess)
-        # At high speeds a batch is longer, so that the caller isn't called for every step.
+        # At high speeds a batch is longer, so that control doesn't return for every step.
         most = max(_LONGEST_RUN_STEPS, int(_LONGEST_RUN_STEPS * self._speed))
         steps = min(int(behind / self._ns_per_step) + 1, most)
         self._step(steps)
@@ -142,13 +142,13 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """Convert a simulation time to the clock, by the present deadlines.
+        """Convert a simulation time to the clock using the current deadlines.
 
         Args:
-            time_s: Since this pacer's start.
+            time_s: Simulation time since this pacer's start.
 
         Returns:
-            The clock's time when the simulation was, or will be, at that time.
+            The clock's time when the simulation reached, or will reach, that time.
         """
         return self._due_ns(time_s / STEP_S)
 
@@ -157,7 +157,7 @@ class Pacer:
 
 
 class SlownessWatch:
-    """Detects a computer too slow for a simulation, from the time that its :class:`Pacer` skipped. Pure.
+    """Detects a computer that is too slow for a simulation from the time that its :class:`Pacer` skipped. Pure.
 
     Args:
         now_ns: Start of the simulation.
@@ -169,11 +169,11 @@ class SlownessWatch:
         self._said_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved share of the simulation's speed when a warning is due; usually None.
+        """Return the achieved fraction of the simulation's speed if a warning is due; otherwise, as usual, None.
 
         Args:
             lost_s: Time skipped so far.
-            now_ns: The present time.
+            now_ns: The current time.
         """
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:

@@ -1,7 +1,7 @@
-"""Parameters of a simulated vehicle: its flight, its rotors and its instruments.
+"""Parameters of a simulated vehicle for its flight, its rotors and its instruments.
 
-The defaults are an AR.Drone 2 with its indoor hull, as far as public sources go; values without a source are marked as
-estimates.
+The defaults describe an AR.Drone 2 with its indoor hull, as far as public sources go. Values without a source are
+marked as estimates.
 
 Sources: [P] Parrot, AR.Drone 2.0 technical specifications. [E] J. Engel, J. Sturm, D. Cremers, "Camera-Based
 Navigation of a Low-Cost Quadrocopter", IROS 2012, with the constants c1 … c7 identified from flights, as used in its
@@ -19,9 +19,9 @@ from typing import Any
 from skyloop.errors import UsageError
 from skyloop.sim.world import Vec3
 
-#: Rotors are numbered front left, front right, rear left, rear right. Seen from above the first and the last turn
-#: clockwise, the others counter-clockwise, as in the X quadrotors of Betaflight, ArduPilot and PX4; so a rotor's torque
-#: turns the body counter-clockwise (1, yaw to the left) or clockwise (-1).
+#: Rotors are numbered front left, front right, rear left, rear right. Seen from above, the first and the last turn
+#: clockwise and the others counter-clockwise, as in the X quadrotors of Betaflight, ArduPilot and PX4. A rotor's torque
+#: therefore turns the body counter-clockwise (1, yaw to the left) or clockwise (-1).
 YAW_SIGNS = (1.0, -1.0, -1.0, 1.0)
 
 Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
@@ -31,8 +31,8 @@ Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tu
 class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
-    ``noise`` is the standard deviation of a sample. ``bias`` is that of a flight's initial error, which wanders
-    with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
+    ``noise`` is the standard deviation of a sample. ``bias`` is that of the error at the start of a flight, which then
+    wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
 
     Raises:
         UsageError: A value is not finite, negative, or zero where it must be positive.
@@ -71,25 +71,25 @@ class InstrumentParameters:
 class RotorParameters:
     """Rotors, air, inertia and power train of a quadrotor.
 
-    A rotor that turns at ω produces the thrust ``thrust_n_s2`` ω², and a torque of ``torque_m`` times that. It follows
-    its command with a first-order lag. A command of 0 stops it; above, its speed is between ``idle_speed_rad_s`` and
-    ``full_speed_rad_s`` in proportion. Both are for a full battery: speed falls with the voltage.
+    A rotor turning at ω produces the thrust ``thrust_n_s2`` ω² and a torque of ``torque_m`` times that. It follows its
+    command with a first-order lag. A command of 0 stops it; above 0, its speed is between ``idle_speed_rad_s`` and
+    ``full_speed_rad_s`` in proportion. Both speeds are for a full battery and decrease with the voltage.
 
     Attributes:
         places_m: Positions of the rotors, forward and left of the centre of mass, in the order of :data:`YAW_SIGNS`.
         inertia_kg_m2: Moments of inertia about the body's axes.
-        thrust_n_s2: Thrust per square of the speed.
+        thrust_n_s2: Thrust per speed squared.
         torque_m: Torque per thrust.
         idle_speed_rad_s: Lowest speed of a running rotor.
         full_speed_rad_s: Speed at full command.
         speed_up_s: Time constant of an accelerating rotor.
         speed_down_s: Time constant of a decelerating rotor.
-        rotor_drag_kg: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the
-            rotors' speeds: from blade flapping and the blades' asymmetric drag.
-        rotor_inflow_kg: The same along the rotors' axes: air from above reduces thrust.
-        body_drag_kg_m: Force per square of the airspeed, along the body's axes.
-        rotor_inertia_kg_m2: Inertia of one rotor about its axis: an accelerating rotor turns the body the other way.
-        efficiency: Share of the battery's power that reaches the air as torque times speed of the rotors' shafts.
+        rotor_drag_kg: Force against the airspeed in the plane of the rotors, per airspeed and per sum of the rotors'
+            speeds. Its causes are blade flapping and the blades' asymmetric drag.
+        rotor_inflow_kg: The same along the rotors' axes, where air from above reduces the thrust.
+        body_drag_kg_m: Force per airspeed squared, along the body's axes.
+        rotor_inertia_kg_m2: Inertia of a rotor about its axis: an accelerating rotor turns the body the other way.
+        efficiency: Fraction of the battery's power that reaches the air as the shafts' torque times speed.
         instruments: Errors of the instruments.
 
     Raises:
@@ -160,39 +160,39 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameters:
-    """One vehicle's body, motors, loops, battery and sensors.
+    """A vehicle's body, motors, loops, battery and sensors.
 
     Raises:
-        UsageError: A value is not finite, negative, or zero where something is divided by it.
+        UsageError: A value is not finite, negative, or zero although it is used as a divisor.
     """
 
     # Body
-    mass_kg: float = 0.42  # with indoor hull [P]; only collisions between drones use it: everything else is per mass
-    radius_m: float = 0.26  # of the hull, 517 mm across [P]
-    half_height_m: float = 0.06  # of the hull, estimate
-    linear_drag_per_s: float = 0.45  # with the next: 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
+    mass_kg: float = 0.42  # with indoor hull [P]; used only by collisions between drones; everything else is per mass
+    radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
+    half_height_m: float = 0.06  # half height of the hull; estimate
+    linear_drag_per_s: float = 0.45  # together with the next one: 0.57 1/s at 3 m/s, where [E] c1 = 0.58 was identified
     quadratic_drag_per_m: float = 0.04
-    vertical_linear_drag_per_s: float = 0.45  # estimate: as horizontally
-    vertical_quadratic_drag_per_m: float = 0.12  # estimate: three times the area seen from above
-    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it: this angle
-    # times the square of the horizontal airspeed, up to 3 m/s. Its causes are blade flapping and wind on the hull.
+    vertical_linear_drag_per_s: float = 0.45  # estimate: same as the horizontal one
+    vertical_quadratic_drag_per_m: float = 0.12  # estimate: the area seen from above is three times as large
+    # The tilt that raises the leading side in the airflow, as far as the attitude loops don't remove it. It is this
+    # angle times the square of the horizontal airspeed, up to 3 m/s, caused by blade flapping and wind on the hull.
     airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
     rotor_radius_m: float = 0.10  # 8 inch propellers [P]
-    rotor_height_m: float = 0.05  # of the rotors above the feet, for the ground effect; estimate
-    ground_effect: float = 1.0  # share of the effect of one rotor of this radius [C]; 0 switches it off
+    rotor_height_m: float = 0.05  # height of the rotors above the feet, for the ground effect; estimate
+    ground_effect: float = 1.0  # fraction of the effect of one rotor with this radius [C]; 0 switches it off
     motor_time_constant_s: float = 0.06  # estimate
-    most_thrust: float = 1.9  # as a share of the weight, with a full battery; estimate
-    least_thrust: float = 0.3  # as a share of the weight, while the motors run; estimate
+    most_thrust: float = 1.9  # as a multiple of the weight, with a full battery; estimate
+    least_thrust: float = 0.3  # as a fraction of the weight, while the motors are running; estimate
 
     # Inner loops
-    attitude_frequency_rad_s: float = 16.0  # with the damping: a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
+    attitude_frequency_rad_s: float = 16.0  # together with the damping, a lag of 2ζ/ω = 0.1 s, [E] c3 = 10 1/s
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
-    # With roll and pitch set-points near level, firmware may lean against the speed: this deceleration per speed at a
-    # level set-point, proportionally less with tilt, and none at the full tilt.
+    # With roll and pitch set-points near level, firmware may lean against the speed: this is the deceleration per speed
+    # at a level set-point; it decreases in proportion to the tilt and is zero at the full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
@@ -206,10 +206,10 @@ class VehicleParameters:
     battery_full_v: float = 12.5
     battery_empty_v: float = 9.6
     battery_resistance_ohm: float = 0.08  # estimate
-    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, less the electronics
+    hover_power_w: float = 50.0  # 11.1 Wh in 12 minutes, minus the electronics
     electronics_power_w: float = 5.0  # estimate
 
-    # Sensors: standard deviations of noise, and of biases that wander with the time constant. Estimates for
+    # Sensors: standard deviations of the noise, and of biases that wander with the time constant. Estimates for
     # consumer parts.
     gyro_noise_rad_s: float = 0.01
     gyro_bias_rad_s: float = 0.005
@@ -226,12 +226,12 @@ class VehicleParameters:
     bias_time_constant_s: float = 40.0
 
     # Damage
-    crash_speed_m_s: float = 3.0  # along a solid's normal; a faster impact is a crash and stops the motors
-    restitution: float = 0.35  # share of the normal speed after a bounce, estimate
-    friction: float = 0.5  # Coulomb, estimate
+    crash_speed_m_s: float = 3.0  # speed along a solid's normal above which an impact is a crash and stops the motors
+    restitution: float = 0.35  # fraction of the normal speed after a bounce; estimate
+    friction: float = 0.5  # Coulomb friction; estimate
 
-    #: For a vehicle modelled down to its rotors (``docs/rotors.md``); None models its response as a whole. With rotors,
-    #: the drag, motor time constant and hover power above have no effect; the rotors' own values count.
+    #: Rotors of a vehicle that is modelled down to them (``docs/rotors.md``); None models its response as a whole. With
+    #: rotors, the drag, motor time constant and hover power above have no effect; the rotors' own values count.
     rotors: RotorParameters | None = None
 
     def __post_init__(self) -> None:
@@ -303,7 +303,7 @@ def _scaled_flaws(parameters: VehicleParameters | InstrumentParameters, factor: 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of a vehicle's set-points, which are clamped to them. Defaults: AR.Drone, indoor [S].
+    """Limits to which a vehicle's set-points are clamped. Defaults: AR.Drone, indoor [S].
 
     Raises:
         UsageError: A value is out of its range.
@@ -313,7 +313,7 @@ class Limits:
     climb_m_s: float = 0.7
     yaw_rate_rad_s: float = 1.75
     altitude_m: float = 3.0
-    speed_m_s: float = 5.0  # horizontally, for velocity set-points
+    speed_m_s: float = 5.0  # horizontal speed of velocity set-points
     takeoff_altitude_m: float = 1.0
 
     def __post_init__(self) -> None:
@@ -323,7 +323,7 @@ class Limits:
                 raise UsageError(f"limit {name} must be a number from {low:g} to {high:g}, not {value!r}")
 
 
-#: Least and greatest value of each limit.
+#: Minimum and maximum of each limit.
 LIMIT_RANGES: dict[str, tuple[float, float]] = {
     "tilt_rad": (0.02, 0.6),
     "climb_m_s": (0.1, 3.0),

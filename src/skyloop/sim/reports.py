@@ -1,4 +1,4 @@
-"""Reports of a simulation about its drones: their own estimates, the truth, and occurrences."""
+"""A simulation's reports about its drones: their own estimates, the truth, and occurrences."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from skyloop.sim.world import Vec3
 
 @dataclass(frozen=True, slots=True)
 class VehicleFeedback:
-    """A drone's estimates, with its sensors' noise and biases.
+    """A drone's estimates, including its sensors' noise and biases.
 
-    Angles: roll right side down, pitch nose down, yaw counter-clockwise from east, within ±π.
+    Angles are roll (right side down), pitch (nose down) and yaw (counter-clockwise from east), within ±π.
     """
 
     time_s: float  #: simulation time
     state: FlightState
-    emergency_reason: str  #: reason for cut motors; empty in other states
+    emergency_reason: str  #: why the motors were cut; empty in other states
     battery: float  #: remaining charge, 0 to 1
     battery_v: float
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
     altitude_m: float  #: height of the feet above the floor
-    velocity_m_s: Vec3  #: forward, left, up, in the levelled axes
-    angular_velocity_rad_s: Vec3  #: about the body's axes
+    velocity_m_s: Vec3  #: velocity forward, left, up, in levelled axes
+    angular_velocity_rad_s: Vec3  #: angular velocity about the body's axes
     acceleration_m_s2: Vec3  #: specific force along the body's axes: +g along z at rest
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleTruth:
-    """A drone's true state. World axes east, north, up."""
+    """A drone's true state. World axes are east, north, up."""
 
     time_s: float
     state: FlightState
@@ -41,9 +41,9 @@ class VehicleTruth:
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
-    quaternion: tuple[float, float, float, float]  #: x, y, z, w, world from body
-    angular_velocity_rad_s: Vec3  #: about the body's axes
-    thrust: float  #: as a share of the weight, before ground effect
+    quaternion: tuple[float, float, float, float]  #: rotation, world from body: x, y, z, w
+    angular_velocity_rad_s: Vec3  #: angular velocity about the body's axes
+    thrust: float  #: thrust as a fraction of the weight, before ground effect
     wind_m_s: Vec3
     battery: float  #: remaining charge, 0 to 1
 
@@ -54,12 +54,12 @@ class OccurrenceKind(StrEnum):
     COLLISION = "collision"
     EMERGENCY = "emergency"
     BATTERY_LOW = "battery_low"
-    SLOW = "slow"  #: for all drones: the computer is too slow for the requested speed
+    SLOW = "slow"  #: applies to all drones: the computer is too slow for the requested speed
 
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """Something that happened to a drone. ``speed_m_s`` is the speed of a collision along its normal, else 0."""
+    """Something that happened to a drone. ``speed_m_s`` is a collision's speed along its normal, otherwise 0."""
 
     kind: OccurrenceKind
     drone: int

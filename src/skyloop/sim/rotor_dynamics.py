@@ -1,7 +1,7 @@
-"""Formulas of the rotor-level model, for the numbers of one drone as well as for arrays of all. Pure.
+"""Formulas of the rotor-level model, both for the numbers of one drone and for arrays of all drones. Pure.
 
-Body axes: forward x, left y, up z. Only sums, products, quotients and square roots, which give the same bits for
-numbers and arrays.
+Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give the
+same bits for numbers and arrays.
 
 Sources: [M] R. Mahony, V. Kumar, P. Corke, "Multirotor Aerial Vehicles: Modeling, Estimation, and Control of
 Quadrotor", IEEE Robotics & Automation Magazine 19(3), 2012: thrust and torque, blade flapping as a force that grows
@@ -27,9 +27,9 @@ from skyloop.sim.parameters import GRAVITY_M_S2, YAW_SIGNS, RotorParameters, Veh
 PLANT_STEP_S = 0.001  #: time step of the rotor-level model and its instruments
 
 _HALF_STEP_S = PLANT_STEP_S / 2
-_LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, within a tenth of a second
-_ROTOR_RESPONSE_S = 0.02  # time constant that the mixer gives slower rotors by commanding them beyond their target
-_YAW_SHARE = 0.25  # of the rotors' range of thrust that yaw may take from roll and pitch
+_LEG_STIFFNESS_PER_S2, _LEG_DAMPING_PER_S = 900.0, 60.0  # critically damped, settling within a tenth of a second
+_ROTOR_RESPONSE_S = 0.02  # time constant that slower rotors get because the mixer commands them beyond their target
+_YAW_SHARE = 0.25  # fraction of the rotors' thrust range that yaw may take from roll and pitch
 
 Four: TypeAlias = tuple[N, N, N, N]
 Three: TypeAlias = tuple[N, N, N]
@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays with those of all. Forces and torques are per mass and per inertia."""
+    """Constants of one drone, or arrays of those of all. Forces and torques are per mass and per inertia."""
 
     thrust: N
     idle_speed: N
@@ -98,7 +98,7 @@ def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
     """Return a vehicle's rotors.
 
     Raises:
-        UsageError: It has none, as its response is modelled as a whole.
+        UsageError: The vehicle has none, because its response is modelled as a whole.
     """
     if vehicle.rotors is None:
         raise UsageError("this vehicle has no rotors: it is modelled by its response as a whole; see docs/rotors.md")
@@ -106,12 +106,12 @@ def rotors_of(vehicle: VehicleParameters) -> RotorParameters:
 
 
 def constants_of(vehicle: VehicleParameters) -> Constants:
-    """Return one vehicle's constants."""
+    """Return the constants of a vehicle."""
     rotors = rotors_of(vehicle)
     ix, iy, iz = rotors.inertia_kg_m2
     mass, k = vehicle.mass_kg, rotors.thrust_n_s2
     (x1, y1), (x2, y2), (x3, y3), (x4, y4) = rotors.places_m
-    # Each rotor's share of a sum of thrusts and torques about x, y and z.
+    # Each rotor's contribution to the sum of thrusts and of torques about x, y and z.
     rows = [[1.0] * 4, [y1, y2, y3, y4], [-x1, -x2, -x3, -x4], [rotors.torque_m * sign for sign in YAW_SIGNS]]
     share = np.linalg.inv(np.array(rows))
     roll, pitch, yaw = (share[:, 1] * ix).tolist(), (share[:, 2] * iy).tolist(), (share[:, 3] * iz).tolist()
@@ -179,7 +179,7 @@ def all_constants(each: Sequence[Constants]) -> Constants:
 
 
 def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
-    """Return the rows of the world-from-body rotation of a quaternion."""
+    """Return the rows of a quaternion's world-from-body rotation."""
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     wx, wy, wz = w * x, w * y, w * z
     return (
@@ -190,10 +190,10 @@ def rotation(w: N, x: N, y: N, z: N) -> tuple[Three, Three, Three]:
 
 
 def spin(do: Operations, c: Constants, speeds: Four, targets: Four) -> tuple[Four, N]:
-    """Spin the rotors towards other speeds for a step of :data:`PLANT_STEP_S`.
+    """Change the rotors' speeds towards target speeds for a step of :data:`PLANT_STEP_S`.
 
     Returns:
-        Their speeds, and the reaction on the body: its angular acceleration about z.
+        The rotors' speeds, and the reaction on the body as an angular acceleration about z.
     """
     (one, two, three, four), (to_one, to_two, to_three, to_four) = speeds, targets
     up, down = c.up_share, c.down_share
@@ -221,14 +221,14 @@ def advance(
         do: The operations.
         c: The constants.
         turning: Quaternion (w, x, y, z; world from body) and body rates.
-        speeds: Rotor speeds, constant during the step.
-        twist: See :func:`spin`.
-        motion: Velocity of the air, position, velocity; world axes.
-        knock: Acceleration, world axes, by which contacts changed the body's velocity in the last step.
-        legs: Whether any drone may stand or lie on something, which then turns it onto its feet.
+        speeds: Rotor speeds, which are constant during the step.
+        twist: Reaction of the rotors; see :func:`spin`.
+        motion: Velocity of the air, position and velocity in world axes.
+        knock: Acceleration in world axes by which contacts changed the body's velocity in the last step.
+        legs: Whether any drone may be standing or lying on something that turns it onto its feet.
 
     Returns:
-        Quaternion and body rates; position and velocity; the specific force along the body's axes in the step; and the
+        Quaternion and body rates; position and velocity; the specific force along the body's axes during the step; the
         rotors' thrust per mass.
     """
     w, x, y, z, p, q, r = turning
@@ -237,7 +237,7 @@ def advance(
     knock_x, knock_y, knock_z = knock
     (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation(w, x, y, z)
 
-    # The air along the body's axes, and at each rotor along its own: a rotor's force is that of [M], less inflow [S].
+    # The air along the body's axes and, at each rotor, along its own: a rotor's force follows [M], less inflow [S].
     east, north, up = vx - air_x, vy - air_y, vz - air_z
     ahead = r00 * east + r10 * north + r20 * up
     aside = r01 * east + r11 * north + r21 * up
@@ -252,7 +252,7 @@ def advance(
     t4 = t4 - inflow * s4 * (along + p * c.y4 - q * c.x4)
     thrust = t1 + t2 + t3 + t4
 
-    # Near the floor it is raised by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow downwards.
+    # Near the floor thrust grows by 1 / (1 - (R / 4h)²) [C], as far as the rotors blow downwards.
     shortfall = c.ground_effect / do.most(pz + c.rotor_offset, c.rotor_height)
     lift = thrust / (1.0 - shortfall * shortfall * do.most(r22, 0.0))
     flapping = c.rotor_drag * (s1 + s2 + s3 + s4)
@@ -264,7 +264,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # The legs push with the supporting force, at arm's length at most.
+        # The legs push with the supporting force, on a lever arm of at most the hull's radius.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
@@ -293,9 +293,9 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the rotor speeds to command, for turning the body as wanted and lifting it.
+    """Return the rotor speeds to command in order to turn the body as wanted and lift it.
 
-    If the rotors cannot do everything, roll and pitch come first, then the thrust; yaw gets a share.
+    If the rotors can't do everything, roll and pitch come first, then the thrust; yaw gets a limited share.
 
     Args:
         do: The operations.
@@ -303,8 +303,8 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
         rates: Rates about the body's axes.
         speeds: Rotor speeds.
         wanted: The target rates.
-        thrust: Per mass; at 0 the rotors stop.
-        sag: Voltage of the battery, as a share of the full one.
+        thrust: Thrust per mass; at 0 the rotors stop.
+        sag: Voltage of the battery as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted
@@ -314,7 +314,7 @@ def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three,
     dr = _within(do, (want_r - r) * c.yaw_gain, most) + c.gyroscopic_z * p * q
     k, slowest, fastest = c.thrust, c.idle_speed * sag, c.full_speed * sag
     least, range_n = k * slowest * slowest, k * (fastest * fastest - slowest * slowest)
-    # All four have the same share of yaw, so that one of them shows whether it is too much.
+    # All four contribute the same amount of yaw, so checking one of them is enough to see whether it is too much.
     yaw = _within(do, dr * c.yaw1, range_n * _YAW_SHARE) / c.yaw1
     d1 = dp * c.roll1 + dq * c.pitch1 + yaw * c.yaw1
     d2 = dp * c.roll2 + dq * c.pitch2 + yaw * c.yaw2
@@ -345,17 +345,17 @@ def electric_power(c: Constants, speeds: Four) -> N:
 
 
 def load(do: Operations, c: Constants, power: N, unloaded: N, voltage: N) -> tuple[N, N]:
-    """Return voltage and current of a battery.
+    """Return a battery's voltage and current.
 
     Args:
         do: The operations.
         c: The constants.
-        power: Drawn from the battery [W].
-        unloaded: Its voltage without load [V].
-        voltage: Its voltage before.
+        power: Power drawn from the battery [W].
+        unloaded: Voltage without a load [V].
+        voltage: Previous voltage [V].
     """
     current = power / do.most(voltage, 1.0)
-    # A battery's power has its maximum at half its voltage.
+    # A battery delivers its maximum power at half its voltage.
     return do.most(unloaded - current * c.resistance, unloaded * 0.5), current
 
 

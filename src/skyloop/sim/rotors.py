@@ -1,4 +1,4 @@
-"""Bodies at the level of rotors: any attitude, four rotors each, in steps of 1 ms; flown by firmware or built-in loops.
+"""Bodies modelled down to their four rotors in steps of 1 ms, at any attitude, flown by firmware or built-in loops.
 
 As in :mod:`skyloop.sim.dynamics`, many drones are computed as arrays and a few one by one, with the same bits.
 """
@@ -30,26 +30,26 @@ from skyloop.sim.rotor_dynamics import (
 )
 from skyloop.sim.streams import Floats
 
-PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: steps of the plant in one of the simulation
+PLANT_STEPS = round(STEP_S / PLANT_STEP_S)  #: number of plant steps per simulation step
 
 # Rows of the table of a body's state and inputs, in addition to those of BodyTable.
 _TURNING, _SPEEDS, _FORCE, _VOLTAGE, _CURRENT = 0, 7, 11, 14, 15
 _TARGETS, _WANTED, _THRUST, _KNOCK, _SAG, _OPEN = 16, 20, 23, 24, 27, 28
 _ROWS = 29
-_AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; near the vertical
-_IDLE_COMMAND = 0.15  # armed firmware idles with 5 to 15 %
-_ROTOR_MARGIN_M_S2 = 60.0  # of gravity, ground effect, and drag in a fast dive
+_AIR, _LEAST_COS = 19, 1e-6  # first row of BodyTable's air, thrust, position, velocity; cosine near the vertical
+_IDLE_COMMAND = 0.15  # armed firmware idles at 5 to 15 %
+_ROTOR_MARGIN_M_S2 = 60.0  # margin for gravity, ground effect, and drag in a fast dive
 
 
 class RotorBodies(BodyTable):
     """Bodies with four rotors each.
 
-    Their state is a quaternion, body rates and rotor speeds; angles, their sines, cosines and derivatives are derived
-    at the end of each step. An attitude loop (250 Hz), a rate loop and a mixer (1 kHz) follow the inputs
+    Their state is a quaternion, body rates and rotor speeds. Angles with their sines, cosines and derivatives are
+    computed at the end of each step. An attitude loop (250 Hz), a rate loop and a mixer (1 kHz) follow the inputs
     ``attitude_command`` and ``thrust_command``, except for drones flown by firmware.
 
     Attributes:
-        quaternion: World from body, w, x, y, z, (4, n).
+        quaternion: Rotation from body to world axes, w, x, y, z, (4, n).
         turning: Body rates, (3, n) [rad/s].
         speeds: Rotor speeds, (4, n) [rad/s].
         voltage: Voltage of the batteries under load, (n,) [V].
@@ -59,7 +59,7 @@ class RotorBodies(BodyTable):
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
         super().__init__(positions, yaws)
         n = len(parameters)
-        self.count = 0  #: steps of the plant
+        self.count = 0  #: number of plant steps
         rows = columns(_ROWS, n)
         self.quaternion, self.turning, self.speeds = rows[0:4], rows[4:7], rows[7:11]
         self._force, self.voltage, self.current = rows[11:14], rows[14], rows[15]
@@ -75,7 +75,7 @@ class RotorBodies(BodyTable):
         self._constants = each
         self._all = all_constants(each)
         self._attitude_gain = column(parameters, lambda p: p.attitude_frequency_rad_s / (2 * p.attitude_damping))
-        self._after = self.velocity.copy()  # the velocity at the end of the last step, before collisions
+        self._after = self.velocity.copy()  # velocity at the end of the last step, before collisions
         self._flown = np.zeros(n, dtype=np.bool_)
         self._pilots: dict[int, _Pilot] = {}
         thrusts = (rotors_of(p).full_thrust_n / p.mass_kg for p in parameters)
@@ -95,16 +95,16 @@ class RotorBodies(BodyTable):
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Do nothing: running rotors hold the attitude, and so does the ground under a drone."""
+        """Do nothing: running rotors hold the attitude, and so does the ground below a drone."""
 
     def fly_by(self, drone: int, firmware: Firmware, instruments: Instruments) -> None:
-        """Let firmware fly a drone from the next step on."""
+        """Have firmware fly a drone from the next step on."""
         self._pilots = {**self._pilots, drone: _Pilot(self, drone, firmware, instruments)}
         self._flown[drone] = True
         self._targets[:, drone] = 0.0
 
     def release(self, drone: int) -> None:
-        """Stop the rotors of a drone flown by firmware and hand it to the built-in loops."""
+        """Stop the rotors of a drone flown by firmware and hand the drone to the built-in loops."""
         self._pilots = {number: pilot for number, pilot in self._pilots.items() if number != drone}
         self._flown[drone] = False
         self._targets[:, drone] = 0.0
@@ -123,13 +123,13 @@ class RotorBodies(BodyTable):
         self._targets[:, drone] = [idle + span * min(one, 1.0) if one > 0.0 else 0.0 for one in commands]
 
     def idles(self, drone: int) -> bool:
-        """Return whether no rotor of a drone flown by firmware is commanded above the idle of armed firmware."""
+        """Return whether no rotor of a drone flown by firmware is commanded above the idle speed of armed firmware."""
         constants = self._constants[drone]
         idle = constants.idle_speed + _IDLE_COMMAND * (constants.full_speed - constants.idle_speed)
         return bool((self._targets[:, drone] <= idle + 1e-9).all())
 
     def set_unloaded_voltage(self, voltage: Floats) -> None:
-        """Set the batteries' voltage without load, (n,) [V]; empty ones have none."""
+        """Set the batteries' voltage without a load, (n,) [V]; that of empty ones is zero."""
         self._open_voltage[:] = voltage
 
     def turn(self, drone: int, change_rad_s: float) -> None:
@@ -139,7 +139,7 @@ class RotorBodies(BodyTable):
         self.rates[2, drone] += change_rad_s
 
     def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
-        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
+        """Move a body, level and at rest; ``position_m`` has shape (3,), and ``thrust`` is an acceleration [m/s²]."""
         super().put(drone, position_m, yaw_rad, thrust)
         constants = self._constants[drone]
         self._after[:, drone] = 0.0
@@ -151,7 +151,7 @@ class RotorBodies(BodyTable):
     # State -----------------------------------------------------------------------------------------------------
 
     def power(self) -> Floats:
-        """Return each drone's present battery power, (n,) [W]."""
+        """Return each drone's current battery power, (n,) [W]."""
         power: Floats = electric_power(self._all, tuple(self.speeds))
         return power
 
@@ -160,12 +160,12 @@ class RotorBodies(BodyTable):
         return self.turning.copy()
 
     def body_rates_of(self, drone: int) -> tuple[float, float, float]:
-        """Return the angular velocity of one drone about its body's axes [rad/s]."""
+        """Return a drone's angular velocity about its body's axes [rad/s]."""
         return _three(self.turning[:, drone])
 
     @property
     def time_s(self) -> float:
-        """Simulation time, including the finished steps of the plant."""
+        """Simulation time, including the plant steps finished so far."""
         return self.count * PLANT_STEP_S
 
     def rotations(self) -> Floats:
@@ -190,7 +190,7 @@ class RotorBodies(BodyTable):
         self._derive()
 
     def _begin(self) -> None:
-        """Prepare the inputs of a step: effects of collisions, the attitude loop, the batteries."""
+        """Prepare the inputs of a step: the effects of collisions, the attitude loop and the batteries."""
         np.subtract(self.velocity, self._after, out=self._knock)
         np.divide(self._knock, STEP_S, out=self._knock)
         np.copyto(self.velocity_before, self.velocity)
@@ -250,8 +250,8 @@ class RotorBodies(BodyTable):
         self.thrust[:] = lift
 
     def _derive(self) -> None:
-        """Derive angles, their sines, cosines and derivatives from the quaternions."""
-        # In separate arrays, because NumPy's functions may give other bits for other strides.
+        """Compute angles, with their sines, cosines and derivatives, from the quaternions."""
+        # In separate arrays, because NumPy's functions may give different bits for different strides.
         quaternion = np.ascontiguousarray(self.quaternion)
         (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation(*quaternion)
         level = np.sqrt(r21 * r21 + r22 * r22)
@@ -260,7 +260,7 @@ class RotorBodies(BodyTable):
         sin[0], sin[1], sin[2] = r21 / some, -r20, r10 / some
         cos[0], cos[1], cos[2] = r22 / some, level, r00 / some
         steep = level < _LEAST_COS
-        if steep.any():  # roll and yaw turn about the same axis; all of it counts as yaw
+        if steep.any():  # roll and yaw turn about the same axis, so all of it counts as yaw
             sin[0, steep], sin[2, steep] = 0.0, -r01[steep]
             cos[0, steep], cos[1, steep], cos[2, steep] = 1.0, _LEAST_COS, r11[steep]
         cos[0, cos[0] == 0.0] = _LEAST_COS  # a divisor of thrust
@@ -272,7 +272,7 @@ class RotorBodies(BodyTable):
 
 
 class _Pilot:
-    """Exchanges readings and commands with the firmware of one drone."""
+    """Exchanges readings and commands with a drone's firmware."""
 
     def __init__(self, bodies: RotorBodies, drone: int, firmware: Firmware, instruments: Instruments) -> None:
         self._bodies = bodies
@@ -283,7 +283,7 @@ class _Pilot:
     def exchange(self) -> None:
         bodies, drone = self._bodies, self._drone
         w, x, y, z = bodies.quaternion[:, drone].tolist()
-        # The ground supports a drone at the end of each simulation step only; between these, the drone falls.
+        # The ground supports a drone only at the end of each simulation step; between these, it falls.
         velocity = bodies.velocity_before if bodies._knock[2, drone] > 0.0 else bodies.velocity
         readings = self._instruments.read(
             bodies.count,

@@ -1,4 +1,4 @@
-"""The vehicles' own estimates: truth with noise and slowly wandering biases."""
+"""The vehicles' own estimates: the truth with noise and slowly wandering biases."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Sensors:
 
     Attributes:
         altitude: Height of the feet above the floor, (n,) [m].
-        velocity: Forward, left, up, levelled axes, (3, n) [m/s].
+        velocity: Velocity forward, left, up in levelled axes, (3, n) [m/s].
         numbers: For a few drones: altitude and velocity.
     """
 
@@ -72,7 +72,7 @@ class Sensors:
         np.add(self._bias, self._bias_fresh * self._bias_normals.take(), out=self._bias)
 
     def estimate(self) -> None:
-        """Measure altitude and velocity."""
+        """Measure the altitude and velocity."""
         bodies = self._bodies
         if self._few:
             for drone, half_height in self._each:
@@ -89,7 +89,7 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def put(self, drone: int) -> None:
-        """Measure a drone that was moved and is at rest, as its last estimate was of another position."""
+        """Measure a drone that was moved and is at rest, because its last estimate was for another position."""
         height = self._bodies.position[2, drone] - self._half_height[drone]
         self._estimate[:, drone] = self._bias[9:, drone]
         self._estimate[0, drone] += height
@@ -97,12 +97,12 @@ class Sensors:
     def inertial(self, step: int) -> Floats:
         """Return the inertial sensors' values at the end of a step, shape (9, n).
 
-        Rows are gyro [rad/s] and accelerometer [m/s²] in body axes, and roll, pitch, yaw [rad] (yaw not wrapped). They
-        are computed once per step for all drones.
+        Rows are gyro [rad/s] and accelerometer [m/s²] in body axes, and roll, pitch, yaw [rad] (yaw is not wrapped).
+        They are computed once per step for all drones.
         """
         if step != self._inertial_step:
             bodies = self._bodies
-            # One drone after another from the step's stream, so that more drones leave the first ones' noise unchanged.
+            # Drone after drone, so that adding drones doesn't change the noise of the earlier ones.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
             truth = np.concatenate([bodies.body_rates(), bodies.specific_force(), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
@@ -111,7 +111,7 @@ class Sensors:
 
 
 def _levelled(velocity: N, sin_yaw: N, cos_yaw: N) -> tuple[N, N, N]:
-    """Return a velocity in world axes as forward, left, up."""
+    """Convert a velocity from world axes to forward, left, up."""
     vx, vy, vz = velocity
     return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, vz
 

@@ -1,7 +1,7 @@
-"""A world with drones in it, stepped by its owner.
+"""A world with drones, stepped by its owner.
 
-Deterministic: the same world, seed, drones and commands in the same steps give the same bits. Nothing here reads a wall
-clock; :class:`~skyloop.sim.options.Pacer` makes it run in real time.
+It is deterministic: the same world, seed, drones and commands in the same steps give the same bits. Nothing here reads
+a wall clock; :class:`~skyloop.sim.options.Pacer` makes it run in real time.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import TargetState, Vec3, Wind, World
 
-LOOP_STEPS = 4  # the autopilot's outer loops, altimeter and velocity: 62.5 Hz
-SLOW_STEPS = 25  # battery and the wandering of biases: 10 Hz
+LOOP_STEPS = 4  # steps per update of the autopilot's outer loops, altimeter and velocity (62.5 Hz)
+SLOW_STEPS = 25  # steps per update of the batteries and of the wandering biases (10 Hz)
 
 T = TypeVar("T")
 
@@ -40,12 +40,12 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """A world with drones in it. All methods may be called from any thread: a lock is held for one step or one query.
+    """A world with drones. All methods may be called from any thread: a lock is held for one step or one query.
 
     Attributes:
         world: The world.
         parameters: The parameters of each drone.
-        seed: Seed of all noise and gusts.
+        seed: Seed for all noise and gusts.
     """
 
     def __init__(
@@ -63,17 +63,17 @@ class Simulation:
 
         Args:
             world: The world.
-            drones: Their number, 1 to 1000.
-            seed: Seed of all noise and gusts. Together with the world's own seed it determines the simulation. None
+            drones: Number of drones, 1 to 1000.
+            seed: Seed for all noise and gusts. Together with the world's own seed it determines the simulation. None
                 uses the world's seed.
-            parameters: One for all drones or one for each.
-            limits: One for all drones or one for each.
-            charge: Initial charge of the batteries, above 0, at most 1.
-            wind: Replaces the world's.
+            parameters: Parameters for all drones, or for each drone.
+            limits: Limits for all drones, or for each drone.
+            charge: Initial charge of the batteries, greater than 0 and at most 1.
+            wind: Wind that replaces the world's own.
 
         Raises:
-            UsageError: An argument is out of its range, some vehicles have rotors and others not, or the world has no
-                room for this many drones.
+            UsageError: An argument is out of its range, some vehicles have rotors and others don't, or the world has no
+                room for that many drones.
         """
         if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
             raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
@@ -108,12 +108,12 @@ class Simulation:
 
     @property
     def drones(self) -> int:
-        """The number of drones; they are numbered from 0."""
+        """Number of drones, which are numbered from 0."""
         return len(self.parameters)
 
     @property
     def step_count(self) -> int:
-        """The number of finished steps."""
+        """Number of finished steps."""
         return self._step
 
     @property
@@ -147,25 +147,25 @@ class Simulation:
             self._autopilot.watch_firmware(self._rotors, self.time_s)
 
     def _supply(self) -> None:
-        """Pass the batteries' present voltage to the rotors."""
+        """Pass the batteries' current voltage to the rotors."""
         if self._rotors is not None:
             self._rotors.set_unloaded_voltage(self._batteries.open_voltage() * (self._batteries.charge > 0))
 
     # Flying ----------------------------------------------------------------------------------------------------
 
     def command(self, drone: int, action: AnyAction) -> AnyAction:
-        """Command a drone; the command stays in force until the next one.
+        """Command a drone. The command stays in force until the next one.
 
         Args:
-            drone: Its number.
+            drone: The drone's number.
             action: A set-point or an action.
 
         Returns:
-            The applied action: the action itself, a set-point within the limits, or :class:`~skyloop.messages.Idle` if
-            the drone ignores it in its present state, as firmware does: set-points before hovering, a reset in the air.
+            The applied action: the action itself, a clamped set-point, or :class:`~skyloop.messages.Idle` if the drone
+            ignores it in its current state, as firmware does: set-points before hovering, a reset in the air.
 
         Raises:
-            UsageError: No such drone, firmware flies it, or a number is not finite.
+            UsageError: There is no such drone, firmware flies it, or a number is not finite.
         """
         if not isinstance(action, Action):
             raise UsageError(f"expected an action from skyloop.messages, got {action!r}")
@@ -176,26 +176,26 @@ class Simulation:
             return self._autopilot.command(drone, action, self.time_s)
 
     def limits(self, drone: int) -> Limits:
-        """Return a drone's limits in force."""
+        """Return the limits in force for a drone."""
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """Change a drone's limits from the next command on; the ceiling applies at once."""
+        """Change a drone's limits from the next command on. The ceiling applies immediately."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
 
     def fly_by(self, drone: int, firmware: Firmware) -> None:
-        """Let firmware fly a drone from now on; the built-in autopilot refuses commands meanwhile.
+        """Have firmware fly a drone from now on. Meanwhile the built-in autopilot refuses commands.
 
         The drone counts as landed while it is on the ground and no rotor command exceeds 15 %, the idle of armed
-        firmware, and as flying otherwise. Collisions are reported as usual and stop no rotor.
+        firmware, and otherwise as flying. Collisions are reported as usual and don't stop rotors.
 
         Args:
-            drone: Its number. It must be on the ground; an emergency is reset.
-            firmware: Called once per millisecond of the simulation, on the stepping thread.
+            drone: The drone's number. The drone must be on the ground; an emergency is reset.
+            firmware: Called once per millisecond of simulation time on the stepping thread.
 
         Raises:
-            UsageError: No such drone, it has no rotors, firmware flies it already, or it is in the air.
+            UsageError: There is no such drone, it has no rotors, firmware already flies it, or it is in the air.
         """
         with self._lock:
             self._require_built_in(drone)
@@ -217,12 +217,12 @@ class Simulation:
             rotors.fly_by(drone, firmware, instruments)
 
     def release(self, drone: int) -> None:
-        """Take a drone back from its firmware: its rotors stop, and the built-in autopilot takes over.
+        """Take a drone back from its firmware. Its rotors stop and the built-in autopilot takes over.
 
-        In the air it falls, in an emergency.
+        A drone in the air falls in an emergency.
 
         Raises:
-            UsageError: No such drone, or no firmware flies it.
+            UsageError: There is no such drone, or no firmware flies it.
         """
         with self._lock:
             if self._rotors is None or self._number(drone) not in self._autopilot.handed_over:
@@ -249,7 +249,7 @@ class Simulation:
         """Set a drone's battery charge.
 
         Raises:
-            UsageError: No such drone, or the charge is not from 0 to 1.
+            UsageError: There is no such drone, or the charge is not between 0 and 1.
         """
         if not 0 <= charge <= 1:
             raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
@@ -257,12 +257,12 @@ class Simulation:
             self._batteries.charge[self._number(drone)] = charge
 
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
-        """Move a flying drone, hovering, level and at rest, to start another episode in the same simulation.
+        """Move a flying drone, hovering, level and at rest, to start a new episode in the same simulation.
 
         Args:
-            drone: Its number.
-            position_m: New position of its centre, world axes.
-            yaw_rad: Its heading.
+            drone: The drone's number.
+            position_m: New position of its centre in world axes.
+            yaw_rad: New heading of the drone.
             charge: Charge of its battery, 0 to 1.
 
         Raises:
@@ -289,7 +289,7 @@ class Simulation:
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """Return a drone's estimates. Altitude and velocity are up to 12 ms older, as their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()
@@ -329,7 +329,7 @@ class Simulation:
             )
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Return the true poses of all bodies, as new arrays, for a renderer or motion capture.
+        """Return the true poses of all bodies as new arrays, for a renderer or for motion capture.
 
         Returns:
             Positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
@@ -338,11 +338,11 @@ class Simulation:
             return self._bodies.position.T.copy(), self._bodies.rotations()
 
     def motions(self) -> tuple[Floats, Floats, Floats]:
-        """Return the motion of all drones as new arrays, for tasks with many drones.
+        """Return the motion of all drones as new arrays, intended for tasks with many drones.
 
         Returns:
             True positions in world axes, shape (n, 3) [m]; the drones' estimates of velocity forward, left and up, up
-            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw, yaw within ±π, shape (n, 3) [rad].
+            to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw (within ±π), shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()
@@ -350,12 +350,12 @@ class Simulation:
             return self._bodies.position.T.copy(), self._sensors.velocity.T.copy(), angles
 
     def airborne(self) -> NDArray[np.bool_]:
-        """Return whether each drone flies, shape (n,); see :attr:`FlightState.airborne`."""
+        """Return whether each drone is flying, shape (n,); see :attr:`FlightState.airborne`."""
         with self._lock:
             return np.array([state.airborne for state in self._autopilot.states])
 
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
-        """Return the states of the moving targets, in the world's order.
+        """Return the states of the moving targets in the world's order.
 
         Args:
             time_s: Simulation time; None for now.
@@ -372,7 +372,7 @@ class Simulation:
         return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
 
     def take_occurrences(self) -> list[Occurrence]:
-        """Return the occurrences since the last call, oldest first; only the newest 1000 are kept."""
+        """Return the occurrences since the last call, oldest first. Only the newest 1000 are kept."""
         with self._lock:
             taken = list(self._autopilot.occurrences)
             self._autopilot.occurrences.clear()

@@ -1,4 +1,4 @@
-"""A world's solids: distances from drones to them, overlaps, and free positions for drones to stand."""
+"""A world's solids: distances from drones to them, overlaps, and free starting positions for drones."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Spawn, Vec
 
 
 class Overlap(NamedTuple):
-    """A drone's overlap with a solid (or with the room's walls and ceiling).
+    """A drone's overlap with a solid or with the room's walls and ceiling.
 
     Attributes:
         normal: Direction out of the solid.
-        depth_m: Depth along it.
+        depth_m: Depth along that direction.
         surface_m_s: Velocity of the solid's surface at the drone's centre.
         spin_rad_s: Turn rate of the surface, counter-clockwise from above.
     """
@@ -33,7 +33,7 @@ class Overlap(NamedTuple):
 
 
 class Solids:
-    """Boxes, gate bars, moving platforms and figures, and the room's walls and ceiling; not the floor."""
+    """Boxes, gate bars, moving platforms and figures, and the room's walls and ceiling, but not the floor."""
 
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
@@ -45,14 +45,14 @@ class Solids:
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
-        # The same as plain numbers, faster for a single box: centre, half the size, cosine and sine of yaw; velocity
-        # and turn rate.
+        # The same as plain numbers, which are faster for a single box: centre, half the size, cosine and sine of yaw;
+        # velocity and turn rate.
         self._boxes = [(0.0,) * 8 for _ in sizes]
         self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
             self._place(number, box.position_m, box.yaw_rad)
         self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
-        self._bounded_m = math.nan  # the radius they are valid for
+        self._bounded_m = math.nan  # radius for which they are valid
         size_x, size_y, height = world.room.size_m
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
@@ -63,20 +63,20 @@ class Solids:
 
     @property
     def moving(self) -> bool:
-        """Whether any of the solids moves."""
+        """Whether any of the solids is moving."""
         return bool(self._movers)
 
     def __len__(self) -> int:
-        """Return the number of boxes, platforms and figures; they are numbered, and moving ones come last."""
+        """Return the number of boxes, platforms and figures. They are numbered, with moving ones last."""
         return len(self._boxes)
 
     @property
     def fixed(self) -> int:
-        """The number of fixed ones."""
+        """Number of fixed solids."""
         return self._fixed
 
     def move(self, time_s: float) -> None:
-        """Move the moving solids to their positions at a time."""
+        """Move the moving solids to their positions at a point in time."""
         for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
             state = track.at(time_s)
             x, y, z = state.position_m  # a platform's top, a figure's footprint
@@ -85,12 +85,12 @@ class Solids:
             self._place(number, centre, state.yaw_rad, state.velocity_m_s, state.yaw_rate_rad_s)
 
     def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
-        """Return bounding boxes, low and high, each (3, boxes) [m]; valid until the next call.
+        """Return bounding boxes, low and high, each (3, boxes) [m]. They are valid until the next call.
 
         Args:
-            seconds: Moving solids stay within their boxes for this time, from their present positions.
-            radius_m: Radius of hulls that touch a box only if their own bounding box overlaps this one. (The distance
-                of a hull from a turned box's corner is that of a square turned the same way.)
+            seconds: Time for which moving solids stay within their boxes, from their current positions.
+            radius_m: Radius of hulls, which touch a box only if their own bounding box overlaps this one. (The distance
+                between a hull and a turned box's corner is that of a square turned the same way.)
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -110,12 +110,12 @@ class Solids:
         high[:, which] = (self._centre[:, which] + around)[:, :, 0]
 
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
-        """Return which points are inside their solids: indices into ``points``, ascending.
+        """Return which points are inside their solids, as indices into ``points`` in ascending order.
 
         Args:
-            points: Shape (3, m), m at least 1.
-            numbers: The solid of each point, shape (m,).
-            sizes: From :meth:`sizes` for the same numbers and the points' hulls.
+            points: The points, shape (3, m), with m at least 1.
+            numbers: Number of the solid for each point, shape (m,).
+            sizes: Sizes from :meth:`sizes` for the same numbers and the points' hulls.
         """
         x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
         c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
@@ -131,7 +131,7 @@ class Solids:
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance to the nearest solid, wall or ceiling, (m,).
 
-        Never more than the true distance; negative inside.
+        It is never more than the true distance, and negative inside a solid.
 
         Args:
             points: Positions of the drones, (3, m).
@@ -147,13 +147,13 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return the deepest overlap of one drone, or None.
+        """Return the deepest overlap of a drone; None if there is none.
 
         Args:
-            point: Its centre, three numbers [m].
-            radius: Radius of its hull [m].
-            half_height: Half height of its hull [m].
-            among: The solids to check, in addition to the room; None for all.
+            point: The drone's centre, three numbers [m].
+            radius: Radius of the hull [m].
+            half_height: Half height of the hull [m].
+            among: Solids to check in addition to the room; None for all.
         """
         x, y, z = point
         wide, deep, tall = self._room
@@ -185,12 +185,12 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance to the first solid, including the floor; infinite without one [m].
+        """Return the distance to the first solid, including the floor [m]; infinite if there is none.
 
         Args:
-            point: Start of a beam; from below the floor its length is 0.
+            point: Start of a beam, whose length is 0 if it starts below the floor.
             direction: Direction of the beam, a unit vector.
-            time_s: Simulation time, for the positions of moving solids.
+            time_s: Simulation time, which determines the positions of moving solids.
         """
         if self._movers:
             self.move(time_s)
@@ -210,7 +210,7 @@ class Solids:
         x, y, z = direction
         starts = np.array([c * away[0] + s * away[1], c * away[1] - s * away[0], away[2]])
         ways = np.array([c * x + s * y, c * y - s * x, np.full_like(c, z)])
-        # Treat a beam parallel to a face as one nearly parallel to it.
+        # Treat a beam parallel to a face as almost parallel to it.
         ways[np.abs(ways) < 1e-12] = 1e-12
         half = self._half[:, :, 0]
         one, other = (-half - starts) / ways, (half - starts) / ways
@@ -221,7 +221,7 @@ class Solids:
     def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
         axis = inside.index(min(inside))
         if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
-            axis = 2  # a platform lifts everything on it, whatever its motion
+            axis = 2  # a platform lifts everything on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         *_, c, s = self._boxes[number]
         if axis == 2:
@@ -244,7 +244,7 @@ class Solids:
         self._motions[number] = velocity, spin
 
     def _local(self, points: Floats) -> Floats:
-        """Return points (3, m) in the axes of each box, (3, boxes, m)."""
+        """Return points (3, m) in each box's axes, (3, boxes, m)."""
         away = points[:, None, :] - self._centre
         local = away.copy()
         local[0] = self._cos * away[0] + self._sin * away[1]
@@ -253,7 +253,7 @@ class Solids:
 
 
 def _top_speed(target: PlatformTarget | FigureTarget) -> float:
-    """Return an upper bound of the speed [m/s] of all points of a target, corners included."""
+    """Return an upper bound for the speed [m/s] of all points of a target, including corners."""
     turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
     return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
 
@@ -262,26 +262,26 @@ Indices = NDArray[np.intp]
 
 
 def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indices]:
-    """Return the pairs of overlapping boxes, by a sweep along the axis of their largest spread.
+    """Return the pairs of overlapping boxes, using a sweep along the axis of their largest spread.
 
     Args:
-        low: Least coordinates of the boxes, shape (3, n) [m].
-        high: Greatest coordinates, shape (3, n).
-        movable: Return only pairs that include one of this many first boxes.
+        low: Minimum coordinates of the boxes, shape (3, n) [m].
+        high: Maximum coordinates, shape (3, n).
+        movable: Number of first boxes, at least one of which must be in each pair.
 
     Returns:
-        The lower and the higher number of each pair, in ascending order. Boxes that touch overlap.
+        The lower and the higher number in each pair, in ascending order. Boxes that touch count as overlapping.
     """
     if low.shape[1] < 2:
         return np.zeros(0, np.intp), np.zeros(0, np.intp)
     axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
     order = low[axis].argsort(kind="stable")
     begins, ends = low[axis, order], high[axis, order]
-    # In this order, a box overlaps along the axis with those after it that begin before it ends.
+    # In this order, a box overlaps along the axis with later ones that begin before it ends.
     numbers = np.arange(len(order))
     counts = begins.searchsorted(ends, side="right") - numbers - 1
     first = numbers.repeat(counts)
-    before = counts.cumsum() - counts  # number of pairs from the previous boxes
+    before = counts.cumsum() - counts  # number of pairs with the previous boxes
     second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
     one, other = order.take(first), order.take(second)
     for across in {0, 1, 2} - {axis}:
@@ -294,14 +294,14 @@ def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indic
     return lesser.take(wanted), greater.take(wanted)
 
 
-_MARGINS_M = (0.6, 0.3, 0.15)  # between hulls, and to obstacles: the first that leaves enough room
+_MARGINS_M = (0.6, 0.3, 0.15)  # distances between hulls and to obstacles; the first one that leaves enough room is used
 
 
 def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
-    """Return a free starting position for each drone: the world's own first, then a grid around the first of them.
+    """Return a free starting position for each drone: first the world's own, then a grid around the first of them.
 
     Raises:
-        UsageError: Not enough positions, or one of the world's own is inside a solid.
+        UsageError: There are not enough positions, or one of the world's own is inside a solid.
     """
     spawns = list(world.spawns[: len(parameters)])
     for spawn, drone in zip(spawns, parameters, strict=False):
@@ -333,7 +333,7 @@ def _fill(
 
 
 def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[float, float]]:
-    """Return points of a square grid over the floor, nearest to ``around`` first."""
+    """Return points of a square grid over the floor, those nearest to ``around`` first."""
     x0, y0 = around.position_m[:2] if around else (0.0, 0.0)
     reach_x, reach_y = (math.ceil(world.room.size_m[axis] / spacing) for axis in (0, 1))
     points = [

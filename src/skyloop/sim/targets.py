@@ -1,6 +1,6 @@
-"""The motion of targets: each path is a sequence of points on a fixed time grid, computed as far as requested.
+"""The motion of targets. Each path is a sequence of points on a fixed time grid, computed as far as requested.
 
-A target's position at a time therefore depends on that time and the seed only.
+A target's position therefore depends only on the time and the seed.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from skyloop.sim.world import (
     Yaw,
 )
 
-GRID_S = 0.02  # spacing of the points; motion between them is linear
-KEPT_S = 60.0  # length of a target's available past
+GRID_S = 0.02  # spacing of the points, between which motion is linear
+KEPT_S = 60.0  # duration of the past that is available for a target
 
-_TURN_BACK = 0.25  # chance that a ring walk reverses at a waypoint
+_TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
 _RING_STEP_RAD = (math.radians(20), math.radians(45))
 
 
@@ -46,26 +46,26 @@ _RING_STEP_RAD = (math.radians(20), math.radians(45))
 class _Point:
     position: Vec3
     velocity: Vec3
-    yaw: float  # unwrapped
+    yaw: float  # not wrapped
     walked: float
 
 
 class TargetTrack:
-    """The motion of one target over time. May be used from any thread."""
+    """A target's motion over time. May be used from any thread."""
 
     def __init__(self, target: Target, seed: int, index: int) -> None:
         self.target = target
         positions = _positions(target.path, stream(seed, Purpose.TARGETS, index))
         self._points = _with_yaw(positions, target.yaw)
         self._kept: deque[_Point] = deque(maxlen=round(KEPT_S / GRID_S) + 2)
-        self._known = 0  # points computed so far, kept or not
+        self._known = 0  # number of points computed so far, whether still kept or not
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> TargetState:
         """Return the state at a simulation time [s].
 
         Raises:
-            UsageError: The time is before the start, or more than :data:`KEPT_S` before the latest requested time.
+            UsageError: The time is before the start or more than :data:`KEPT_S` before the latest requested time.
         """
         if not (math.isfinite(time_s) and time_s >= 0):
             raise UsageError(f"time must be a finite number of at least 0 s, not {time_s!r}")
@@ -76,7 +76,7 @@ class TargetTrack:
         yaw = wrap_angle(first.yaw + part * (second.yaw - first.yaw))
         walked = first.walked + part * (second.walked - first.walked)
         place = (position[0], position[1], position[2])
-        # The velocity between the points, not at the first one; otherwise a drone on a platform would creep.
+        # Use the velocity between the points, not at the first one; otherwise a drone on a platform would creep.
         velocity = _vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
         rate = (second.yaw - first.yaw) / GRID_S
         return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
@@ -92,7 +92,7 @@ class TargetTrack:
 
 
 def top_speed(path: Path) -> float:
-    """Return a target's greatest speed [m/s] on the path."""
+    """Return a target's maximum speed [m/s] on the path."""
     if isinstance(path, LissajousPath):
         rates = (a * 2 * math.pi * c / path.period_s for a, c in zip(path.amplitude_m, path.cycles, strict=True))
         return math.hypot(*rates)
@@ -104,7 +104,7 @@ def top_speed(path: Path) -> float:
 
 
 def _positions(path: Path, rng: np.random.Generator) -> Iterator[tuple[Vec3, Vec3]]:
-    """Yield position and velocity at 0, GRID_S, 2 GRID_S …, endlessly."""
+    """Yield position and velocity at 0, GRID_S, 2 GRID_S … endlessly."""
     if isinstance(path, WaypointPath):
         return _waypoints(path)
     if isinstance(path, CirclePath):
@@ -146,7 +146,7 @@ def _circle(path: CirclePath, time_s: float) -> tuple[Vec3, Vec3]:
 def _oval(path: OvalPath, time_s: float) -> tuple[Vec3, Vec3]:
     half, radius, bend = path.length_m / 2, path.radius_m, math.pi * path.radius_m
     along = (path.start_m + path.speed_m_s * time_s) % (2 * (path.length_m + bend))
-    back = along >= path.length_m + bend  # the second half is the first one rotated by half a turn
+    back = along >= path.length_m + bend  # the second half is the first half rotated by half a turn
     along -= (path.length_m + bend) * back
     if along < path.length_m:
         x, y, c, s = along - half, -radius, 1.0, 0.0
@@ -187,9 +187,9 @@ def _ring_goals(path: RingWalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
 def _steer(
     goals: Iterator[Vec3], speeds: tuple[float, float], acceleration: float, rng: np.random.Generator
 ) -> Iterator[tuple[Vec3, Vec3]]:
-    """Walk from goal to goal, each leg at its own speed, with a limited acceleration.
+    """Walk from goal to goal with each leg at its own speed, and with limited acceleration.
 
-    A goal counts as reached at the braking distance, so that a reversal there does not overshoot it.
+    A goal counts as reached at the braking distance, so that a reversal at the goal does not overshoot it.
     """
     position, goal = np.array(next(goals)), np.array(next(goals))
     velocity = np.zeros(3)
@@ -224,7 +224,7 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
 
 
 def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:
-    """Return the heading to turn to; None without one (at rest, or right above the point to look at)."""
+    """Return the heading to turn to; None if there is none (at rest, or directly above the point to look at)."""
     if isinstance(yaw, FixedYaw):
         return yaw.yaw_rad
     if isinstance(yaw, TowardsYaw):

@@ -1,4 +1,4 @@
-"""Descriptions of simulated worlds: frozen, without motion (see ``targets``) and file reading (see ``world_file``).
+"""Frozen descriptions of simulated worlds, without motion (see ``targets``) or file reading (see ``world_file``).
 
 World axes: x east, y north, z up, metres, radians; yaw 0 faces east, positive yaw is counter-clockwise from above.
 The room's floor is centred on the origin: x in ±size/2, y in ±size/2, z from 0 to the height.
@@ -18,7 +18,7 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Rgb = tuple[int, int, int]
 
-# Surface names that a renderer must support. A world file with another name is refused.
+# Surface names that a renderer must support. A world file with any other name is refused.
 TEXTURES: tuple[str, ...] = (
     "asphalt",
     "books",
@@ -41,7 +41,7 @@ TEXTURES: tuple[str, ...] = (
     "wood",
 )
 
-# ArUco and AprilTag dictionaries by their OpenCV names, with how many markers each holds (ids 0 … n-1).
+# ArUco and AprilTag dictionaries by their OpenCV names, with the number of markers in each (ids 0 … n-1).
 # Source: cv::aruco::PredefinedDictionaryType, OpenCV 4.x reference.
 MARKER_DICTIONARIES: dict[str, int] = {
     **{f"DICT_{bits}X{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
@@ -55,10 +55,10 @@ MARKER_DICTIONARIES: dict[str, int] = {
 
 @dataclass(frozen=True, slots=True)
 class FacePose:
-    """The pose of a flat object (poster, marker, board).
+    """Pose of a flat object (poster, marker, board).
 
     ``yaw_rad`` and ``elevation_rad`` give the direction of the outward normal: its heading, and its angle above the
-    horizon (π/2 points straight up, as for a marker on the floor). ``turn_rad`` turns the picture in its own plane,
+    horizon (π/2 points straight up, as for a marker on the floor). ``turn_rad`` rotates the picture in its own plane,
     counter-clockwise as seen from the front.
     """
 
@@ -68,7 +68,7 @@ class FacePose:
     turn_rad: float = 0.0
 
     def rotation(self) -> NDArray[np.float64]:
-        """Return the world-from-face rotation, (3, 3): columns are the picture's right, its up, the outward normal."""
+        """Return the world-from-face rotation, (3, 3), with columns picture's right, its up, outward normal."""
         cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         ce, se = math.cos(self.elevation_rad), math.sin(self.elevation_rad)
         right = np.array([-sy, cy, 0.0])
@@ -80,9 +80,9 @@ class FacePose:
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """The bounds of the world. Drones never leave them.
+    """The bounds of the world, which drones never leave.
 
-    Without ``enclosed`` there is ground and sky, but no visible walls or ceiling; the bounds then act as a net.
+    Without ``enclosed`` there is ground and sky but no visible walls or ceiling; the bounds then act like a net.
     """
 
     size_m: Vec3  # x, y, z extents
@@ -94,17 +94,17 @@ class Room:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A solid upright box: ``position_m`` is its centre, ``size_m`` its extents along its own x, y, z."""
+    """A solid upright box: ``position_m`` is its centre, and ``size_m`` its extents along its own x, y, z."""
 
     name: str
     position_m: Vec3
     size_m: Vec3
     yaw_rad: float = 0.0
     texture: str = "crate"
-    colour: Rgb | None = None  # a plain colour instead of the texture
+    colour: Rgb | None = None  # plain colour that replaces the texture
 
     def corners(self) -> NDArray[np.float64]:
-        """Return the corners in world axes, shape (8, 3); bit 0, 1, 2 of the row number choose +x, +y, +z."""
+        """Return the corners in world axes, shape (8, 3). Bits 0, 1 and 2 of the row number select +x, +y and +z."""
         bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
         local = (bits - 0.5) * np.asarray(self.size_m)
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
@@ -119,10 +119,10 @@ class Gate:
 
     Attributes:
         name: The gate's name.
-        position_m: Centre of the opening.
+        position_m: Position of the opening's centre.
         inner_size_m: Width and height of the opening.
-        yaw_rad: Heading of the way through.
-        frame_m: Thickness of its bars.
+        yaw_rad: Heading for flying through the gate.
+        frame_m: Thickness of the bars.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Gate:
     colour: Rgb = (235, 110, 20)
 
     def bars(self) -> tuple[Box, ...]:
-        """Return the solid parts: top, bottom, left and right bars, and two legs if the opening is off the floor."""
+        """Return the solid parts: top, bottom, left and right bars, and two legs if the opening is above the floor."""
         width, height = self.inner_size_m
         bar, x, y, z = self.frame_m, *self.position_m
         side = (width + bar) / 2
@@ -161,7 +161,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A flat textured rectangle with no thickness: a poster, a window, a door. Drones don't collide with it."""
+    """A flat textured rectangle without thickness: a poster, a window, a door. Drones don't collide with it."""
 
     name: str
     pose: FacePose
@@ -180,13 +180,13 @@ class MarkerPattern:
 
     @property
     def card_size_m(self) -> float:
-        """Return the edge of the square card: the black square and the margin on both sides."""
+        """Return the edge of the square card: the black square plus the margin on both sides."""
         return self.size_m + 2 * self.margin_m
 
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker with a fixed pose. ``pose`` is that of its centre; the picture's up is the marker's own."""
+    """A printed marker with a fixed pose: that of its centre. The picture's up is the marker's own."""
 
     name: str
     pose: FacePose
@@ -195,7 +195,7 @@ class Marker:
 
 @dataclass(frozen=True, slots=True)
 class WaypointPath:
-    """Straight legs between points at a constant speed; ``closed`` runs in a loop, otherwise back and forth."""
+    """Straight legs between points at a constant speed, in a loop if ``closed``, otherwise back and forth."""
 
     points_m: tuple[Vec3, ...]
     speed_m_s: float
@@ -204,7 +204,7 @@ class WaypointPath:
 
 @dataclass(frozen=True, slots=True)
 class CirclePath:
-    """A level circle at a constant speed, starting at ``start_rad`` from east, counter-clockwise from above."""
+    """A level circle at a constant speed, starting at ``start_rad`` from east, counter-clockwise as seen from above."""
 
     centre_m: Vec3
     radius_m: float
@@ -215,13 +215,13 @@ class CirclePath:
 
 @dataclass(frozen=True, slots=True)
 class OvalPath:
-    """A level race track at a constant speed: two straights along x, joined by half circles; counter-clockwise.
+    """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
-    It starts ``start_m`` along the track from the beginning of the southern straight; clockwise, of the northern one.
+    It starts ``start_m`` along the track from the beginning of the southern straight; if clockwise, the northern one.
     """
 
     centre_m: Vec3
-    length_m: float  #: of each straight
+    length_m: float  #: length of each straight
     radius_m: float
     speed_m_s: float
     start_m: float = 0.0
@@ -230,7 +230,7 @@ class OvalPath:
 
 @dataclass(frozen=True, slots=True)
 class LissajousPath:
-    """position = centre + amplitude · sin(2π · cycles · t / period + phase), axis by axis."""
+    """position = centre + amplitude · sin(2π · cycles · t / period + phase) on each axis."""
 
     centre_m: Vec3
     amplitude_m: Vec3
@@ -241,32 +241,32 @@ class LissajousPath:
 
 @dataclass(frozen=True, slots=True)
 class WalkPath:
-    """A seeded random walk between points of a box, each leg at a speed drawn from a range.
+    """A seeded random walk between points in a box, with each leg at a speed drawn from a range.
 
-    The box extends from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``),
-    which can leave the box by some 0.1 m.
+    The box extends from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``), so
+    that the walk can leave the box by some 0.1 m.
     """
 
     low_m: Vec3
     high_m: Vec3
-    speed_m_s: Vec2  # least, greatest
+    speed_m_s: Vec2  # minimum, maximum
     acceleration_m_s2: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class RingWalkPath:
-    """A seeded random walk around a centre, within a ring, with occasional reversals. Rounded as ``WalkPath``."""
+    """A seeded random walk around a centre within a ring, with occasional reversals. Rounded like ``WalkPath``."""
 
     centre_m: Vec2
-    radius_m: Vec2  # least, greatest
-    height_m: Vec2  # least, greatest
-    speed_m_s: Vec2  # least, greatest
+    radius_m: Vec2  # minimum, maximum
+    height_m: Vec2  # minimum, maximum
+    speed_m_s: Vec2  # minimum, maximum
     acceleration_m_s2: float = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class StillPath:
-    """A fixed point: a parked car, a waiting person."""
+    """A fixed point, for a parked car or a waiting person."""
 
     position_m: Vec3
 
@@ -283,7 +283,7 @@ class FixedYaw:
 
 @dataclass(frozen=True, slots=True)
 class AlongYaw:
-    """The heading of the motion plus an offset, turning no faster than the limit."""
+    """The heading of the motion plus an offset, turning at most as fast as the limit."""
 
     offset_rad: float
     turn_rate_rad_s: float
@@ -291,7 +291,7 @@ class AlongYaw:
 
 @dataclass(frozen=True, slots=True)
 class TowardsYaw:
-    """The heading towards a point of the floor plan, turning no faster than the limit."""
+    """The heading towards a point on the floor plan, turning at most as fast as the limit."""
 
     point_m: Vec2
     turn_rate_rad_s: float
@@ -302,9 +302,9 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:
-    """An upright card with a marker, carried along a path. Drones pass through it.
+    """An upright card with a marker that is carried along a path. Drones pass through it.
 
-    The path is that of the card's centre, and the yaw is the heading of its face.
+    The path is that of the card's centre, and the yaw is the heading of the card's face.
     """
 
     name: str
@@ -335,15 +335,15 @@ FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.
 class FigureTarget:
     """A solid dummy that moves along a path on the ground: a person with swinging legs and arms, or a car.
 
-    The path is that of the middle of its footprint (z is the ground below it), and the yaw is its heading.
+    The path is that of the middle of its footprint (z is the ground below), and the yaw is its heading.
 
     Attributes:
         name: The target's name.
         shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
         path: Its path.
         yaw: Its heading.
-        size_m: Size along its own x (ahead), y (left) and z.
-        look: Determines its colours and the pattern of its clothes: equal shapes and looks are look-alikes.
+        size_m: Size along the figure's own x (ahead), y (left) and z.
+        look: Number that selects the colours and the pattern of the clothes; equal shapes and looks are look-alikes.
         colour: Colour of a person's top or a car's body; None for the look's colour.
     """
 
@@ -363,9 +363,9 @@ Target = BoardTarget | PlatformTarget | FigureTarget
 class TargetState:
     """The state of a moving target at a simulation time, in world axes.
 
-    Position [m], yaw [rad, within ±π] and velocity [m/s]. A platform's position is the centre of its top face, a
-    figure's the ground below it. ``walked_m`` is the distance travelled since the start, ``yaw_rate_rad_s`` the turn
-    rate.
+    Position [m], yaw [rad, within ±π] and velocity [m/s]. The position of a platform is the centre of its top face,
+    that of a figure is the ground below it. ``walked_m`` is the distance travelled since the start, and
+    ``yaw_rate_rad_s`` is the turn rate.
     """
 
     name: str
@@ -379,17 +379,17 @@ class TargetState:
     def face(self, target: Target) -> FacePose:
         """Return the pose of the target's marker at this time."""
         if isinstance(target, PlatformTarget):
-            # Facing up with the picture's up along the heading: see FacePose for the half turn.
+            # Facing up, with the picture's up along the heading; FacePose explains the half turn.
             return FacePose(self.position_m, yaw_rad=self.yaw_rad + math.pi, elevation_rad=math.pi / 2)
         return FacePose(self.position_m, yaw_rad=self.yaw_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """Moving air: a mean velocity (the direction it blows to) and gusts.
+    """Moving air: a mean velocity (the direction it blows towards) and gusts.
 
-    Gusts are a first-order Gauss-Markov process per axis with ``gust_m_s`` as its standard deviation along each
-    horizontal axis (half of it vertically).
+    Gusts are a first-order Gauss-Markov process per axis. ``gust_m_s`` is the standard deviation along each horizontal
+    axis (half of it vertically).
     """
 
     mean_m_s: Vec3 = (0.0, 0.0, 0.0)
@@ -401,14 +401,14 @@ class Wind:
 class Light:
     """Slowly changing daylight, as under passing clouds: between 1 - ``amplitude`` and 1 times the full brightness.
 
-    The sum of two sines, of ``period_s`` and about a third of it, with phases from the world's seed.
+    It is the sum of two sines, with ``period_s`` and about a third of it, and phases from the world's seed.
     """
 
     amplitude: float = 0.0
     period_s: float = 60.0
 
     def at(self, time_s: float, seed: int = 0) -> float:
-        """Return the brightness at a simulation time [s], 1 - amplitude to 1; exactly 1 without amplitude."""
+        """Return the brightness at a simulation time [s], from 1 - amplitude to 1; exactly 1 for amplitude 0."""
         if self.amplitude == 0.0:
             return 1.0
         first, second = stream(seed, Purpose.LIGHT).uniform(0.0, 2 * math.pi, 2).tolist()
@@ -419,7 +419,7 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Spawn:
-    """A drone's starting position: ``position_m`` is on the ground below its centre."""
+    """A drone's starting position. ``position_m`` is on the ground below the drone's centre."""
 
     name: str
     position_m: Vec3
@@ -428,7 +428,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` determines everything random in it (the walks of its targets)."""
+    """A whole world. ``seed`` determines everything that is random in it (the walks of its targets)."""
 
     name: str
     room: Room
@@ -443,5 +443,5 @@ class World:
     light: Light = Light()
 
     def solids(self) -> tuple[Box, ...]:
-        """Return every fixed solid: the boxes, and the bars and legs of the gates."""
+        """Return every fixed solid: the boxes, and the gates' bars and legs."""
         return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())

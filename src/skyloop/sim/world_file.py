@@ -1,7 +1,7 @@
-"""Read worlds from TOML files.
+"""Reading of worlds from TOML files.
 
-Lengths are metres, speeds metres a second, angles **degrees** (with keys that end in ``_deg``), because people write
-these files; degrees become radians only here. The files in ``worlds/`` show every table.
+Lengths are in metres, speeds in metres per second and angles in **degrees** (with keys that end in ``_deg``), because
+people write these files; degrees are converted to radians only here. The files in ``worlds/`` show every table.
 """
 
 from __future__ import annotations
@@ -79,15 +79,15 @@ from skyloop.sim.world_tables import (
 )
 from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
-_NEAREST_M = 0.01  # least distance of two waypoints
-_WALL_GAP_M = 0.004  # posters and markers are this far off their wall, so that the renderer has a clear order
+_NEAREST_M = 0.01  # minimum distance between two waypoints
+_WALL_GAP_M = 0.004  # distance of posters and markers from their wall, which gives the renderer a clear order
 
 N = TypeVar("N", bound=Named)
 T = TypeVar("T")
 
 
 def shipped_worlds() -> tuple[str, ...]:
-    """Return the names of the shipped worlds, in order."""
+    """Return the names of the built-in worlds in order."""
     folder = resources.files("skyloop.sim") / "worlds"
     return tuple(sorted(e.name.removesuffix(".toml") for e in folder.iterdir() if e.name.endswith(".toml")))
 
@@ -96,13 +96,13 @@ def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
     """Load a world.
 
     Args:
-        name_or_path: A shipped world's name, or a file (any name that ends in ``.toml`` or has a separator).
-        seed: Seed of everything random in the world.
+        name_or_path: A built-in world's name, or a file (any name that ends in ``.toml`` or has a separator).
+        seed: Seed for everything that is random in the world.
 
     Raises:
-        UnknownNameError: No shipped world has this name.
+        UnknownNameError: No built-in world has this name.
         FileFormatError: The file can't be read or understood.
-        UsageError: The seed is not a whole number of at least 0.
+        UsageError: The seed is not an integer of at least 0.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
@@ -222,10 +222,10 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
 
 
 def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room) -> FacePose:
-    """Return the pose of an object on a face of the room.
+    """Return the pose of an object on one of the room's faces.
 
-    On a wall, ``along`` is x (north, south) or y (east, west) and ``other`` the height; on floor and ceiling they are x
-    and y, and the image's up points east.
+    On a wall, ``along`` is x (north, south) or y (east, west), and ``other`` is the height. On the floor and the
+    ceiling they are x and y, and the image's up points east.
     """
     half_x, half_y, height = room.size_m[0] / 2, room.size_m[1] / 2, room.size_m[2]
     gap = _WALL_GAP_M
@@ -360,8 +360,8 @@ def _colour(text: str, place: Place) -> Rgb:
     return (int(digits[0:2], 16), int(digits[2:4], 16), int(digits[4:6], 16))
 
 
-_TRIES = 400  # for the position of one object
-_BEGINNINGS = 100  # of the whole placement: the first objects may leave no room for the last
+_TRIES = 400  # maximum number of tries for the position of one object
+_BEGINNINGS = 100  # maximum number of restarts, because the first objects may leave no room for the last
 
 Varied = BoxTable | GateTable | SpawnTable
 
@@ -370,7 +370,7 @@ def place_varied(table: WorldTable, seed: int, place: Place) -> None:
     """Move varied objects to positions determined by the seed, uniformly within their ranges.
 
     Raises:
-        FileFormatError: They do not fit at the distance ``apart``.
+        FileFormatError: The objects do not fit at the distance ``apart``.
     """
     things = _varied(table)
     if not things:
@@ -398,7 +398,7 @@ def _varied(table: WorldTable) -> list[Varied]:
 
 
 def _places(things: list[Varied], apart_m: float, random: np.random.Generator) -> list[tuple[float, ...]] | None:
-    """Return a position for each object, or None if one found no room."""
+    """Return a position for each object; None if there was no room for one of them."""
     places: list[tuple[float, ...]] = []
     for thing in things:
         centre = _centre(thing)
@@ -413,7 +413,7 @@ def _places(things: list[Varied], apart_m: float, random: np.random.Generator) -
 
 
 def _centre(thing: Varied) -> tuple[float, float, float] | None:
-    """Return the position in the file; None for a box without one, which is refused later, by name."""
+    """Return the position given in the file; None for a box without one, which is refused later by name."""
     if isinstance(thing, BoxTable) and thing.stands_at is not None:
         return (*thing.stands_at, 0.0)
     return thing.position

@@ -34,7 +34,7 @@ Cycles = Annotated[float, Meta(ge=0.0, le=20.0)]
 RingRadius = Annotated[float, Meta(ge=0.1)]
 RingHeight = Annotated[float, Meta(ge=0.0)]
 TurnRate = Annotated[float, Meta(ge=1.0, le=720.0)]
-#: The valid ids depend on the dictionary.
+#: The id of a marker; which ones are valid depends on the dictionary.
 MarkerId = Annotated[Any, Meta(description="a whole number, a marker's in its dictionary")]
 
 
@@ -69,7 +69,7 @@ class VariedTable(Named, kw_only=True):
 
 class BoxTable(VariedTable, kw_only=True):
     size: Size
-    stands_at: Spot | None = None  #: on the floor, the usual case
+    stands_at: Spot | None = None  #: position on the floor, the usual case
     position: Position | None = None
     yaw_deg: Degrees = 0.0
     texture: Texture = "crate"
@@ -85,7 +85,7 @@ class GateTable(VariedTable, kw_only=True):
 
 
 class FaceTable(Named, kw_only=True):
-    """On a face of the room at two coordinates, or anywhere with a heading."""
+    """Position on a face of the room by two coordinates, or anywhere with a heading."""
 
     on: Mount | None = None
     at: Spot | None = None
@@ -190,7 +190,7 @@ class PlatformTable(BoardTable, kw_only=True, tag_field="kind", tag="platform"):
 
 
 class FigureTable(Named, kw_only=True, tag_field="kind", tag="figure"):
-    """The path is on the ground below it; the heading is that of the path by default."""
+    """The path is on the ground below the figure, and the heading is by default that of the path."""
 
     shape: Literal["person", "car"] = "person"
     path: PathTable
@@ -211,7 +211,7 @@ class SpawnTable(VariedTable, kw_only=True):
 
 
 class VaryTable(_Table, kw_only=True):
-    apart: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0  #: least horizontal distance between varied objects
+    apart: Annotated[float, Meta(ge=0.0, le=1000.0)] = 0.0  #: minimum horizontal distance between varied objects
 
 
 class WorldTable(_Table, kw_only=True):

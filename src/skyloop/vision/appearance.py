@@ -1,6 +1,6 @@
-"""A tracker that notices when it has lost its target, and a memory of appearances that recognises it again.
+"""A tracker that notices when it has lost its target and finds it again by its remembered appearance.
 
-The division into tracking, a verifying memory and detection by that memory follows Kalal, Mikolajczyk and Matas,
+The split into a tracker, a memory that verifies it and a search with that memory follows Kalal, Mikolajczyk and Matas,
 "Tracking-learning-detection", TPAMI 34, 2012.
 """
 
@@ -32,36 +32,36 @@ from skyloop.vision.tracking import (
     patch,
 )
 
-_VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box counts as verified
-_SURE: Final = 0.6  # similarity from which the appearance is learned
-_FOUND: Final = 0.55  # similarity from which a place is worth a trial while the target is lost
-_UNLIKE_OTHERS: Final = 0.15  # margin by which a place must be more similar than any other place and known look-alike
-_LOOK_ALIKE: Final = 0.4  # similarity from which something beside the target is remembered as a look-alike
-_PATIENCE: Final = 10  # images without verification before the whole image is searched
-_TRIAL: Final = 3  # images in which a found place must be verified
-_LEARN_EACH: Final = 5  # learn at most every this many images
-_LOOK_AROUND_EACH: Final = 15  # look for look-alikes every this many images
-_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # shares of the target's last size, searched one per image
+_VERIFIED: Final = 0.45  # a tracked box counts as verified from this similarity to the memory
+_SURE: Final = 0.6  # the appearance is learned from this similarity
+_FOUND: Final = 0.55  # a lost target is tried at places of at least this similarity
+_UNLIKE_OTHERS: Final = 0.15  # required lead in similarity over all other places and known look-alikes
+_LOOK_ALIKE: Final = 0.4  # anything near the target with this similarity is remembered as a look-alike
+_PATIENCE: Final = 10  # number of images without verification before the whole image is searched
+_TRIAL: Final = 3  # number of images in which a found place must be verified
+_LEARN_EACH: Final = 5  # minimum number of images between updates of the memory
+_LOOK_AROUND_EACH: Final = 15  # number of images between searches for look-alikes
+_SIZES: Final = (1.0, 0.8, 1.25, 1.0, 0.65, 1.55)  # multiples of the target's last size, one searched per image
 
-# Score, and share of such boxes with an overlap of at least a half: `python -m benchmarks.tracking_street`.
+# Score, and fraction of such boxes that overlap the target by at least half: `python -m benchmarks.tracking_street`.
 _CONFIDENCE: Final = ((0.45, 0.857), (0.55, 0.946), (0.65, 0.974), (0.75, 0.986), (0.85, 0.986), (0.95, 0.989))
-_PLACES: Final = 5  # strips across a box in which its colours are sampled
-_ASIDE: Final = 0.12  # offset between neighbouring strips, of the box's width
-_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as shares of the height
-_SIZE: Final = (24, 24)  # stored patch, regardless of the target's shape
-_GRADIENTS: Final = 7  # the first channels of the features
-_COLOUR_WEIGHT: Final = 1.2  # how fast the similarity falls with the colour distance
-_KEPT: Final = 12  # appearances kept, and as many look-alikes
-_NEW_BELOW: Final = 0.9  # an appearance more similar to a known one is not added
+_PLACES: Final = 5  # number of strips across a box in which its colours are sampled
+_ASIDE: Final = 0.12  # offset between neighbouring strips, as a fraction of the box's width
+_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # upper and lower half from the top, as fractions of the height
+_SIZE: Final = (24, 24)  # size of the stored patch, whatever the target's shape [px]
+_GRADIENTS: Final = 7  # number of gradient channels, which come first in the features
+_COLOUR_WEIGHT: Final = 1.2  # decay of the similarity with the colour distance
+_KEPT: Final = 12  # maximum number of appearances, and of look-alikes
+_NEW_BELOW: Final = 0.9  # appearances more similar to a known one than this are not added
 _SEARCHED_PX: Final = 16.0  # side of the target in the shrunk search image
-_LEAST_MATCH: Final = 0.35  # correlation of a place worth a look
-_WORTH_NUDGING: Final = 0.2  # similarity from which to refine a place; a fifth of the size aside it is higher
-_NUDGE: Final = 0.08  # step of the refinement, of the target's size
+_LEAST_MATCH: Final = 0.35  # correlation from which a place is examined
+_WORTH_NUDGING: Final = 0.2  # refine places from this similarity; a match exceeds it even a fifth of the size off
+_NUDGE: Final = 0.08  # step of the refinement, as a fraction of the target's size
 _GROWTH: Final = (0.9, 1.1)  # scales tried by the refinement
 
 
 def confidence(score: float) -> float:
-    """Return the estimated chance, 0 to 1, that a box with a score overlaps the target by at least a half; monotone."""
+    """Return the estimated chance, 0 to 1, that a box with this score overlaps the target by half or more; monotone."""
     return float(np.interp(score, [at for at, _ in _CONFIDENCE], [share for _, share in _CONFIDENCE]))
 
 
@@ -75,13 +75,13 @@ class LongTermTracker(Tracker):
     """Tracks a target, reports its loss, and finds it again anywhere in the image.
 
     Another tracker follows the target. Each of its boxes is compared with a memory of the target's appearances, learned
-    from boxes that match well, and with look-alikes seen beside it. A box that is not verified is not returned: the
-    result is lost. After ten such images the whole image is searched, one size per image. A place that is similar
-    enough, and clearly more so than any other place and any known look-alike, is tracked on trial and returned after
+    from boxes that match well, and with look-alikes seen near it. A box that is not verified is withheld and the target
+    reported as lost. After ten such images the whole image is searched, at one size per image. A place that is similar
+    enough, and clearly more similar than any other place or known look-alike, is tracked on trial and returned after
     three images.
 
-    A target that was hidden beside a twin therefore stays lost, because nothing distinguishes them: start again with a
-    new box. The score is the similarity to the nearest appearance; its confidence is calibrated on simulated figures.
+    A target that was hidden next to a twin therefore stays lost, because nothing tells the two apart: restart with a
+    new box. The score is the similarity to the closest appearance; its confidence is calibrated on simulated figures.
     """
 
     def __init__(self, tracker: Callable[[], Tracker] = CorrelationTracker) -> None:
@@ -97,12 +97,12 @@ class LongTermTracker(Tracker):
         self._tracker = tracker()
 
     def shift(self, right: float, down: float) -> None:
-        """Search for the target shifted by this much to the right and down in the next image [px], unless lost."""
+        """Look for the target shifted by this much to the right and down in the next image [px]. Ignored while lost."""
         if self._shape is not None and self._state is not _State.LOST:
             self._tracker.shift(right, down)
 
     def similarity(self, image: Image, box: Sequence[float]) -> float:
-        """Return the similarity of a box's content to the target, 0 to 1; 0 if a known look-alike fits better.
+        """Return how similar a box's content is to the target, 0 to 1; 0 if a known look-alike fits better.
 
         Args:
             image: As in :meth:`update`.
@@ -116,10 +116,10 @@ class LongTermTracker(Tracker):
         return 0.0 if _is_other(seen) else seen.similarity
 
     def resume(self, image: Image, box: Sequence[float]) -> None:
-        """Continue from a box in which another detector found the target, keeping all remembered appearances.
+        """Continue from a box in which another detector found the target. All remembered appearances are kept.
 
         Args:
-            image: As in :meth:`update`, which is called with the next one.
+            image: As in :meth:`update`; pass the next image to that method.
             box: x, y, width, height [px].
 
         Raises:
@@ -130,7 +130,7 @@ class LongTermTracker(Tracker):
         self._state, self._count, self._size = _State.TRACKING, 0, checked[2:]
 
     def refuse(self) -> None:
-        """Mark the target as lost, because other evidence shows that the tracked thing is not the target.
+        """Mark the target as lost because other evidence shows that the tracker follows something else.
 
         Raises:
             UsageError: The tracker was not started.
@@ -170,7 +170,7 @@ class LongTermTracker(Tracker):
         return TrackResult(seen.box, seen.similarity, confidence(seen.similarity))
 
     def _doubt(self, seen: Candidate | None) -> TrackResult:
-        """Keep an unverified target for a while; drop a target on trial, or a clear look-alike, at once."""
+        """Keep an unverified target for a while, but drop a clear look-alike or a target on trial at once."""
         self._count += 1
         mistaken = seen is not None and _is_other(seen)
         if self._state is _State.ON_TRIAL or mistaken or self._count >= _PATIENCE:
@@ -202,7 +202,7 @@ class LongTermTracker(Tracker):
 
 
 def _is_other(seen: Candidate) -> bool:
-    """Return whether a place clearly shows a look-alike; an exact twin is distinguished only by tracking."""
+    """Return whether a place clearly shows a look-alike. Only tracking can tell an exact twin apart."""
     return seen.look_alike - seen.similarity > _UNLIKE_OTHERS
 
 
@@ -210,13 +210,13 @@ def _is_other(seen: Candidate) -> bool:
 class Appearance:
     """The appearance of a box's content in one image."""
 
-    pixels: Image  #: the patch, 24×24
-    texture: Floats  #: its gradients in cells, of length 1
-    colour: Floats  #: both parts of its colour in cells; empty for a grey image
+    pixels: Image  #: 24×24 patch
+    texture: Floats  #: gradients of the patch's cells, normalised to length 1
+    colour: Floats  #: both colour components of the patch's cells; empty for a grey image
 
     @classmethod
     def of(cls, cv: Any, image: Image, box: Box) -> Appearance:
-        """Take the appearance of a box in an image."""
+        """Extract the appearance of a box in an image."""
         pixels = patch(cv, image, box, _SIZE)
         cells = features(cv, pixels)
         gradients, rest = cells[:_GRADIENTS].ravel(), cells[_GRADIENTS:]
@@ -225,7 +225,7 @@ class Appearance:
         return cls(pixels, np.asarray(both / math.sqrt(2), np.float32), rest[1:])
 
     def similarity(self, other: Appearance) -> float:
-        """Return the similarity of two appearances, 0 to 1: texture and colour must both agree."""
+        """Return the similarity of two appearances, 0 to 1. It is high only if both texture and colour agree."""
         texture = within(float(self.texture @ other.texture), 0.0, 1.0)
         colour = float(np.abs(self.colour - other.colour).mean()) if self.colour.size else 0.0
         return texture * math.exp(-_COLOUR_WEIGHT * colour)
@@ -234,8 +234,8 @@ class Appearance:
 def colours(image: Image, box: Box) -> Floats:
     """Return the colours of a box's upper and lower half, (5, 6) float32: L, a, b of each (CIELAB).
 
-    One row for each of five strips, a third of the width each, from left to right: a person with an arm or a leg
-    stretched out is not in the middle of the box, where the background shows instead.
+    One row for each of five strips, each a third of the box's width, from left to right: a person with an arm or a leg
+    stretched out is not in the middle of the box, which then shows the background.
 
     Args:
         image: uint8, (h, w, 3) BGR or (h, w) grey.
@@ -259,7 +259,7 @@ def colours(image: Image, box: Box) -> Floats:
 
 
 def _within(low: float, high: float, most: int) -> tuple[int, int]:
-    """Return the range of pixels from low to high within the image, at least one pixel."""
+    """Return the pixel range from low to high, clipped to the image but at least one pixel long."""
     first = min(max(0, math.floor(low)), most - 1)
     return first, min(max(first + 1, math.ceil(high)), most)
 
@@ -269,12 +269,12 @@ class Candidate:
     """A place in an image that may be the target."""
 
     box: Box
-    similarity: float  #: to the most similar appearance of the target
-    look_alike: float  #: to the most similar look-alike; 0 if none is known
+    similarity: float  #: similarity to the closest appearance of the target
+    look_alike: float  #: similarity to the closest look-alike; 0 if none is known
 
 
 class TargetMemory:
-    """Several appearances of one target, and look-alikes seen beside it.
+    """Several appearances of one target, and look-alikes seen near it.
 
     The first appearance, which the user selected, is never forgotten.
     """
@@ -287,12 +287,12 @@ class TargetMemory:
         self._turn = 0
 
     def judged(self, image: Image, box: Box) -> Candidate:
-        """Compare the content of a box with everything remembered."""
+        """Compare a box's content with everything in the memory."""
         seen = Appearance.of(self._cv, image, box)
         return Candidate(box, _nearest(seen, self._appearances), _nearest(seen, self._look_alikes))
 
     def learn(self, image: Image, box: Box) -> None:
-        """Remember the target's current appearance, unless it is known."""
+        """Remember the target's current appearance unless it is already known."""
         _add(self._appearances, Appearance.of(self._cv, image, box), keep_first=True)
 
     def learn_look_alike(self, image: Image, box: Box) -> None:
@@ -300,12 +300,12 @@ class TargetMemory:
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Search the whole image for the target, each time by another of its appearances.
+        """Search the whole image for the target, using another of its appearances each time.
 
         Args:
             image: The image.
             size: Width and height of the target [px].
-            besides: Skip places that share more than a tenth with this box.
+            besides: Skip places that overlap this box by more than a tenth.
 
         Returns:
             At most the three best places, the most similar first.
@@ -335,7 +335,7 @@ class TargetMemory:
         return sorted(found, key=lambda one: -one.similarity)
 
     def _nudged(self, image: Image, box: Box) -> Candidate:
-        """Refine the coarse search: return the most similar of the boxes nearby, unless the place is hopeless."""
+        """Refine the coarse search by returning the most similar of the nearby boxes, unless the place is hopeless."""
         rough = self.judged(image, box)
         if rough.similarity < _WORTH_NUDGING:
             return rough

@@ -1,12 +1,12 @@
-"""Calibration boards, printed and detected in images, and the calibration of a camera from views of a board.
+"""Calibration boards, drawn for printing and detected in images, and camera calibration from views of a board.
 
 ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a partial view suffices
 (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
 Pattern Recognition 47(6), 2014; detection is OpenCV's). A plain chessboard must be entirely in view (Duda and Frese,
 "Accurate Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
 
-Calibration: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
-for both models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
+Method: Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV
+for both models. Outliers (views with a wrong corner, a blurred or bent board) are removed one by one, worst first.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from skyloop.vision.opencv import marker_dictionary, opencv
 Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
-_MARKER_SHARE = 0.74  # marker's side, as a share of a square's side
-_LEAST_CORNERS = 8  # corners of a ChArUco board needed in an image
+_MARKER_SHARE = 0.74  # marker's side as a fraction of the square's side
+_LEAST_CORNERS = 8  # minimum number of a ChArUco board's corners in an image
 Model = Literal["pinhole", "fisheye"]
 
-LEAST_VIEWS: Final = 6  #: needed for a calibration
-GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
+LEAST_VIEWS: Final = 6  #: minimum number of views for a calibration
+GRID: Final = (8, 6)  #: number of cells across and down for measuring coverage
 _WORST_SHARE: Final = 2.5  # remove a view whose error is more than this many times the median ...
 _WORST_PX: Final = 0.3  # ... and above this
-_NEW_SHARE: Final = 0.08  # share of the image's width: a view is new only if its corners moved at least this far
+_NEW_SHARE: Final = 0.08  # a view is new if its corners moved this fraction of the image's width
 _STEPS: Final = (60, 1e-8)  # iterations and accuracy of OpenCV's optimisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The corners of a board in one image."""
+    """A board's corners in one image."""
 
-    points: Array  #: (n, 3) on the board [m]
-    pixels: Array  #: (n, 2) in the image
+    points: Array  #: corners on the board, (n, 3) [m]
+    pixels: Array  #: corners in the image, (n, 2) [px]
     name: str = ""  #: name of the image, for messages
 
     @property
@@ -64,7 +64,7 @@ class Board:
 
     columns: int = 7
     rows: int = 5
-    square_m: float = 0.033  #: side of a printed square: measure it
+    square_m: float = 0.033  #: side of a square as printed; measure it
     kind: Kind = "charuco"
     dictionary: str = "4x4_50"  #: dictionary of a ChArUco board's markers
 
@@ -112,10 +112,10 @@ class Board:
 
         Args:
             path: A file name that ends in ``.png`` or ``.pdf``.
-            dpi: Resolution; it is adapted slightly so that a square has a whole number of pixels.
+            dpi: Resolution, which is adjusted slightly so that a square has an integer number of pixels.
 
         Raises:
-            UsageError: The file name has another ending, or a square would not have 20 to 2000 pixels.
+            UsageError: The file name has a different ending, or a square would not have 20 to 2000 pixels.
             MissingExtraError: Pillow or OpenCV is not installed.
         """
         file = Path(path)
@@ -130,7 +130,7 @@ class Board:
             raise UsageError(
                 f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, and must be 20 to 2000"
             )
-        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # gives a square exactly its size
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # at which a square has exactly its size
         with replacing(file) as part:
             if file.suffix.lower() == ".pdf":
                 Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)
@@ -149,7 +149,7 @@ class Board:
 
 
 class BoardFinder:
-    """Detects one board in images. Holds OpenCV's scratch memory: use one finder per thread.
+    """Detects one board in images. Keeps OpenCV's working memory, so use one finder per thread.
 
     Attributes:
         board: The board to detect.
@@ -178,7 +178,7 @@ class BoardFinder:
             name: Name of the image, kept in the view.
 
         Returns:
-            The board's corners; None if it is not visible enough.
+            The board's corners; None if too little of it is visible.
 
         Raises:
             UsageError: The array has a wrong shape or type, or is empty.
@@ -213,7 +213,7 @@ class BoardFinder:
 
 
 class Collector:
-    """Selects views of a board that differ enough from those selected before. Pure.
+    """Selects views of a board that differ enough from the views selected before. Pure.
 
     Attributes:
         views: The selected views.
@@ -221,13 +221,13 @@ class Collector:
     """
 
     def __init__(self, width: int, height: int) -> None:
-        """Initialise an empty collection for images of one size [px]."""
+        """Initialise an empty collection for images of a fixed size [px]."""
         self.views: list[BoardView] = []
         self.size = (width, height)  #: width and height of the images [px]
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
-        """Select a view if it shows the board at a new place, distance or tilt.
+        """Select a view if it shows the board in a new place, at a new distance or with a new tilt.
 
         Returns:
             Whether it was selected.
@@ -242,12 +242,12 @@ class Collector:
 
     @property
     def coverage(self) -> float:
-        """Share of the image area in which corners were seen, 0 to 1."""
+        """Fraction of the image area in which corners were seen, 0 to 1."""
         return coverage(self.views, *self.size)
 
 
 def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Return the share of the cells of a grid over the image that hold a corner, 0 to 1.
+    """Return the fraction of a grid's cells over the image that contain a corner, 0 to 1.
 
     Args:
         views: Views of one camera.
@@ -342,8 +342,8 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # Without k3: estimated from few images it is mostly noise, and bends the image's corners, where nothing was seen.
-    # Lenses that need it are fisheyes.
+    # Without k3: estimated from few images it is mostly noise, and it bends the image's corners, where there was no
+    # data. Lenses that need it are fisheyes.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
     )
@@ -366,12 +366,12 @@ def _fit_fisheye(cv: Any, views: Sequence[BoardView], size: tuple[int, int], cri
 
 
 def _fisheye_flag(cv: Any, name: str) -> int:
-    """Return a fisheye flag: OpenCV 4 has separate ones with other values, OpenCV 5 has one set."""
+    """Return a fisheye flag. OpenCV 4 has separate ones with different values, OpenCV 5 has one set for all."""
     return int(getattr(cv.fisheye, name, getattr(cv, name, 0)))
 
 
 def _mark(view: BoardView) -> Array:
-    """Return a signature to compare views: the pixels of four points of the board, (8,) [px]."""
+    """Return a signature for comparing views: the pixels of four points on the board, (8,) [px]."""
     cv = opencv("calibration")
     ends = np.array([view.points.min(axis=0)[:2], view.points.max(axis=0)[:2]])
     homography, _ = cv.findHomography(view.points[:, :2], view.pixels)

@@ -1,9 +1,9 @@
-"""Output layouts of ONNX files of the YOLO and DETR families: recognition and decoding. Pure.
+"""Output layouts of YOLO and DETR networks in ONNX files: recognition and decoding. Pure.
 
-The exports' outputs: YOLOv5 and v7 rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 the same
-without objectness and transposed; YOLOv10 and other exports without suppression corners, score and class; YOLOX offsets
-on the grid of its strides, unless exported with ``--decode_in_inference``; DETR's descendants boxes as shares of the
-image, with logits or scores beside them.
+YOLOv5 and v7 return rows of centre, size, objectness and class scores; YOLOv8, v9 and v11 the same, transposed and
+without objectness; YOLOv10 and other exports that need no suppression return corners, score and class. YOLOX returns
+offsets on the grid of its strides, unless exported with ``--decode_in_inference``. DETR's descendants return boxes as
+fractions of the image, together with logits or scores.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from skyloop.vision.object_tracks import Floats
 
 
 class Layout(StrEnum):
-    """The meaning of a network's outputs, and the input that it expects."""
+    """The meaning of a network's outputs, and the kind of input it expects."""
 
     YOLO5 = "yolo5"  #: (1, n, 5 + classes), pixels, objectness: YOLOv5, v6 and v7
     YOLO8 = "yolo8"  #: (1, 4 + classes, n), pixels: YOLOv8, v9, v11
     END_TO_END = "end-to-end"  #: (1, n, 6) left, top, right, bottom, score, class: YOLOv10, exports with suppression
     YOLOX = "yolox"  #: (1, n, 5 + classes), offsets on a grid; the input is BGR of 0 to 255
-    YOLOX_DECODED = "yolox-decoded"  #: the same in pixels
-    RT_DETR = "rt-detr"  #: (1, n, 4 + classes), shares of the image
-    DETR = "detr"  #: boxes (1, n, 4), shares of the image, and logits or scores (1, n, classes)
-    RF_DETR = "rf-detr"  #: as DETR; the input is normalised by ImageNet's mean and deviation
+    YOLOX_DECODED = "yolox-decoded"  #: as YOLOX, but in pixels
+    RT_DETR = "rt-detr"  #: (1, n, 4 + classes), fractions of the image
+    DETR = "detr"  #: boxes (1, n, 4), fractions of the image, and logits or scores (1, n, classes)
+    RF_DETR = "rf-detr"  #: as DETR, but the input is normalised by ImageNet's mean and deviation
     LISTS = "lists"  #: boxes (n, 4) in pixels, scores (n) and labels (n): torchvision, RT-DETR with its postprocessor
 
 
-#: Layouts whose input is the whole image stretched, not letterboxed.
+#: Layouts that take the whole image stretched instead of letterboxed.
 STRETCHED: Final = frozenset({Layout.RT_DETR, Layout.DETR, Layout.RF_DETR})
-#: Layouts whose input is BGR of 0 to 255 instead of RGB of 0 to 1.
+#: Layouts that take BGR from 0 to 255 instead of RGB from 0 to 1.
 RAW_BGR: Final = frozenset({Layout.YOLOX, Layout.YOLOX_DECODED})
-#: Layouts with overlapping boxes, which need suppression.
+#: Layouts whose boxes overlap and need suppression.
 SUPPRESSED: Final = frozenset({Layout.YOLO5, Layout.YOLO8, Layout.YOLOX, Layout.YOLOX_DECODED})
 
 _STRIDES: Final = ((8, 16, 32), (8, 16, 32, 64))  # grids of YOLOX models [px]
-_FEW: Final = 1000  # queries of a network without suppression: 100 to 900, mostly 300
+_FEW: Final = 1000  # maximum number of queries of a network without suppression (usual: 100 to 900, mostly 300)
 
 Array = NDArray[np.generic]
 Outputs = Mapping[str, Array]
@@ -53,18 +53,18 @@ Outputs = Mapping[str, Array]
 class Found:
     """Rows of a network's output: candidate detections."""
 
-    corners: Floats  #: (n, 4) left, top, right, bottom, in pixels of the network's input
-    scores: Floats  #: (n,) 0 to 1
+    corners: Floats  #: left, top, right, bottom in pixels of the network's input, (n, 4)
+    scores: Floats  #: scores, 0 to 1, (n,)
     classes: NDArray[np.int64]  #: (n,)
 
 
 def grid_places(width: int, height: int) -> tuple[int, ...]:
-    """Return the possible numbers of grid cells of an input [px]: with strides up to 32 and up to 64."""
+    """Return the possible numbers of grid cells of an input [px], first for strides up to 32, then up to 64."""
     return tuple(sum((width // s) * (height // s) for s in strides) for strides in _STRIDES)
 
 
 def describe(outputs: Outputs) -> str:
-    """Describe the names and shapes of outputs, for error messages."""
+    """Describe the names and shapes of outputs for an error message."""
     return ", ".join(f"{name} {tuple(value.shape)}" for name, value in outputs.items()) or "none"
 
 
@@ -72,13 +72,13 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
     """Recognise a network's layout from its outputs.
 
     Args:
-        outputs: Outputs by name, of one run on any image.
+        outputs: Outputs by name, from one run on any image.
         width: Width of the network's input [px].
         height: Height of the network's input [px].
-        classes: Number of known class names; None: none.
+        classes: Number of known class names; None if there are none.
 
     Raises:
-        FileFormatError: The outputs fit no family, or more than one.
+        FileFormatError: The outputs fit none of the families, or several.
     """
     if len(outputs) == 3:
         _lists(outputs)
@@ -120,7 +120,7 @@ def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None =
 
 
 def class_count(layout: Layout, outputs: Outputs) -> int | None:
-    """Return the number of classes with scores; None if the outputs give class numbers instead."""
+    """Return the number of classes that have scores; None if the outputs give class numbers instead."""
     if layout in (Layout.END_TO_END, Layout.LISTS):
         return None
     if layout in (Layout.DETR, Layout.RF_DETR):
@@ -132,7 +132,7 @@ def class_count(layout: Layout, outputs: Outputs) -> int | None:
 
 
 def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
-    """Turn a network's outputs into boxes, scores and classes. Rows with values that are not finite pass unchanged.
+    """Decode a network's outputs into boxes, scores and classes. Rows with non-finite values pass unchanged.
 
     Args:
         layout: Layout of the outputs.
@@ -141,7 +141,7 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
         height: Height of the network's input [px].
 
     Raises:
-        FileFormatError: The outputs don't have the shapes of this layout.
+        FileFormatError: The shapes of the outputs don't match the layout.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # hostile numbers become infinite and are dropped later
         if layout is Layout.LISTS:
@@ -179,7 +179,7 @@ def _unknown(outputs: Outputs) -> FileFormatError:
 
 
 def _single(outputs: Outputs, layout: Layout) -> Array:
-    """Return the only output, of one image; if the first fits, ignore others (of a training head)."""
+    """Return the only output for one image; if the first one fits, ignore others (of a training head)."""
     values = next(iter(outputs.values()), None)
     if values is None or values.ndim != 3 or values.shape[0] != 1:
         raise FileFormatError(
@@ -204,7 +204,7 @@ def _numbers(values: Array) -> Floats:
 
 
 def _pair(outputs: Outputs) -> tuple[Array, Array]:
-    """Distinguish boxes from logits, by name if both may be boxes."""
+    """Tell boxes from logits, by name if both could be boxes."""
     shapes = [value.shape for value in outputs.values()]
     if len(shapes) != 2 or any(len(s) != 3 or s[0] != 1 for s in shapes) or shapes[0][1] != shapes[1][1]:
         raise _unknown(outputs)
@@ -218,7 +218,7 @@ def _pair(outputs: Outputs) -> tuple[Array, Array]:
 
 
 def _lists(outputs: Outputs) -> tuple[Floats, Floats, Floats]:
-    """Return boxes (n, 4), scores (n) and labels (n), without a leading axis of one image."""
+    """Return boxes (n, 4), scores (n) and labels (n), after removing a leading axis for a single image."""
     single = {name.lower(): _numbers(value) for name, value in outputs.items()}
     single = {name: value[0] if value.ndim > 1 and value.shape[0] == 1 else value for name, value in single.items()}
     boxes = [value for name, value in single.items() if "box" in name]
@@ -234,7 +234,7 @@ def _lists(outputs: Outputs) -> tuple[Floats, Floats, Floats]:
 
 
 def _shares(boxes: Floats) -> bool:
-    """Return whether centres and sizes are shares of the image, even for queries that found nothing."""
+    """Return whether centres and sizes are fractions of the image, even those of queries that found nothing."""
     finite = boxes[np.isfinite(boxes).all(axis=1)]
     return bool(len(finite)) and bool(((finite >= -0.5) & (finite <= 1.5)).all())
 
@@ -257,7 +257,7 @@ def _shared(boxes: Floats, scores: Floats, width: int, height: int) -> Found:
 
 
 def _surest(corners: Floats, scores: Floats) -> Found:
-    """Take each row's best class; NaN counts as the best, so that the row is dropped later."""
+    """Take each row's best class. NaN counts as the best, so that its row is dropped later."""
     if not len(scores):
         return Found(corners, np.zeros(0), np.zeros(0, np.int64))
     classes = np.argmax(scores, axis=1)
@@ -269,7 +269,7 @@ def _whole(labels: Floats) -> NDArray[np.int64]:
 
 
 def _grid(rows: int, width: int, height: int, outputs: Outputs) -> tuple[Floats, Floats]:
-    """Return each grid cell's corner and stride [px], (n, 2) and (n, 1)."""
+    """Return the corner and stride of each grid cell [px], (n, 2) and (n, 1)."""
     for strides, places in zip(_STRIDES, grid_places(width, height), strict=True):
         if places == rows:
             return _places(strides, width, height)
@@ -290,7 +290,7 @@ def _places(strides: Sequence[int], width: int, height: int) -> tuple[Floats, Fl
 
 
 def _decoded(rows: Floats, width: int, height: int) -> bool:
-    """Return whether centres are in pixels, near their grid cells, rather than offsets from these."""
+    """Return whether centres are in pixels, near their grid cells, rather than offsets from those cells."""
     strides = _STRIDES[grid_places(width, height).index(len(rows))]
     corners, sizes = _places(strides, width, height)
     with np.errstate(invalid="ignore"):
@@ -300,7 +300,7 @@ def _decoded(rows: Floats, width: int, height: int) -> bool:
 
 
 def layout_named(name: str | Layout | None) -> Layout | None:
-    """Check the name of a layout.
+    """Check a layout's name.
 
     Raises:
         UsageError: There is no such layout.

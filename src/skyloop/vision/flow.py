@@ -1,10 +1,10 @@
-"""Visual odometry of a camera that looks down, by the optical flow of the ground.
+"""Visual odometry from the optical flow of the ground, for a camera that looks down.
 
 Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from frame to frame by pyramidal
 Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forward and back.
-The attitude levels each ray, which meets the ground at the height that the vehicle measures. A corner first seen from a
-known position gives the vehicle's current one; the result is the median of all corners. The position drifts only as
-corners leave the image and new ones replace them.
+Each ray is levelled by the attitude and intersected with the ground at the measured height. A corner first seen from a
+known position gives the vehicle's current one, and the result is the median over all corners. The position drifts only
+as corners leave the image and new ones replace them.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from skyloop.vision.planar import checked
 
 Array = NDArray[np.float64]
 
-_MOST: Final = 80  # corners tracked
-_ENOUGH: Final = 8  # corners needed for a position
-_REFILL: Final = 50  # detect new corners when fewer remain
-_APART_PX: Final = 12  # least distance between corners
-_RETURN_PX: Final = 0.7  # a corner tracked forward and back must return within this distance
-_LOWEST_M: Final = 0.15  # closer to the ground there is nothing to track
+_MOST: Final = 80  # maximum number of tracked corners
+_ENOUGH: Final = 8  # minimum number of corners for a position
+_REFILL: Final = 50  # number of corners below which new ones are detected
+_APART_PX: Final = 12  # minimum distance between corners
+_RETURN_PX: Final = 0.7  # maximum distance between a corner and where it returns after tracking forward and back
+_LOWEST_M: Final = 0.15  # minimum height; any closer to the ground, the image has no corners to track
 
 
 class GroundTracker:
-    """Tracks the ground in a downward camera's frames, and computes the vehicle's position relative to its start.
+    """Tracks the ground in a downward camera's frames and computes the vehicle's position relative to its start.
 
     Attributes:
-        place: Position as of the last frame, (2,) [m], along yaw 0 and to its left.
+        place: Position at the last frame, (2,) [m]: along yaw 0, and to the left of that direction.
     """
 
     def __init__(self, camera: CameraInfo) -> None:
         """Initialise the tracker.
 
         Args:
-            camera: The camera, with its mounting.
+            camera: The camera, including its mounting.
 
         Raises:
             UsageError: The camera's mounting is unknown.
@@ -53,16 +53,16 @@ class GroundTracker:
         self._offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m, np.float64)
         self._grey: NDArray[np.uint8] | None = None
         self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
-        self._ground = np.empty((0, 2))  # their places on the ground, in the axes of `place`
-        self.place = np.zeros(2)  #: the vehicle's position, along yaw 0 and to its left [m], as of the last frame
+        self._ground = np.empty((0, 2))  # positions of the corners on the ground, in the axes of `place`
+        self.place = np.zeros(2)  #: the vehicle's position at the last frame: along yaw 0 and to the left [m]
 
     @property
     def points(self) -> tuple[tuple[float, float], ...]:
-        """The tracked corners, pixels in the last frame."""
+        """The tracked corners in the last frame [px]."""
         return tuple((float(x), float(y)) for x, y in self._corners)
 
     def forget(self) -> None:
-        """Forget all corners; the next frame restarts at the current position."""
+        """Drop all corners, so that tracking restarts at the current position with the next frame."""
         self._grey, self._corners, self._ground = None, np.empty((0, 2), np.float32), np.empty((0, 2))
 
     def see(
@@ -72,12 +72,12 @@ class GroundTracker:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            at_capture: Feedback with attitude and altitude at the capture.
-            intrinsics: Intrinsics of the camera; None takes the frame's.
+            at_capture: Feedback with the attitude and altitude at the time of capture.
+            intrinsics: Intrinsics of the camera; None uses the frame's own.
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too
-            few corners were found again, and if attitude or height is unknown; tracking then restarts at the last
+            few corners were found again, or if the attitude or height is unknown; tracking then restarts at the last
             position.
 
         Raises:
@@ -87,7 +87,7 @@ class GroundTracker:
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
         height = at_capture.altitude_m
         known = (height, at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
-        # A value that is not finite would stay in the position for good.
+        # A value that is not finite would stay in the position forever.
         if height is None or height < _LOWEST_M or any(one is None or not math.isfinite(one) for one in known):
             self.forget()
             return None
@@ -137,7 +137,7 @@ class GroundTracker:
     def _below(
         self, corners: NDArray[Any], at_capture: Feedback, intrinsics: Intrinsics
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Return where the corners' rays meet the ground, relative to the vehicle, (n, 2) [m], and which rays do."""
+        """Return where the corners' rays hit the ground, relative to the vehicle, (n, 2) [m], and which rays hit it."""
         if not len(corners):
             return np.empty((0, 2)), np.empty(0, np.bool_)
         rays = normalised(np.asarray(corners, np.float64), intrinsics)

@@ -1,9 +1,9 @@
-"""Detection of things of one colour, of gates of a known size with their poses, and of upright poles.
+"""Detection of objects of one colour, of gates of a known size with their poses, and of upright poles.
 
-A gate is a frame of one colour around an opening. A hole in that colour's mask that is bounded by four straight sides
-is an opening. After the lens distortion is removed, lines are fitted to the hole's edge (OpenCV's ``fitLine`` with
-Huber's weights), so that the corners, their intersections, are accurate to less than a pixel. The pose is IPPE (Collins
-and Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
+A gate is a frame of one colour around an opening: a hole in that colour's mask with four straight sides. After the lens
+distortion is removed, lines are fitted to the hole's edge (OpenCV's ``fitLine`` with Huber's weights) and intersected,
+so that the corners are accurate to less than a pixel. The pose is computed by IPPE (Collins and Bartoli,
+"Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, re
 
 Rgb = tuple[int, int, int]
 
-_HUE_DEG: Final = 16.0  # tolerance on each side of the colour's own hue
-_SATURATION: Final = 0.5  # share of the colour's own saturation: covers paint in light and shade
-_LEAST_SATURATION: Final = 80  # 0 to 255: a colour with less is too grey to distinguish
+_HUE_DEG: Final = 16.0  # tolerance on either side of the colour's hue
+_SATURATION: Final = 0.5  # minimum saturation as a fraction of the colour's own; covers paint in light and shade
+_LEAST_SATURATION: Final = 80  # 0 to 255: a less saturated colour is too grey to distinguish
 _LEAST_VALUE: Final = 35  # 0 to 255: darker pixels have no reliable hue
-_LEAST_AREA_PX: Final = 150.0  # smaller openings say little about the distance
-_FARTHEST_M: Final = 8.0  # anything further away is more likely a patch of the same colour
-_SIDE_SHARE: Final = 0.15  # share of each side left out at both ends, because corners look round
-_FILLED: Final = 0.6  # least share of the four-sided hull: a like-coloured thing behind may reach into the hole
-_OFF_PX: Final = 1.5  # greatest root mean square distance of the edge from its four sides
-_LEAST_HEIGHT_PX: Final = 20  # least height of a pole
-_SLIM: Final = 3.0  # least ratio of a pole's height to its width
-_ABOVE_PX: Final = 6  # searched above a pole for something that hides its top
-_COLOURFUL: Final = 100  # saturation, 0 to 255
-_LEAST_SHARE: Final = 0.8  # least share of a pole's rows that are one piece; two overlapping poles are not
+_LEAST_AREA_PX: Final = 150.0  # minimum area; smaller openings are unreliable for the distance
+_FARTHEST_M: Final = 8.0  # maximum distance; anything further away is more likely a patch of the same colour
+_SIDE_SHARE: Final = 0.15  # fraction of each side left out at both ends, because corners look rounded
+_FILLED: Final = 0.6  # minimum fraction of the hull: similarly coloured objects behind may reach into the hole
+_OFF_PX: Final = 1.5  # maximum RMS distance between the edge and its four sides
+_LEAST_HEIGHT_PX: Final = 20  # minimum height of a pole
+_SLIM: Final = 3.0  # minimum ratio of a pole's height to its width
+_ABOVE_PX: Final = 6  # height of the area above a pole that is searched for something hiding its top
+_COLOURFUL: Final = 100  # saturation from which a pixel counts as colourful, 0 to 255
+_LEAST_SHARE: Final = 0.8  # minimum fraction of a pole's rows in one piece, unlike two overlapping poles
 
 
 class ColourMask:
-    """Selects pixels by hue, with enough saturation, at any brightness."""
+    """Selects pixels by hue at any brightness, if their saturation is high enough."""
 
     def __init__(self, colour: Rgb) -> None:
         """Prepare the mask.
@@ -61,7 +61,7 @@ class ColourMask:
         self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
 
     def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the mask of a BGR image (h, w, 3): 255 where it has the colour, 0 elsewhere, (h, w), uint8."""
+        """Return the mask (h, w), uint8, of a BGR image (h, w, 3): 255 where the pixel has the colour, otherwise 0."""
         cv = self._cv
         hsv = cv.cvtColor(cv.GaussianBlur(pixels, (3, 3), 0), cv.COLOR_BGR2HSV)
         reach = round(_HUE_DEG / 2)  # OpenCV's hue has 180 steps per turn
@@ -73,25 +73,25 @@ class ColourMask:
 
 @dataclass(frozen=True, slots=True)
 class BlobSighting:
-    """One thing of a colour in one image."""
+    """One object of a colour in one image."""
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
-    left_rad: float  #: its left edge, from the optical axis, positive to the left
-    right_rad: float  #: its right edge, likewise: less than the left one
+    left_rad: float  #: angle of the left edge from the optical axis, positive to the left
+    right_rad: float  #: angle of the right edge, with the same sign: less than `left_rad`
 
     @property
     def bearing_rad(self) -> float:
-        """Angle of its middle from the optical axis, positive to the left."""
+        """Angle of the object's middle from the optical axis, positive to the left."""
         return (self.left_rad + self.right_rad) / 2
 
     @property
     def width_rad(self) -> float:
-        """Its apparent width."""
+        """Apparent width of the object."""
         return self.left_rad - self.right_rad
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
-        """The corners of its box, for annotations."""
+        """The corners of the box, for annotations."""
         left, top, right, bottom = self.box
         return (left, top), (right, top), (right, bottom), (left, bottom)
 
@@ -104,7 +104,7 @@ class BlobDetector:
 
         Args:
             colour: Red, green, blue, 0 to 255.
-            least_px: Ignore areas narrower or lower than this.
+            least_px: Ignore areas narrower or lower than this [px].
 
         Raises:
             UsageError: The colour is invalid, or too grey to have a hue.
@@ -115,11 +115,11 @@ class BlobDetector:
         self._least_px = least_px
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[BlobSighting]:
-        """Detect everything of the colour.
+        """Detect all objects of the colour.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None uses the frame's own.
 
         Returns:
             The sightings, the widest first.
@@ -142,11 +142,11 @@ class BlobDetector:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GateSighting(PlanarSighting):
-    """One gate's opening in one image; its face is the visible side."""
+    """The opening of one gate in one image; its face is the visible side."""
 
 
 class GateDetector:
-    """Detects gates of one colour and one opening size, in images that are upright within about 30°.
+    """Detects gates of one colour and one opening size in images that are upright to within about 30°.
 
     Attributes:
         colour: Red, green, blue, 0 to 255.
@@ -177,7 +177,7 @@ class GateDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None uses the frame's own.
 
         Returns:
             The sightings, the nearest first.
@@ -190,7 +190,7 @@ class GateDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.distance_m)
 
     def _holes(self, mask: NDArray[np.uint8]) -> list[Array]:
-        """Return the edges of the holes, each (n, 2) pixels: the innermost pixels of the gate's frame."""
+        """Return the edges of the mask's holes, each (n, 2) pixels: the innermost pixels of the gate's frame."""
         contours, tree = self._cv.findContours(mask, self._cv.RETR_CCOMP, self._cv.CHAIN_APPROX_NONE)
         if tree is None:
             return []
@@ -201,7 +201,7 @@ class GateDetector:
         ]
 
     def _sighting(self, edge: Array, intrinsics: Intrinsics) -> GateSighting | None:
-        """Return the opening bounded by a hole's edge; None if the hole is not an opening."""
+        """Return the opening that a hole's edge bounds; None if the hole is not an opening."""
         rough = self._four_corners(edge)
         if rough is None:
             return None
@@ -215,7 +215,7 @@ class GateDetector:
         return GateSighting(corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)
 
     def _four_corners(self, edge: Array) -> Array | None:
-        """Return rough corners, (4, 2) pixels, from the top left clockwise; None for another shape."""
+        """Return rough corners, (4, 2) pixels, clockwise from the top left; None for any other shape."""
         cv = self._cv
         hull = cv.convexHull(edge.astype(np.float32))
         length = cv.arcLength(hull, True)
@@ -231,7 +231,7 @@ class GateDetector:
         return np.asarray(np.roll(clockwise, -first, axis=0), np.float64)
 
     def _meeting_sides(self, edge: Array, rough: Array, intrinsics: Intrinsics) -> Array | None:
-        """Return x/z and y/z of the corners where the sides' lines meet, (4, 2); None unless all sides are straight."""
+        """Return x/z and y/z of the sides' intersections, (4, 2); None unless all sides are straight."""
         lines = []
         for begin, end in zip(rough, np.roll(rough, -1, axis=0), strict=True):
             side = _along(edge, begin, end)
@@ -241,14 +241,14 @@ class GateDetector:
             if not np.isfinite(flat).all():
                 return None
             vx, vy, x, y = np.ravel(self._cv.fitLine(flat.astype(np.float32), self._cv.DIST_HUBER, 0, 0.01, 0.001))
-            normal = np.array([-vy, vx])  # into the opening: the corners go clockwise, and y is down
+            normal = np.array([-vy, vx])  # points into the opening, because the corners are clockwise and y is down
             along = normalised(np.array([begin, end]), intrinsics)
             if float(normal @ np.array([-(along[1] - along[0])[1], (along[1] - along[0])[0]])) < 0:
                 normal = -normal
             off = (flat - (x, y)) @ normal * intrinsics.fx
             if math.sqrt(float(np.mean(off**2))) > _OFF_PX:
                 return None
-            # The edge's pixels still belong to the frame: the opening begins half a pixel further in.
+            # The edge's pixels still belong to the frame, so the opening begins half a pixel further in.
             lines.append(np.array([*normal, -float(normal @ (x, y)) - 0.5 / intrinsics.fx]))
         meeting = [np.cross(before, after) for before, after in zip(lines[-1:] + lines[:-1], lines, strict=True)]
         if any(abs(point[2]) < 1e-6 for point in meeting):
@@ -257,7 +257,7 @@ class GateDetector:
 
 
 def _along(edge: Array, begin: Array, end: Array) -> Array:
-    """Return the edge's points along one side, without the ends, (n, 2)."""
+    """Return the edge's points along one side, excluding both ends, (n, 2)."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length < 1.0:
@@ -274,9 +274,9 @@ class PoleSighting:
     """One pole in one image.
 
     Attributes:
-        top: The middle of its upper end, (2,) pixels.
+        top: The middle of the pole's upper end, (2,) pixels.
         ray: Ray through the top, in optical axes, (3,), z = 1.
-        width_px: Width at half its height.
+        width_px: Width at half the pole's height.
     """
 
     top: Array
@@ -290,7 +290,7 @@ class PoleSighting:
 
 
 class PoleDetector:
-    """Detects poles of one colour, in images that are upright within about 30°."""
+    """Detects poles of one colour in images that are upright to within about 30°."""
 
     def __init__(self, colour: Rgb) -> None:
         """Prepare the detector.
@@ -310,7 +310,7 @@ class PoleDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
-            intrinsics: Intrinsics of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None uses the frame's own.
 
         Returns:
             The sightings, the widest first.
@@ -339,14 +339,14 @@ class PoleDetector:
         return sorted(found, key=lambda one: -one.width_px)
 
     def _hidden(self, pixels: NDArray[np.uint8], x: float, y: int) -> bool:
-        """Return whether something colourful is right above: probably a gate's bar that hides the top."""
+        """Return whether something colourful is directly above: probably a gate's bar that hides the top."""
         column = min(max(round(x), 0), pixels.shape[1] - 1)
         above = pixels[max(0, y - _ABOVE_PX) : max(1, y - 1), column : column + 1]
         return bool((self._cv.cvtColor(above, self._cv.COLOR_BGR2HSV)[..., 1] > _COLOURFUL).any())
 
 
 def _line(shape: NDArray[np.bool_]) -> tuple[float, float] | None:
-    """Return a leaning pole's top, from the left, and its width; None if it is not one piece."""
+    """Return the top of a leaning pole, measured from the left, and its width; None if it is not in one piece."""
     rows = np.arange(len(shape))
     first, last = shape.argmax(axis=1), shape.shape[1] - 1 - shape[:, ::-1].argmax(axis=1)
     whole = shape.any(axis=1) & (shape.sum(axis=1) == last - first + 1)

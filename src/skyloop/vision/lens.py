@@ -1,4 +1,4 @@
-"""Lens models: directions to pixels and back, and images without distortion.
+"""Lens models: conversion between directions and pixels, and removal of distortion from images.
 
 OpenCV's models: ``pinhole`` with Brown and Conrady's distortion (``calib3d``: k1, k2, p1, p2, k3, …) and ``fisheye``
 (Kannala and Brandt, "A Generic Camera Model and Calibration Method", IEEE PAMI 28(8), 2006: an odd polynomial of the
@@ -18,23 +18,23 @@ from skyloop.messages import Intrinsics
 from skyloop.vision.opencv import opencv
 
 Array = NDArray[np.float64]
-_WIDEST = 1e-9  # z over distance; below this a point is beside or behind the camera
-_STEEPEST = 3.0  # x/z, 72°: a wider ideal camera would show little but its edges
-_DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which a distortion is sampled
-_RETURN_PX = 0.01  # greatest error of an inverted distortion when projected back
-_ITERATIONS = (40, 1e-10)  # iterations and accuracy of a distortion's inverse
+_WIDEST = 1e-9  # z divided by distance: at smaller values a point is beside or behind the camera
+_STEEPEST = 3.0  # x/z, 72°: an even wider ideal camera would show little but its edges
+_DISTANCES = np.linspace(0.0, 20.0, 20_001)  # values of x/z at which the distortion is sampled
+_RETURN_PX = 0.01  # maximum error of an inverted distortion after projecting it back
+_ITERATIONS = (40, 1e-10)  # iterations and accuracy of the distortion's inversion
 
 
 def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
     """Project points into the image.
 
     Args:
-        points: Shape (n, 3) in optical axes; points or directions of any length.
+        points: Shape (n, 3) in optical axes; either points, or directions of any length.
         intrinsics: Intrinsics of the camera.
 
     Returns:
-            Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole, or beyond the angle at
-            which the lens polynomial turns back.
+            Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole camera or beyond
+            the angle at which the lens polynomial turns back.
 
     Raises:
         UsageError: The shape is wrong, or the model is unknown.
@@ -62,7 +62,7 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
         intrinsics: Intrinsics of the camera.
 
     Returns:
-        The directions; NaN where the model has none.
+        The directions; NaN for pixels that have none in the model.
 
     Raises:
         UsageError: The shape is wrong, or the model is unknown.
@@ -101,9 +101,9 @@ def undistort(
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
-        intrinsics: Intrinsics of the camera; None takes the frame's.
-        balance: From 0, which shows only valid pixels, to 1, which shows everything that the camera saw, with black
-            around it.
+        intrinsics: Intrinsics of the camera; None uses the frame's own.
+        balance: 0 shows only valid pixels; 1 shows everything that the camera saw, surrounded by black; values in
+            between are allowed.
 
     Returns:
         The image of an ideal pinhole camera, and that camera's intrinsics.
@@ -130,7 +130,7 @@ def undistort(
 
 @lru_cache(maxsize=8)
 def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tuple[Intrinsics, Any, Any]:
-    """Return the ideal camera and the sampling maps of its pixels; cached for each camera."""
+    """Return the ideal camera and the sampling maps of its pixels. Cached for each camera."""
     cv, size, turn = opencv("removing distortion"), (width, height), np.eye(3)
     focal = _focal_length(intrinsics, width, height, balance)
     ideal = Intrinsics(focal, focal, intrinsics.cx, intrinsics.cy)
@@ -142,9 +142,9 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Return the focal length of the ideal pinhole, between only valid pixels and the whole view."""
+    """Return the ideal pinhole's focal length, between showing only valid pixels and showing the whole view."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
-    reach = []  # distance of each side from the axis, with the least and greatest direction on it
+    reach = []  # distance between each side and the axis, with the least and greatest direction on that side
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
         side = np.full((len(along), 2), at)
         side[:, 1 - axis] = along
@@ -167,7 +167,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
     else:
         flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
     found = np.asarray(flat, dtype=np.float64).reshape(-1, 2)
-    # Beyond a lens's fold the iteration ends anywhere; reject results that don't project back.
+    # Beyond a lens's fold the iteration can end anywhere, so reject results that don't project back.
     back = project(np.column_stack([found, np.ones(len(found))]), intrinsics)
     found[~(np.abs(back - pixels).max(axis=1) < _RETURN_PX)] = np.nan
     return found
@@ -175,7 +175,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 @lru_cache(maxsize=64)
 def _fold(distortion: tuple[float, ...]) -> float:
-    """Return the distance from the axis, for f = 1, beyond which a pinhole's distortion folds back."""
+    """Return the distance from the axis (for f = 1) beyond which a pinhole model's distortion folds back."""
     k1, k2, _, _, k3, k4, k5, k6 = (*distortion, *(0.0,) * 8)[:8]
     if not any(distortion):
         return np.inf
@@ -186,7 +186,7 @@ def _fold(distortion: tuple[float, ...]) -> float:
 
 
 def _bent(points: Array, intrinsics: Intrinsics) -> Array:
-    """Return the pixels of directions in a fisheye."""
+    """Project directions through a fisheye lens and return their pixels."""
     aside = np.hypot(points[:, 0], points[:, 1])
     angle = np.arctan2(aside, points[:, 2])
     radius, slope = _polynomial(angle, intrinsics)
@@ -196,7 +196,7 @@ def _bent(points: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Return the viewing directions of a fisheye's pixels, by Newton's method on the angle to the axis."""
+    """Return the viewing directions of a fisheye's pixels, using Newton's method on the angle to the axis."""
     flat = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     radius = np.hypot(flat[:, 0], flat[:, 1])
     angle = np.minimum(radius, np.pi)
@@ -212,7 +212,7 @@ def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _polynomial(angle: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
-    """Return the image distance from the axis, for f = 1, at an angle to the axis, and its derivative."""
+    """Return the distance from the axis in the image (for f = 1) at an angle to the axis, and its derivative."""
     k1, k2, k3, k4 = _distortion(intrinsics)
     square = angle * angle
     value = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))

@@ -1,9 +1,9 @@
-"""Detections, common to all detectors, and objects: detections matched from image to image. Pure.
+"""Detections, in the form common to all detectors, and objects: detections matched from image to image. Pure.
 
-Detections are joined into objects with lasting numbers as in Zhang et al., "ByteTrack: Multi-Object Tracking by
-Associating Every Detection Box", ECCV 2022: confident detections are matched with all objects first, uncertain ones
-then with the remaining objects, because half-hidden things get low scores; only confident ones start an object. Each
-object has a Kalman filter of constant velocity on its box, here with real times instead of image counts, so that a
+Detections are joined into objects with permanent numbers as in Zhang et al., "ByteTrack: Multi-Object Tracking by
+Associating Every Detection Box", ECCV 2022: confident detections are matched with all objects first, then uncertain
+ones with the remaining objects, because half-hidden things get low scores. Only confident ones start an object. Each
+object's box has a constant-velocity Kalman filter, which uses real times here instead of image counts, so that a
 missed frame does no harm. The pairs come from SciPy's ``linear_sum_assignment``.
 """
 
@@ -22,20 +22,20 @@ from skyloop.estimation import assignment, corrected, drift
 from skyloop.vision.tracking import Box, Image, outline
 
 Floats = NDArray[np.float64]
-# Shares of the box's height, as in ByteTrack's filter, which counts 30 images a second.
+# Fractions of the box's height, as in ByteTrack's filter, which assumes 30 images a second.
 _POSITION: Final = 1 / 20  # standard deviation of a detection
 _SPEED: Final = 1.5  # initial standard deviation of the velocity [1/s]
-_WANDERING: Final = 0.8  # change of the velocity within a second
+_WANDERING: Final = 0.8  # standard deviation of the change in velocity within a second
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One thing that a detector found in one image."""
+    """One object that a detector found in one image."""
 
     box: Box  #: x, y, width, height [px] in the image, within its edges
-    score: float  #: 0 to 1, the detector's confidence; a score, not a probability
+    score: float  #: the detector's confidence, 0 to 1; a score, not a probability
     class_id: int  #: the detector's class number
-    class_name: str  #: class name; the number as text if the detector has no names
+    class_name: str  #: class name; its number as text if the detector has no names
 
     @property
     def centre(self) -> tuple[float, float]:
@@ -51,10 +51,10 @@ class Detection:
 
 @runtime_checkable
 class ObjectDetector(Protocol):
-    """Finds things of known classes in an image. Call a detector from one thread only."""
+    """Finds objects of known classes in an image. Call a detector from one thread only."""
 
     def detect(self, image: Image) -> list[Detection]:
-        """Return the things in the image, the most confident first.
+        """Return the objects in the image, the most confident first.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
@@ -63,7 +63,7 @@ class ObjectDetector(Protocol):
 
 
 def overlaps(one: Floats, others: Floats) -> Floats:
-    """Return each box's overlap with one box: intersection over union, 0 to 1.
+    """Return the overlap of each box with one box: intersection over union, 0 to 1.
 
     Args:
         one: (4,) left, top, right, bottom.
@@ -78,16 +78,16 @@ def overlaps(one: Floats, others: Floats) -> Floats:
 
 
 def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: float) -> NDArray[np.int64]:
-    """Keep the best of overlapping boxes, class by class (non-maximum suppression).
+    """Keep the best of several overlapping boxes, class by class (non-maximum suppression).
 
     Args:
         corners: (n, 4) left, top, right, bottom.
         scores: (n,).
         classes: (n,) class numbers.
-        iou: Boxes of a class with a larger overlap are the same thing.
+        iou: Boxes of a class that overlap more count as the same object.
 
     Returns:
-        The rows kept, the best first.
+        The numbers of the rows kept, the best first.
     """
     left = np.argsort(-scores, kind="stable")
     kept: list[int] = []
@@ -101,23 +101,23 @@ def suppress(corners: Floats, scores: Floats, classes: NDArray[np.int64], iou: f
 
 @dataclass(frozen=True, slots=True)
 class TrackedObject:
-    """One object at the time of the newest update."""
+    """An object at the time of the newest update."""
 
-    id: int  #: from 1; never reused
-    detection: Detection  #: the last detection, with its box
-    box: Box  #: x, y, width, height [px], filtered; predicted while the object is not seen
-    velocity: tuple[float, float]  #: velocity of the box's centre, right and down [px/s]
+    id: int  #: number of the object, from 1; never reused
+    detection: Detection  #: the last detection, including its box
+    box: Box  #: x, y, width, height [px], filtered, and predicted while the object is not seen
+    velocity: tuple[float, float]  #: velocity of the box's centre to the right and down [px/s]
     seen: bool  #: whether the object was detected in this image
-    age_s: float  #: since it was first detected [s]
-    unseen_s: float  #: since it was last detected [s]
+    age_s: float  #: time since the first detection [s]
+    unseen_s: float  #: time since the last detection [s]
 
 
 @dataclass(slots=True, eq=False)
 class _Object:
     number: int
     detection: Detection
-    state: Floats  # (2, 4): of centre x, centre y, width and height, position and velocity
-    covariance: Floats  # (2, 2), of each of the four
+    state: Floats  # (2, 4): position and velocity of the centre's x and y, the width and the height
+    covariance: Floats  # (2, 2), for each of the four
     first_s: float
     last_s: float
     hits: int = 1
@@ -125,7 +125,7 @@ class _Object:
 
 
 class ObjectTracks:
-    """Gives the detections of successive images numbers that stay with their objects. Not thread-safe."""
+    """Numbers the detections of successive images so that each object keeps its number. Not thread-safe."""
 
     def __init__(
         self,
@@ -136,15 +136,15 @@ class ObjectTracks:
         confirm: int = 2,
         keep_s: float = 1.5,
     ) -> None:
-        """Start without objects.
+        """Start with no objects.
 
         Args:
-            sure: Score from which a detection can start an object, 0 to 1. Let the detector return lower scores too
-                (``OnnxDetector(…, score=0.1)``): they continue objects.
-            overlap: Least overlap of an object's predicted box with a confident detection, 0 to 1.
-            overlap_unsure: The same with an uncertain one.
-            confirm: Detections after which an object is returned; 1 or more.
-            keep_s: How long an undetected object is remembered [s].
+            sure: Score from which a detection can start an object, 0 to 1. Have the detector return lower scores too
+                (``OnnxDetector(…, score=0.1)``), because they continue objects.
+            overlap: Minimum overlap of an object's predicted box with a confident detection, 0 to 1.
+            overlap_unsure: Minimum overlap with an uncertain detection, 0 to 1.
+            confirm: Number of detections after which an object is returned; 1 or more.
+            keep_s: Time for which an undetected object is remembered [s].
 
         Raises:
             UsageError: An argument is out of its range.
@@ -165,14 +165,14 @@ class ObjectTracks:
         self._next = 1
 
     def update(self, detections: Sequence[Detection], time_s: float) -> list[TrackedObject]:
-        """Match the next image's detections; return all objects, including those not seen now, by number.
+        """Match the next image's detections and return all objects by number, including those not seen in this image.
 
         Args:
-            detections: Detections in one image; those not finite or empty are ignored.
+            detections: Detections in one image; empty and non-finite ones are ignored.
             time_s: Capture time of the image [s], on any clock that never runs backwards.
 
         Raises:
-            UsageError: The time is not finite, or before that of the last update.
+            UsageError: The time is not finite, or earlier than in the last update.
         """
         if isinstance(time_s, bool) or not isinstance(time_s, int | float) or not math.isfinite(time_s):
             raise UsageError(f"time_s is {time_s!r} and must be a finite number of seconds")
@@ -186,7 +186,7 @@ class ObjectTracks:
         usable = [each for each in detections if _is_usable(each)]
         sure = [each for each in usable if each.score >= self._sure]
         unsure = [each for each in usable if each.score < self._sure]
-        # Unconfirmed objects come last, so that they take no detection from a known object.
+        # Unconfirmed objects come last, so that they can't take a detection from a known object.
         known = [each for each in self._objects if each.hits >= self._confirm]
         young = [each for each in self._objects if each.hits < self._confirm]
         known, sure = self._match(known, sure, self._overlap, time_s)
@@ -201,13 +201,13 @@ class ObjectTracks:
     def _match(
         self, objects: list[_Object], detections: list[Detection], least: float, time_s: float
     ) -> tuple[list[_Object], list[Detection]]:
-        """Update the objects found among the detections; return the unmatched ones of both."""
+        """Update the objects that match a detection; return the unmatched objects and detections."""
         if not objects or not detections:
             return objects, detections
         corners = np.array([_corners(each.box) for each in detections])
         agreement = np.stack([overlaps(each.corners, corners) for each in objects])
         classes = np.array([[a.detection.class_id == b.class_id for b in detections] for a in objects])
-        # Another class, or too little overlap, costs more than any sum of allowed pairs.
+        # A different class or too little overlap costs more than any sum of allowed pairs.
         allowed = classes & (agreement > least)
         cost = np.where(allowed, 1.0 - agreement, float(len(objects) + len(detections) + 1))
         pairs = [(int(i), int(j)) for i, j in zip(*self._assign(cost), strict=True) if allowed[i, j]]

@@ -1,6 +1,6 @@
-"""Networks from ONNX files, run on the CPU by ONNX Runtime, or by OpenCV as trackers.
+"""Networks loaded from ONNX files and run on the CPU by ONNX Runtime or, for trackers, by OpenCV.
 
-A network file is a stranger's program: before it is loaded here, a child process loads and runs it within limits.
+A network file is an untrusted program: before it is loaded here, a child process loads and runs it within limits.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, Final
 
 from skyloop.errors import FileFormatError, MissingExtraError
 
-CPU_S: Final = 20  #: CPU time to load a network and run it once
-MEMORY: Final = 4 << 30  #: bytes of address space, on top of four times the file's size
-_WAIT_S: Final = 300.0  # wall-clock limit, for a busy computer
+CPU_S: Final = 20  #: limit of CPU time for loading a network and running it once
+MEMORY: Final = 4 << 30  #: limit of address space in bytes, in addition to four times the file's size
+_WAIT_S: Final = 300.0  # wall-clock limit, long enough for a busy computer
 _REFUSED: Final = 3  # exit code of a child that printed the reason
 _OWN: Final = Path(__file__).with_name("weights")
-#: The child uses this process's module path, not the working directory, which may hold a stranger's files.
+#: The child uses this process's module path, not the working directory, which may hold untrusted files.
 _CHILD: Final = (
     "import sys; sys.path[:] = sys.argv[3:]; "
     "from skyloop.vision.onnx import run_alone; run_alone(int(sys.argv[1]), *sys.argv[2].splitlines())"
@@ -26,19 +26,19 @@ _CHILD: Final = (
 
 
 def load_network(path: Path, threads: int, purpose: str) -> tuple[tuple[type[Exception], ...], Any]:
-    """Load a network after a child process has loaded it and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
+    """Load a network after a child process has loaded and run it on zeros within :data:`CPU_S` and :data:`MEMORY`.
 
     Args:
         path: The ONNX file.
-        threads: CPU threads of one run.
+        threads: CPU threads for one run.
         purpose: The feature that needs it; a noun phrase for the error message.
 
     Returns:
-        The exceptions that running it raises, and ONNX Runtime's session.
+        The exceptions that running the network can raise, and ONNX Runtime's session.
 
     Raises:
         MissingExtraError: ONNX Runtime is not installed.
-        FileFormatError: It is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
+        FileFormatError: The file is not an ONNX file, ONNX Runtime can't load it, or it exceeds the limits.
     """
     try:
         import onnxruntime
@@ -66,11 +66,11 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits.
 
     Args:
-        files: One file; one or two for a tracker.
-        tracker: Name of the OpenCV tracker whose weights they are; empty: ONNX Runtime loads the file.
+        files: The network's file; one or two for a tracker.
+        tracker: Name of the OpenCV tracker that the weights are for; empty to load the file in ONNX Runtime.
 
     Raises:
-        FileFormatError: It can't be loaded within the limits.
+        FileFormatError: The network can't be loaded within the limits.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
@@ -91,7 +91,7 @@ def try_alone(*files: Path | str, tracker: str = "") -> None:
 
 
 def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
-    """Load a network and run it on zeros within limits; the main function of the child process."""
+    """Load a network and run it on zeros within limits. This is the main function of the child process."""
     if sys.platform != "win32":
         import resource
 
@@ -113,7 +113,7 @@ def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
 
 
 def _network(path: str) -> Callable[[], object]:
-    """Load a network; return a function that runs it on zeros."""
+    """Load a network and return a function that runs it on zeros."""
     import numpy as np
     import onnxruntime
 
@@ -130,7 +130,7 @@ def _network(path: str) -> Callable[[], object]:
 
 
 def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
-    """Load a tracker's weights; return a function that tracks with them in a black image."""
+    """Load a tracker's weights and return a function that tracks with them in a black image."""
     import numpy as np
 
     from skyloop.vision.opencv import opencv
@@ -140,7 +140,7 @@ def _tracker(name: str, files: Sequence[str]) -> Callable[[], object]:
 
 
 def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
-    """Create an OpenCV tracker by name with its weights: one file for ViTTrack, two for NanoTrack."""
+    """Create an OpenCV tracker by name and load its weights: one file for ViTTrack, two for NanoTrack."""
     settings = getattr(cv, f"{name}_Params")()
     if len(files) == 1:
         (settings.net,) = files
@@ -150,5 +150,5 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 
 def reason(error: Exception) -> str:
-    """Return the text of an exception on one line, shortened."""
+    """Return an exception's text, shortened and on one line."""
     return " ".join(str(error).split())[:300]  # OpenCV's `err` belongs to the class and holds the last error anywhere

@@ -1,4 +1,4 @@
-"""Detectors of the YOLO and DETR families from a user's ONNX file, run by ONNX Runtime on the CPU."""
+"""Detectors of the YOLO and DETR families, loaded from a user's ONNX file and run on the CPU by ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import Image
 
-_GREY: Final = 114  # padding of letterboxed images, as in the training of YOLO networks
-_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's, for RF-DETR
+_GREY: Final = 114  # padding of letterboxed images, as YOLO networks are trained with
+_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's mean, for RF-DETR
 _DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
-_SIDE: Final = 640  # default side of a network that takes any size
-_MOST_SIDE: Final = 4096  # limit of an input image [px]
-_MOST: Final = 1000  # best boxes compared with one another
+_SIDE: Final = 640  # default side for a network that takes any size
+_MOST_SIDE: Final = 4096  # maximum side of an input image [px]
+_MOST: Final = 1000  # number of best boxes to compare with one another
 _TYPES: Final = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 class OnnxDetector:
-    """Detects with a network of the YOLO or DETR family, recognised by its outputs. Call it from one thread.
+    """Runs a YOLO or DETR network, recognised by its outputs, as a detector. Call it from one thread.
 
     Attributes:
-        layout: The layout of the network's outputs.
-        names: Names of the classes by number.
+        layout: Layout of the network's outputs.
+        names: Class names by number.
         size: Width and height of the network's input [px].
-        dropped: Number of detections dropped because they were not finite, or their score was outside 0 to 1.
+        dropped: Number of detections dropped for values that were not finite or a score outside 0 to 1.
     """
 
     def __init__(
@@ -60,22 +60,22 @@ class OnnxDetector:
         layout: Layout | str | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        """Load the network and recognise its layout from a run on an empty image.
+        """Load the network and recognise its layout by running it on an empty image.
 
         Args:
             path: The ONNX file.
-            score: Drop detections with a lower score, 0 to 1.
-            iou: Merge boxes of one class that overlap more (intersection over union), 0 to 1.
-            names: Class names: a list, a mapping from numbers, or a text file with one per line. None: those in the
+            score: Minimum score of a detection, 0 to 1.
+            iou: Merge boxes of one class that overlap by more than this (intersection over union), 0 to 1.
+            names: Class names: a list, a mapping from numbers, or a text file with one per line. None uses those in the
                 file's metadata, as Ultralytics writes them, or the numbers.
-            threads: CPU threads per image; more than 1 takes CPU time from the rest of the flight.
-            layout: Layout of the outputs, if ambiguous.
+            threads: CPU threads per image; more than 1 takes CPU time away from other flight code.
+            layout: Layout of the outputs, in case it is ambiguous.
             size: Width and height of the input [px], for a network that takes any size.
 
         Raises:
             MissingExtraError: ONNX Runtime or OpenCV is not installed.
             UsageError: An argument is out of its range, or there is no such file.
-            FileFormatError: The file is not an ONNX file, or not of a known family.
+            FileFormatError: The file is not an ONNX file, or its network belongs to no known family.
         """
         for name, value in (("score", score), ("iou", iou)):
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 <= value <= 1.0:
@@ -109,7 +109,7 @@ class OnnxDetector:
             raise FileFormatError(f"{path}: {error}") from None
 
     def detect(self, image: Image) -> list[Detection]:
-        """Return the things in the image, the most confident first.
+        """Return the objects in the image, the most confident first.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey, of any size.
@@ -126,7 +126,7 @@ class OnnxDetector:
         return self._detections(found, scale, shift, (pixels.shape[1], pixels.shape[0]))
 
     def _fit(self, pixels: Image) -> tuple[Image, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the image fitted to the input size, its scale and its corner, x and y each."""
+        """Return the image fitted to the input size, its scale and its corner, the last two as x and y."""
         width, height = self.size
         rows, columns = pixels.shape[:2]
         if self.layout in STRETCHED:
@@ -142,7 +142,7 @@ class OnnxDetector:
         return canvas, np.array([wide / columns, high / rows]), np.array([left, top], np.float64)
 
     def _run(self, fitted: Image) -> dict[str, Any]:
-        values: Any = np.stack(self._cv.split(fitted))  # colours first: several times faster than a transposed copy
+        values: Any = np.stack(self._cv.split(fitted))  # channels first; several times faster than a transposed copy
         if self.layout not in RAW_BGR:
             values = values[::-1]
             if self._type is not np.uint8:
@@ -152,7 +152,7 @@ class OnnxDetector:
         tensor = np.ascontiguousarray(values[None], self._type)
         feed: dict[str, Any] = {self._input: tensor}
         for other in self._session.get_inputs():
-            if other.name != self._input:  # RT-DETR with its postprocessor: the image size of its boxes
+            if other.name != self._input:  # RT-DETR with its postprocessor takes the image size for its boxes
                 feed[other.name] = np.array([self.size], np.int64)
         try:
             results = self._session.run(None, feed)
@@ -187,7 +187,7 @@ class OnnxDetector:
     def _check_inputs(
         self, size: tuple[int, int] | None, metadata: Mapping[str, str]
     ) -> tuple[str, Any, tuple[int, int]]:
-        """Return the input's name, its type and its image size."""
+        """Return the input's name, type and image size."""
         inputs = self._session.get_inputs()
         extra = [each.name for each in inputs[1:] if each.name != "orig_target_sizes"]
         shown = ", ".join(f"{each.name} {each.type} {tuple(each.shape)}" for each in inputs) or "none"
@@ -205,7 +205,7 @@ class OnnxDetector:
         if size is None:
             asked = _literal(metadata.get("imgsz"))
             both = [int(each) for each in asked] if _is_pair(asked) else [_SIDE, _SIDE]
-            size = both[1], both[0]  # Ultralytics writes the height first
+            size = both[1], both[0]  # Ultralytics stores the height first
         elif any(own is not None and own != given for own, given in zip(fixed, size, strict=True)):
             raise UsageError(f"size is {size!r}, but {self._path} takes only {_shape(shape)}: leave size out")
         width, height = (given if own is None else own for own, given in zip(fixed, size, strict=True))
@@ -221,7 +221,7 @@ class OnnxDetector:
 
 
 def _names(text: str | None, path: Path) -> dict[int, str]:
-    """Read the class names in a file's metadata: a dict or list in Python notation, as Ultralytics writes it."""
+    """Read the class names from a file's metadata: a dict or list in Python notation, as Ultralytics writes it."""
     if text is None:
         return {}
     value = _literal(text)
@@ -249,7 +249,7 @@ def _given(names: Sequence[str] | Mapping[int, str] | Path | str) -> dict[int, s
 
 
 def _literal(text: str | None) -> Any:
-    """Parse a value in Python notation; None if malformed or too long."""
+    """Parse a value in Python notation; None if it is malformed or too long."""
     if text is None or len(text) > 1_000_000:
         return None
     try:

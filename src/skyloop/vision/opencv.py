@@ -1,4 +1,4 @@
-"""OpenCV, imported on first use, and its marker dictionaries."""
+"""OpenCV (imported on first use) and its marker dictionaries."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def marker_dictionary(cv: Any, dictionary: str) -> Any:
 
     Args:
         cv: The module ``cv2``.
-        dictionary: Name, with or without ``DICT_``, in upper or lower case.
+        dictionary: Name with or without ``DICT_``, in upper or lower case.
 
     Raises:
         UnknownNameError: OpenCV has no such dictionary.

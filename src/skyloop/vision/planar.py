@@ -1,6 +1,6 @@
-"""Poses of flat things of known size, such as gates, and detection of markers (ArUco and AprilTag).
+"""Poses of flat objects of known size, such as gates, and detection of markers (ArUco and AprilTag).
 
-Camera axes are optical: x right, y down, z forward. A flat thing's own axes are x right, y up, z out of its face.
+Camera axes are optical: x right, y down, z forward. A flat object's own axes are x right, y up, z out of its face.
 
 Markers are detected by OpenCV's ``ArucoDetector`` (Garrido-Jurado et al., "Automatic generation and detection of highly
 reliable fiducial markers under occlusion", Pattern Recognition 47(6), 2014); the pose is IPPE for squares (Collins and
@@ -32,21 +32,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PlanarSighting:
-    """One flat thing in one image."""
+    """One flat object in one image."""
 
-    corners: Array  #: (4, 2) pixels: the thing's top left, top right, bottom right, bottom left
-    position_m: Array  #: (3,) its centre in the camera's optical axes [m]
-    rotation: Array  #: (3, 3) from its own axes (x right, y up, z out of its face) to optical axes
-    ambiguity: float  #: fit of the second-best pose relative to the best: 0 not at all, 1 equally good
+    corners: Array  #: the object's top left, top right, bottom right, bottom left, (4, 2) pixels
+    position_m: Array  #: centre of the object in the camera's optical axes, (3,) [m]
+    rotation: Array  #: (3, 3), from the object's axes (x right, y up, z out of its face) to optical axes
+    ambiguity: float  #: how well the second-best pose fits: 0 not at all, 1 as well as the best
 
     @property
     def normal(self) -> Array:
-        """Unit vector out of its face, optical axes, shape (3,)."""
+        """Unit vector pointing out of the object's face, in optical axes, shape (3,)."""
         return self.rotation[:, 2]
 
     @property
     def pose(self) -> RigidTransform:
-        """Its pose in the camera's optical axes.
+        """Pose of the object in the camera's optical axes.
 
         Raises:
             MissingExtraError: SciPy is not installed.
@@ -55,7 +55,7 @@ class PlanarSighting:
 
     @property
     def distance_m(self) -> float:
-        """Distance from the camera's optical centre to its centre."""
+        """Distance between the camera's optical centre and the object's centre."""
         return float(np.linalg.norm(self.position_m))
 
     @property
@@ -64,7 +64,7 @@ class PlanarSighting:
         return tuple((float(x), float(y)) for x, y in self.corners)
 
     def position_in_body(self, camera: CameraInfo) -> Array:
-        """Return its centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
+        """Return the object's centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
 
         Raises:
             UsageError: The camera's mounting is unknown.
@@ -73,7 +73,7 @@ class PlanarSighting:
         return mounting_rotation(camera) @ self.position_m + offset
 
     def normal_in_body(self, camera: CameraInfo) -> Array:
-        """Return the unit vector out of its face in body axes, shape (3,).
+        """Return the unit vector pointing out of the object's face in body axes, shape (3,).
 
         Raises:
             UsageError: The camera's mounting is unknown.
@@ -83,19 +83,19 @@ class PlanarSighting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarPose:
-    """The pose of a flat thing in optical axes."""
+    """The pose of a flat object in optical axes."""
 
-    position: Array  #: (3,) [m]
-    rotation: Array  #: (3, 3)
+    position: Array  #: position of the centre, (3,) [m]
+    rotation: Array  #: rotation from the object's axes, (3, 3)
     ambiguity: float
 
     @classmethod
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
-        """Estimate the pose from four corners.
+        """Estimate the pose from the four corners.
 
         Args:
             cv: The module ``cv2``.
-            outline_m: The corners in the thing's own axes, (4, 3).
+            outline_m: The corners in the object's own axes, (4, 3).
             rays: x/z and y/z of each corner in the image, (4, 2).
             method: One of OpenCV's IPPE methods.
 
@@ -115,7 +115,7 @@ class PlanarPose:
 
 
 def rectangle(width_m: float, height_m: float) -> Array:
-    """Return the corners of a rectangle in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
+    """Return a rectangle's corners in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
     x, y = width_m / 2, height_m / 2
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
 
@@ -123,11 +123,11 @@ def rectangle(width_m: float, height_m: float) -> Array:
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """Check an image; return its pixels as a plain array, and its intrinsics.
+    """Check an image and return its pixels as a plain array, together with its intrinsics.
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
-        intrinsics: Intrinsics of the camera; None takes the frame's.
+        intrinsics: Intrinsics of the camera; None uses the frame's own.
         colour: Whether to refuse grey images.
 
     Raises:
@@ -141,7 +141,7 @@ def checked(
 
 
 def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
-    """Check an image; return its pixels as a plain array in the same memory.
+    """Check an image and return its pixels as a plain array that shares its memory.
 
     Args:
         image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
@@ -160,25 +160,25 @@ def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.u
     return pixels
 
 
-#: The largest dictionary of each family; it contains the smaller ones' markers under the same ids.
+#: The largest dictionary of each family, which contains the smaller ones' markers with the same ids.
 _FAMILIES: Final = (
     *("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original"),
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between tries (some 2 ms each at 320×240), only until a marker is found
-_FEW_IMAGES: Final = 30  #: images before a diagnosis
+_OTHERS_EVERY: Final = 8  #: images between attempts (some 2 ms each at 320×240), which end once a marker is found
+_FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerSighting(PlanarSighting):
-    """One marker in one image; its top left is that of the printed marker."""
+    """One marker in one image. Its top left is the printed marker's own."""
 
     id: int
 
 
 class MarkerDetector:
-    """Detects markers of one dictionary and one size. Holds OpenCV's scratch memory: use one detector per thread.
+    """Detects markers of one dictionary and one size. Keeps OpenCV's working memory, so use one detector per thread.
 
     Attributes:
         dictionary: The dictionary's name, as given.
@@ -193,7 +193,7 @@ class MarkerDetector:
             size_m: Edge of the black square.
 
         Raises:
-            UsageError: The size is not a finite number above 0.
+            UsageError: The size is not a finite number greater than 0.
             UnknownNameError: OpenCV has no such dictionary.
             MissingExtraError: OpenCV is not installed.
         """
@@ -206,15 +206,15 @@ class MarkerDetector:
         # The order and axes that SOLVEPNP_IPPE_SQUARE expects: x right, y up, z out of the face.
         self._square = rectangle(self.size_m, self.size_m)
         self._images = self._seen = 0
-        self._others: Counter[tuple[str, int]] = Counter()  # tags of other dictionaries, by family and id
+        self._others: Counter[tuple[str, int]] = Counter()  # count of tags from other dictionaries, by family and id
 
     def why_nothing(self) -> str:
         """Explain why no marker was found.
 
-        While no image has a marker, some of them are also searched for markers of other dictionaries.
+        As long as no image contains a marker, some images are also searched for markers of other dictionaries.
 
         Returns:
-            An explanation; empty after few images, or if any image had a marker.
+            An explanation; empty after only a few images, or if any image contained a marker.
         """
         if self._seen or self._images < _FEW_IMAGES:
             return ""
@@ -229,7 +229,7 @@ class MarkerDetector:
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
-            intrinsics: Intrinsics of the camera; None takes the frame's.
+            intrinsics: Intrinsics of the camera; None uses the frame's own.
 
         Returns:
             The sightings, ordered by id.
@@ -253,12 +253,12 @@ class MarkerDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
-        """Search for markers of another family, the next one each time."""
+        """Search for markers of another family, a different one each time."""
         known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
         parameters = self._cv.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0  # a square in the room must not pass for a tag
+        parameters.errorCorrectionRate = 0.0  # a square object in the room must not pass for a tag
         markers = marker_dictionary(self._cv, family)
         _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
         self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
@@ -277,7 +277,7 @@ class MarkerDetector:
 
 
 def _smallest(family: str, number: int) -> str:
-    """Return the smallest dictionary of a family that has a marker."""
+    """Return the smallest dictionary of a family that contains a marker."""
     kind, _, size = family.rpartition("_")
     return f"{kind}_{next(one for one in _SIZES if number < one)}" if size == "1000" else family
 
@@ -285,9 +285,9 @@ def _smallest(family: str, number: int) -> str:
 def _make_detector(cv: Any, dictionary: str) -> Any:
     markers = marker_dictionary(cv, dictionary)
     parameters = cv.aruco.DetectorParameters()
-    # Refine corners to a fraction of a pixel: a marker's range is only as good as its edges.
+    # Refine corners to a fraction of a pixel, because a marker's range is only as accurate as its edges.
     parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
-    # Half a cell each way: with OpenCV's 0.3, corners are 0.46 px off (median of 150 noisy poses), with this 0.31 px.
+    # Half a cell each way: corners are 0.31 px off (median of 150 noisy poses), with OpenCV's 0.3 they are 0.46 px off.
     parameters.relativeCornerRefinmentWinSize = 0.5
     # The white card's edge is another square near the marker's; with OpenCV's 0.125 it can hide the marker.
     parameters.minMarkerDistanceRate = 0.05

@@ -1,4 +1,4 @@
-"""Skyloop's own detector: people, cars and crates as the simulator draws them, and nothing else."""
+"""Skyloop's own detector for people, cars and crates as the simulator draws them, and for nothing else."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Final
 
 from skyloop.vision.onnx_detector import OnnxDetector
 
-#: Its network: 320×256 pixels, classes ``person``, ``car`` and ``box``. ``scripts/train_detector.py`` made it.
+#: The detector's network (320×256 px, classes ``person``, ``car``, ``box``), made by ``scripts/train_detector.py``.
 SIMULATED_WEIGHTS: Final = Path(__file__).with_name("weights") / "figures.onnx"
 
 
 def simulated_detector(*, score: float = 0.4, iou: float = 0.5, threads: int = 1) -> OnnxDetector:
-    """Return a detector of the simulator's figures: ``person``, ``car``, and ``box`` for a crate.
+    """Return a detector for the simulator's figures: ``person``, ``car``, and ``box`` for a crate.
 
-    It was trained only on rendered images and is useless on a real drone's.
+    It was trained on rendered images only and is useless on images from a real drone.
 
     Args:
-        score: Drop detections with a lower score, 0 to 1.
-        iou: Merge boxes of one class that overlap more, 0 to 1.
+        score: Minimum score of a detection, 0 to 1.
+        iou: Merge boxes of one class that overlap by more than this, 0 to 1.
         threads: CPU threads per image.
 
     Raises:

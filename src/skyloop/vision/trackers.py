@@ -1,19 +1,19 @@
-"""Trackers of a box from image to image: by a correlation filter, by the flow of points, and learned ones.
+"""Trackers that follow a box from image to image by a correlation filter, by the flow of points, or by a network.
 
-**Correlation.** A filter is learned whose correlation with the patch around the target has a narrow peak at its middle.
-It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using adaptive
-correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the target
-(Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37, 2015; its
-linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan, Häger, Khan
-and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
+**Correlation.** A filter is learned whose correlation with the patch around the target has a narrow peak at the middle
+of the patch. It is a product in the Fourier domain (Bolme, Beveridge, Draper and Lui, "Visual object tracking using
+adaptive correlation filters", CVPR 2010), over several channels of gradients and colours and a patch larger than the
+target (Henriques, Caseiro, Martins and Batista, "High-speed tracking with kernelized correlation filters", TPAMI 37,
+2015; its linear kernel). The size is tracked by a second, one-dimensional filter over patches of 17 sizes (Danelljan,
+Häger, Khan and Felsberg, "Accurate scale estimation for robust visual tracking", BMVC 2014).
 
 **Median flow.** Kalal, Mikolajczyk and Matas, "Forward-backward error: automatic detection of tracking failures", ICPR
-2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. Of the half that returns closest
-to its start, the half whose surroundings look most alike give the motion by the median of their displacements, and the
-scale by the median change of their distances.
+2010: a grid of points is tracked to the next image and back by pyramidal Lucas-Kanade. The half of the points that
+return closest to their start is kept, and of these the half whose surroundings look most alike. Their median
+displacement gives the motion, and the median change of the distances between them gives the scale.
 
-**Learned.** ViTTrack (``cv2.TrackerVit``) is one ONNX file, NanoTrack (``cv2.TrackerNano``) two: backbone, and neck and
-head.
+**Learned.** ViTTrack (``cv2.TrackerVit``) is a single ONNX file. NanoTrack (``cv2.TrackerNano``) is two: the backbone,
+and the neck with the head.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ from skyloop.vision.tracking import CELL, Box, Floats, Image, Tracker, TrackResu
 
 Spectrum = NDArray[np.complex64]
 
-_AREA_PX: Final = 128.0**2  # size of the sampled patch around the target
-_CONTEXT: Final = 1.5  # margin added to width and height, times the root of the target's area
+_AREA_PX: Final = 128.0**2  # area of the sampled patch around the target
+_CONTEXT: Final = 1.5  # margin added to width and height, as a multiple of the square root of the target's area
 _RATE: Final = 0.02  # learning rate per image
-_SCALE_RATE: Final = 0.02  # learning rate of the size per image
-_REGULARISATION: Final = 0.02  # share of the spectrum's mean energy
-_SPREAD: Final = 0.08  # width of the peak, as a share of the target's size
-_SCALES: Final = 17  # sizes tried per image
+_SCALE_RATE: Final = 0.02  # learning rate of the size filter per image
+_REGULARISATION: Final = 0.02  # as a fraction of the spectrum's mean energy
+_SPREAD: Final = 0.08  # width of the peak as a fraction of the target's size
+_SCALES: Final = 17  # number of sizes tried per image
 _SCALE_STEP: Final = 1.03  # ratio between neighbouring sizes
-_SCALE_SPREAD: Final = 1.0  # steps
-_SCALE_AREA_PX: Final = 32.0**2  # size of the sampled patch of each size
-_SMALLEST: Final = 0.2  # times the initial size
-_LARGEST: Final = 6.0  # times the initial size
-_LEAST_PX: Final = 4.0  # smallest side of a target
-_GRID: Final = 10  # points along each side
+_SCALE_SPREAD: Final = 1.0  # width of the size filter's peak, in steps of the size
+_SCALE_AREA_PX: Final = 32.0**2  # area of the sampled patch for each size
+_SMALLEST: Final = 0.2  # smallest size, as a multiple of the initial one
+_LARGEST: Final = 6.0  # largest size, as a multiple of the initial one
+_LEAST_PX: Final = 4.0  # minimum side of a target
+_GRID: Final = 10  # number of points along each side
 _WINDOW: Final = (11, 11)  # window of Lucas-Kanade [px]
-_LEVELS: Final = 3  # levels of its image pyramid
-_AROUND: Final = (9, 9)  # pixels of a point's surroundings to compare
-_ENOUGH: Final = 6  # points needed
-_RETURN_PX: Final = 5.0  # a larger median return distance is a failure
-_SPREAD_PX: Final = 0.35  # share of the box's smaller side: a larger spread of the displacements is a failure
-_SMALLEST_PX: Final = 6.0  # a smaller box is a failure
+_LEVELS: Final = 3  # number of levels of its image pyramid
+_AROUND: Final = (9, 9)  # size of a point's surroundings to compare [px]
+_ENOUGH: Final = 6  # minimum number of points
+_RETURN_PX: Final = 5.0  # maximum median return distance; a larger one is a failure
+_SPREAD_PX: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
+_SMALLEST_PX: Final = 6.0  # minimum side of the box; a smaller one is a failure
 
 
 class _Filter:
-    """A ridge regression in the Fourier domain, with all channels sharing one denominator."""
+    """A ridge regression in the Fourier domain; all channels share one denominator."""
 
     def __init__(self, wanted: Spectrum, rate: float) -> None:
         self._wanted = wanted
@@ -66,7 +66,7 @@ class _Filter:
         self._below: Floats | None = None
 
     def learn(self, spectrum: Spectrum) -> None:
-        """Learn from a patch's spectrum, channels first: the first one fully, later ones by the learning rate."""
+        """Learn from a patch's spectrum (channels first): the first one fully, later ones by the learning rate."""
         above = np.conj(self._wanted) * spectrum
         below = np.sum(spectrum.real**2 + spectrum.imag**2, axis=0)
         if self._above is None or self._below is None:
@@ -84,11 +84,11 @@ class _Filter:
 
 
 class CorrelationTracker(Tracker):
-    """Tracks a target's place and size by correlation filters; fast, and the default.
+    """Tracks a target's position and size by correlation filters. Fast, and the default.
 
-    It follows a target that changes slowly and moves by less than half its size from image to image. The score is the
-    height of the correlation peak: about 1 on the image that it was learned from; below ``lost_below`` the target
-    counts as lost. A lost target is searched for where it was last. For loss detection, memory and search, see
+    It follows a target that changes slowly and moves by less than half its size between images. The score is the height
+    of the correlation peak: about 1 for the image that it was learned from. Below ``lost_below`` the target counts as
+    lost, and it is searched for where it was last seen. For loss detection, memory and search, see
     :class:`LongTermTracker`.
     """
 
@@ -107,7 +107,7 @@ class CorrelationTracker(Tracker):
         self._centre: NDArray[np.float64] = np.zeros(2)  # the target's centre [px]
 
     def shift(self, right: float, down: float) -> None:
-        """Search for the target shifted by this much to the right and down in the next image [px]."""
+        """Look for the target shifted by this much to the right and down in the next image [px]."""
         self._centre = np.add(self._centre, (right, down))
 
     def _start(self, image: Image, box: Box) -> None:
@@ -116,12 +116,12 @@ class CorrelationTracker(Tracker):
         self._size = np.array([width, height])
         self._scale = 1.0
         extra = _CONTEXT * math.sqrt(width * height)
-        self._around = self._size + extra  # the patch in the image, at scale 1
+        self._around = self._size + extra  # size of the patch in the image at scale 1
         self._sampled = _in_cells(self._around, _AREA_PX)
         self._scale_sampled = _in_cells(self._size, _SCALE_AREA_PX)
         columns, rows = self._sampled[0] // CELL, self._sampled[1] // CELL
         self._window = np.outer(np.hanning(rows + 2)[1:-1], np.hanning(columns + 2)[1:-1]).astype(np.float32)
-        cells = np.array([columns, rows]) * self._size / self._around  # the target's size in cells
+        cells = np.array([columns, rows]) * self._size / self._around  # size of the target in cells
         wanted = np.outer(_peak(rows, _SPREAD * cells[1] + 0.5), _peak(columns, _SPREAD * cells[0] + 0.5))
         self._filter = _Filter(np.asarray(np.fft.rfft2(wanted), np.complex64), _RATE)
         self._steps = _SCALE_STEP ** (np.arange(_SCALES) - _SCALES // 2)
@@ -171,7 +171,7 @@ class CorrelationTracker(Tracker):
         return np.asarray(np.fft.rfft2(features(self._cv, pixels) * self._window), np.complex64)
 
     def _scale_spectrum(self, image: Image) -> Spectrum:
-        """Return the spectrum over the sizes of each feature of the target, (features, _SCALES // 2 + 1)."""
+        """Return the spectrum of each of the target's features over the sizes, (features, _SCALES // 2 + 1)."""
         width, height = self._scale_sampled
         largest = float(self._steps[-1])
         finer = (round(width * largest * 1.5), round(height * largest * 1.5))
@@ -186,14 +186,14 @@ class CorrelationTracker(Tracker):
 
 
 def _in_cells(size: NDArray[np.float64], area_px: float) -> tuple[int, int]:
-    """Return width and height of about this area and a size's shape, as an even number of whole cells."""
+    """Return a width and height in whole cells, both even, with about this area and the proportions of a size."""
     share = math.sqrt(area_px / float(size[0] * size[1]))
     width, height = (max(2, round(float(side) * share / CELL / 2) * 2) * CELL for side in size)
     return width, height
 
 
 def _peak(count: int, spread: float) -> NDArray[np.float64]:
-    """Return a Gaussian whose middle is the first of a ring of values."""
+    """Return a Gaussian on a ring of values, centred on the first one."""
     away = np.minimum(np.arange(count), count - np.arange(count))
     return np.asarray(np.exp(-0.5 * (away / spread) ** 2))
 
@@ -203,18 +203,18 @@ def _signed(place: float, count: int) -> float:
 
 
 def _refined(values: NDArray[np.floating[Any]], at: int) -> float:
-    """Refine the place of a peak in a ring of values by the parabola through it and its neighbours."""
+    """Refine a peak's position in a ring of values, using the parabola through it and its neighbours."""
     before, here, after = float(values[at - 1]), float(values[at]), float(values[(at + 1) % len(values)])
     bend = before - 2 * here + after
     return at if bend >= 0 else at + 0.5 * (before - after) / bend
 
 
 class MedianFlowTracker(Tracker):
-    """Tracks a target's place and size from each image to the next, without remembering its appearance.
+    """Tracks a target's position and size from each image to the next, without remembering the target's appearance.
 
-    It is exact while the target is in view and moves smoothly, and notices a failure at once; it then stays lost until
-    restarted. It drifts, because it never compares with the first image. The score says how many points returned, and
-    how closely.
+    It is accurate while the target is in view and moves smoothly. It notices a failure at once and then stays lost
+    until restarted. It drifts because it never compares with the first image. The score expresses how many points
+    returned and how closely.
     """
 
     def __init__(self) -> None:
@@ -271,7 +271,7 @@ class MedianFlowTracker(Tracker):
         return found, min(score, 1.0)
 
     def _there_and_back(self, grey: Image, before: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-        """Return the points' new places, their return distances, and which of them could be tracked."""
+        """Return the points' new positions and return distances, and which points could be tracked."""
         cv = self._cv
         points = before.reshape(-1, 1, 2)
         after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=_WINDOW, maxLevel=_LEVELS)
@@ -291,7 +291,7 @@ class MedianFlowTracker(Tracker):
 
 
 def _grid(box: Box) -> Floats:
-    """Return points in the box, evenly spaced and not at its edge, (n, 2) pixels."""
+    """Return evenly spaced points in the box, away from its edge, (n, 2) pixels."""
     x, y, width, height = box
     share = (np.arange(_GRID) + 0.5) / _GRID
     across, down = np.meshgrid(x + width * share - 0.5, y + height * share - 0.5)
@@ -299,7 +299,7 @@ def _grid(box: Box) -> Floats:
 
 
 def _stretch(before: Floats, after: Floats) -> float:
-    """Return the growth of the distances between the points: the median over all pairs."""
+    """Return by how much the distances between the points grew: the median over all pairs."""
     one, other = np.triu_indices(len(before), k=1)
     old = np.linalg.norm(before[one] - before[other], axis=1)
     new = np.linalg.norm(after[one] - after[other], axis=1)
@@ -307,17 +307,17 @@ def _stretch(before: Floats, after: Floats) -> float:
 
 
 class LearnedTracker(Tracker):
-    """Tracks by a neural network, through OpenCV, on the CPU. The score is the network's own.
+    """Tracks by a neural network that OpenCV runs on the CPU. The score is the network's own.
 
-    The weights are not part of Skyloop: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, the repository
-    of NanoTrack its two files.
+    Skyloop doesn't include the weights: the OpenCV Zoo offers ``object_tracking_vittrack_2023sep.onnx``, NanoTrack's
+    repository has its two files.
     """
 
     def __init__(self, weights: Path | str, head: Path | str | None = None, *, lost_below: float = 0.3) -> None:
         """Load the weights.
 
         Args:
-            weights: ONNX file of ViTTrack or, with ``head``, of NanoTrack's backbone.
+            weights: ONNX file of ViTTrack or, together with ``head``, of NanoTrack's backbone.
             head: ONNX file of NanoTrack's neck and head.
             lost_below: Score below which the target is lost.
 
@@ -325,7 +325,7 @@ class LearnedTracker(Tracker):
             MissingExtraError: OpenCV is not installed.
             UnsupportedError: This OpenCV was built without that tracker.
             UsageError: A file does not exist.
-            FileFormatError: A file is not the weights of that tracker, or exceeds the limits of loading (tested in a
+            FileFormatError: A file has no weights for that tracker, or exceeds the limits for loading (tested in a
                 child process, as in :func:`skyloop.vision.onnx.load_network`).
         """
         self._cv: Any = opencv("tracking")
@@ -357,7 +357,7 @@ class LearnedTracker(Tracker):
         return TrackResult(None if lost else (x, y, width, height), score)
 
     def _call(self, method: str, *arguments: Any) -> Any:
-        """Call OpenCV's tracker; a file with another network often loads and only fails here."""
+        """Call OpenCV's tracker. A file with a different network often loads and only fails here."""
         try:
             return getattr(self._tracker, method)(*arguments)
         except self._cv.error as error:

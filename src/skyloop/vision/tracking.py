@@ -1,7 +1,7 @@
-"""The base of all trackers of a box: start, update and result; and patches of an image.
+"""The base class of all trackers that follow a box, with their results, and patches of an image.
 
-A box is x, y, width and height in pixels: its left and top edge, and its size, as in OpenCV. A box of whole numbers
-covers the columns x to x + width − 1 and the rows y to y + height − 1.
+A box is x, y, width and height in pixels: its left and top edge, and its size, as in OpenCV. A box with integer values
+covers columns x to x + width − 1 and rows y to y + height − 1.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from skyloop.vision.planar import pixels_of
 Box = tuple[float, float, float, float]  #: x, y, width, height [px]
 Image = NDArray[np.uint8]
 
-LEAST_PX: Final = 6.0  #: least side of a box; a smaller one has too little texture to be found again
-_IN_VIEW: Final = 0.5  # least share of the initial box inside the image
+LEAST_PX: Final = 6.0  #: minimum side of a box; a smaller one has too little texture to be found again
+_IN_VIEW: Final = 0.5  # minimum fraction of the initial box that is inside the image
 Floats = NDArray[np.float32]
 
-CELL: Final = 4  #: pixels of a patch along a side of a cell
+CELL: Final = 4  #: side of a cell in pixels of the patch
 
 
 @dataclass(frozen=True, slots=True)
 class TrackResult:
-    """The target's place in one image."""
+    """The target's position in one image."""
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
-    score: float  #: 0 to 1, similarity to the target; a score, not a probability
-    confidence: float | None = None  #: chance of an overlap of at least a half; None: no estimate
+    score: float  #: similarity to the target, 0 to 1; a score, not a probability
+    confidence: float | None = None  #: chance that the overlap is at least half; None without an estimate
 
     @property
     def lost(self) -> bool:
@@ -43,7 +43,7 @@ class TrackResult:
 
     @property
     def centre(self) -> tuple[float, float] | None:
-        """The middle of the box, pixels; None while the target is lost."""
+        """The middle of the box [px]; None while the target is lost."""
         if self.box is None:
             return None
         x, y, width, height = self.box
@@ -51,21 +51,21 @@ class TrackResult:
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
-        """The corners of the box, for annotations; none while the target is lost."""
+        """The corners of the box, for annotations; empty while the target is lost."""
         return () if self.box is None else outline(self.box)
 
 
 class Tracker(ABC):
-    """Follows the content of a box from image to image: :meth:`start` once, then :meth:`update` with each new image.
+    """Follows a box's content from image to image: call :meth:`start` once, then :meth:`update` with each new image.
 
-    It can be restarted at any time, even with images of another size. It is not thread-safe: call it from one thread,
-    such as a controller's or a processor's.
+    It can be restarted at any time, even with images of a different size. It is not thread-safe, so call it from one
+    thread, such as a controller's or a processor's.
     """
 
     _shape: tuple[int, ...] | None = None
 
     def start(self, image: Image, box: Sequence[float]) -> None:
-        """Start tracking the content of a box, and forget the previous target.
+        """Start tracking a box's content and forget the previous target.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
@@ -76,7 +76,7 @@ class Tracker(ABC):
         """
         pixels = pixels_of(image)
         checked = checked_box(box, pixels.shape)
-        self._shape = None  # in case that _start fails
+        self._shape = None  # in case _start fails
         self._start(pixels, checked)
         self._shape = pixels.shape
 
@@ -87,7 +87,7 @@ class Tracker(ABC):
             image: As in :meth:`start`, of the same size and kind.
 
         Raises:
-            UsageError: The tracker was not started, or the image's shape or type differs from the first.
+            UsageError: The tracker was not started, or the image's shape or type differs from the first image's.
         """
         if self._shape is None:
             raise UsageError("the tracker was not started: call start(image, box) before update(image)")
@@ -100,10 +100,10 @@ class Tracker(ABC):
         return self._update(pixels)
 
     def shift(self, right: float, down: float) -> None:  # noqa: B027 - to ignore it is allowed
-        """Announce how far the target moved in the image since the last one, as known from the camera's rotation [px].
+        """Report how far the camera's rotation has moved the target in the image since the last one [px].
 
-        The target is searched for there in the next image. Trackers that search everywhere, or measure the image's own
-        motion, ignore this, and calling it is optional.
+        The tracker looks for the target there in the next image. Trackers that search everywhere or measure the image's
+        motion themselves ignore this. Calling it is optional.
         """
 
     @abstractmethod
@@ -112,11 +112,11 @@ class Tracker(ABC):
 
     @abstractmethod
     def _update(self, image: Image) -> TrackResult:
-        """Track in a checked image."""
+        """Track the target in a checked image."""
 
 
 def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
-    """Check the initial box of a tracker.
+    """Check a tracker's initial box.
 
     Args:
         box: x, y, width, height [px].
@@ -147,7 +147,7 @@ def outline(box: Box) -> tuple[tuple[float, float], ...]:
 
 
 def overlap_area(one: Box, other: Box) -> float:
-    """Return the area that two boxes share [px²]."""
+    """Return the area shared by two boxes [px²]."""
     wide = min(one[0] + one[2], other[0] + other[2]) - max(one[0], other[0])
     high = min(one[1] + one[3], other[1] + other[3]) - max(one[1], other[1])
     return max(wide, 0.0) * max(high, 0.0)
@@ -160,7 +160,7 @@ def overlap(one: Box, other: Box) -> float:
 
 
 def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
-    """Sample a box of an image; pixels outside the image repeat its edge.
+    """Sample a box of an image. Pixels outside the image repeat its edge.
 
     Args:
         cv: The module ``cv2``.
@@ -174,7 +174,7 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
     right, bottom = min(columns, math.ceil(x + width) + 1), min(rows, math.ceil(y + height) + 1)
     left, top = min(left, columns - 1), min(top, rows - 1)
     part = image[top : max(bottom, top + 1), left : max(right, left + 1)]
-    # Linear sampling uses only the nearest pixels, so average a large part down first.
+    # Linear sampling uses only the nearest pixels, so average a large area down first.
     coarse = [max(1, int(full / wanted)) for full, wanted in zip((width, height), size, strict=True)]
     high, wide = part.shape[:2]
     if max(coarse) > 1:
@@ -182,7 +182,7 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
         part = cv.resize(part, wanted, interpolation=cv.INTER_AREA)
     shrink_x, shrink_y = part.shape[1] / wide, part.shape[0] / high
     step_x, step_y = width / size[0] * shrink_x, height / size[1] * shrink_y
-    first_x = (x - left) * shrink_x + step_x / 2 - 0.5  # centres of pixels, not their edges
+    first_x = (x - left) * shrink_x + step_x / 2 - 0.5  # pixel centres, not pixel edges
     first_y = (y - top) * shrink_y + step_y / 2 - 0.5
     turn = np.array([[step_x, 0.0, first_x], [0.0, step_y, first_y]])
     flags = cv.INTER_LINEAR | cv.WARP_INVERSE_MAP
@@ -190,11 +190,11 @@ def patch(cv: Any, image: Image, box: Box, size: tuple[int, int]) -> Image:
 
 
 def features(cv: Any, pixels: Image) -> Floats:
-    """Return the features of a patch, (channels, height / CELL, width / CELL): 8 channels for grey, 10 for colour.
+    """Return a patch's features, (channels, height / CELL, width / CELL): 8 channels for grey, 10 for colour.
 
-    The gradient's strength in each cell and the first harmonics of its direction, which carry a direction histogram's
-    information in fewer numbers, each normalised by the local strength, so that light and contrast do not matter. Then
-    brightness and, for a colour image, both colour components, over the whole patch's.
+    Each cell has its gradient strength and the first harmonics of the gradient's direction, which carry the information
+    of a direction histogram in fewer numbers. Both are normalised by the local strength, so light and contrast don't
+    matter. The other channels are brightness and, for a colour image, both colour components relative to the patch's.
     """
     size = (pixels.shape[1] // CELL, pixels.shape[0] // CELL)
     if pixels.ndim == 3:
@@ -221,7 +221,7 @@ def features(cv: Any, pixels: Image) -> Floats:
         2 * twice_cos * sin2,
     ]
     cells = [cv.resize(one, size, interpolation=cv.INTER_AREA) for one in maps]
-    around = cv.blur(cells[0], (3, 3)) + np.float32(4.0)  # grey levels; noise on a flat wall is not texture
+    around = cv.blur(cells[0], (3, 3)) + np.float32(4.0)  # 4 grey levels: noise on a flat wall is not texture
     light = [(plain[0] - plain[0].mean()) / np.float32(64.0)]
     colour = [(one - 128) / np.float32(32.0) for one in plain[1:]]
     return np.stack([one / around for one in cells] + light + colour)

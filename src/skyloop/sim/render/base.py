@@ -1,4 +1,4 @@
-"""The renderer's input and output, and OpenCV with a clear error if it is not installed."""
+"""The renderer's input and output, and an import of OpenCV with a clear error if it is not installed."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneState:
-    """The poses of all moving objects at one time.
+    """The poses of all moving objects at a point in time.
 
-    The renderer may cache results for a state as long as it receives the same object, so do not write to a state's
-    arrays afterwards.
+    The renderer may cache results for as long as it receives the same state object, so don't write to a state's arrays
+    afterwards.
 
     Attributes:
-        drone_positions_m: Positions of the bodies' origins, world axes, shape (n, 3).
+        drone_positions_m: Positions of the bodies' origins in world axes, shape (n, 3).
         drone_rotations: World from body, shape (n, 3, 3).
-        targets: One for each target of the world, in the world's order.
-        light: Brightness of the whole picture; 1 is full. See :class:`~skyloop.sim.world.Light`.
+        targets: One state for each target in the world, in the world's order.
+        light: Brightness of the whole image, where 1 is full. See :class:`~skyloop.sim.world.Light`.
     """
 
     drone_positions_m: NDArray[np.float64]

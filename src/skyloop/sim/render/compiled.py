@@ -1,7 +1,7 @@
-"""Draw with the ``kernels``, compiled by Numba if it is installed: the same pictures, several times faster.
+"""Drawing with the ``kernels``, compiled by Numba if it is installed: the same images, several times faster.
 
-Importing Numba takes almost a second, and the first compilation some more; afterwards the machine code is in Numba's
-cache on disk. No picture waits for either: both happen on a separate thread.
+Importing Numba takes almost a second, and the first compilation takes longer; from then on the machine code is in
+Numba's cache on disk. No image waits for either: both happen on a separate thread.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _CONSTANTS: Final = np.array(
 
 @dataclass(frozen=True, slots=True)
 class Kernels:
-    """The functions of ``kernels``; by default uncompiled."""
+    """The functions of ``kernels``, by default uncompiled."""
 
     prepare: Callable[..., int] = kernels.prepare
     draw: Callable[..., None] = kernels.draw
@@ -44,7 +44,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels; see :class:`Painter`.
+    """Draws with kernels. See :class:`Painter`.
 
     Args:
         raster: See :class:`Painter`.
@@ -71,7 +71,7 @@ class CompiledPainter(Painter):
     ) -> None:
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
-        if self._fixed is None or self._fixed[0] is not quads.texture:  # fixed for a scene, despite motion
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # fixed for a scene, even if its parts move
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
             origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
             self._fixed = quads.texture, weight, origin
@@ -91,7 +91,7 @@ class CompiledPainter(Painter):
         )
         edges, planes, box = np.empty((n, 4, 3)), np.empty((n, 3)), np.empty((n, 4), np.int64)
         table = np.empty((13, n + 1), np.float32)
-        # Contiguous arrays: Numba would recompile the function for another layout.
+        # Contiguous arrays, because Numba would recompile the function for a different layout.
         whole = [np.ascontiguousarray(part) for part in scene]
         count = self._do.prepare(*whole, _CONSTANTS, self._grid, self.pixel_area, edges, planes, box, table)
         raster, pixels = self.raster, picture.shape[0] * picture.shape[1]
@@ -124,12 +124,12 @@ class CompiledPainter(Painter):
 
 
 def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
-    """Return the number of grid rows needed for each row of the picture, and how many of the last ones to keep."""
+    """Return the number of grid rows needed for each row of the image, and how many of the last ones to keep."""
     height, width = raster.rays.x.shape
     row = raster.lookup.reshape(height, width) // raster.grid.width
-    # For the samples below, and to know whether the samples below a row differ from it.
+    # Include the row below, for its samples and to find out whether they differ from those above.
     rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
-    at_once = -(-kernels.BLOCK // width) + 1  # rows of the picture
+    at_once = -(-kernels.BLOCK // width) + 1  # rows of the image
     first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]
     bands = -(-rows_for // kernels.BAND) * kernels.BAND
     needed = max(bands[min(start + at_once, height) - 1] - first[start] for start in range(height))
@@ -137,25 +137,25 @@ def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
 
 
 class Compiler:
-    """Compiles the kernels for this process, once, on a separate thread.
+    """Compiles the kernels once for this process, on a separate thread.
 
-    The end of the process waits only for the function being compiled at that moment, not for all of them: LLVM must not
-    be torn down while it works.
+    At its end the process waits only for the function being compiled at that moment, not for all of them, because LLVM
+    must not be torn down while it works.
 
     Args:
-        load: Returns the kernels, which compile on their first call. Raises ``ImportError`` without Numba.
+        load: Returns kernels that compile on their first call. Raises ``ImportError`` without Numba.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
         self.kernels: Kernels | None = None  #: None until compiled
-        self.problem = ""  #: why there are no kernels; empty until known
+        self.problem = ""  #: why there are no kernels; empty until this is known
         self._load = load or load_kernels
         self._lock = threading.Lock()
         self._compiling = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def start(self) -> threading.Thread:
-        """Start compiling unless it has started; return its thread."""
+        """Start compiling unless this has already happened; return the compiling thread."""
         with self._lock:
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
@@ -164,7 +164,7 @@ class Compiler:
             return self._thread
 
     def _hold(self, process: int) -> None:
-        """Block further compilation for good; after a fork neither the thread nor a usable lock remains."""
+        """Block further compilation permanently, because after a fork neither the thread nor a usable lock exists."""
         if process == os.getpid():
             self._compiling.acquire()
 
@@ -188,11 +188,11 @@ class Compiler:
 
 
 def load_kernels() -> Kernels:
-    """Return the kernels as Numba functions, which compile or load from the cache on their first call.
+    """Return the kernels as Numba functions, which are compiled or loaded from the cache on their first call.
 
     Raises:
         ImportError: Numba is not installed.
-        RuntimeError: Its cache is not writable: every start would spend seconds on compilation.
+        RuntimeError: Numba's cache is not writable, so every start would spend seconds on compilation.
     """
     import numba
 
@@ -201,7 +201,7 @@ def load_kernels() -> Kernels:
 
 
 def _draw_once(functions: Kernels) -> None:
-    """Draw a tiny picture, because Numba compiles a function on its first call with new types."""
+    """Draw a tiny image, because Numba compiles a function on its first call with new types."""
     textures, shapes = AtlasBuilder(), QuadBuilder()
     grey = textures.add("grey", lambda: np.full((8, 8, 3), 128, np.uint8))
     shapes.rectangle((-1, -1, 0), (2, 0, 0), (0, 2, 0), grey)
@@ -213,5 +213,5 @@ def _draw_once(functions: Kernels) -> None:
     painter.paint(shapes.build(), np.ones(1, np.bool_), [shadow], pose, np.empty((8, 8, 3), np.uint8))
 
 
-#: Of this process.
+#: The compiler of this process.
 COMPILER: Final = Compiler()

@@ -1,4 +1,4 @@
-"""Dummies of people and cars, made of textured boxes. Origin on the ground, x ahead, y left, z up."""
+"""Dummies of people and cars made from textured boxes. Origin on the ground, x ahead, y left, z up."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from skyloop.sim.world import FIGURE_SIZES_M, FigureTarget, Rgb, Vec3
 
 Image = NDArray[np.uint8]
 
-_STRIDE_M = 1.5  #: length of two steps
-_SWING_RAD = 0.52  # of a leg, to either side
+_STRIDE_M = 1.5  #: distance covered by two steps
+_SWING_RAD = 0.52  # swing of a leg to either side
 _TOPS: tuple[Rgb, ...] = (
     (200, 40, 44),
     (36, 92, 190),
@@ -52,11 +52,11 @@ class Figure:
     """A figure's parts: the rigid body, and limbs that swing about their upper ends.
 
     Attributes:
-        body: The rigid part.
-        limbs: As many equally large groups of quads as there are joints, each with its joint as origin; None: none.
+        body: The rigid body.
+        limbs: Equally large groups of quads, one per joint, each with its joint as origin; None without limbs.
         joints: Positions of the joints, (limbs, 3).
         swings: Forward swing of each limb in the middle of a step [rad], (limbs,).
-        spots: Circles of the shadow: x, y, radius [m].
+        spots: Circles that make up the shadow: x, y, radius [m].
     """
 
     body: Quads
@@ -66,7 +66,7 @@ class Figure:
     spots: tuple[Vec3, ...]
 
     def posed(self, position_m: Floats, rotation: Floats, walked_m: float) -> Quads:
-        """Return it at a position after a distance walked [m]; the swing starts and stops with the walk."""
+        """Return the figure at a position after a distance walked [m]; the swing starts and stops with the walk."""
         body = self.body.moved(position_m, rotation)
         if self.limbs is None:
             return body
@@ -79,11 +79,11 @@ class Figure:
         return body.joined(limbs)
 
     def standing(self) -> Quads:
-        """Return it at the origin, at rest."""
+        """Return the figure at the origin, at rest."""
         return self.posed(np.zeros(3), np.eye(3), 0.0)
 
     def shadows(self, position_m: Floats, rotation: Floats) -> list[Shadow]:
-        """Return its soft shadow on the ground below it."""
+        """Return the figure's soft shadow on the ground below it."""
         return [Shadow(position_m + rotation @ (x, y, 0.0), radius, 0.5) for x, y, radius in self.spots]
 
 
@@ -185,7 +185,7 @@ def _pick(rng: np.random.Generator, colours: tuple[Rgb, ...]) -> Rgb:
 
 
 def _cloth(first: Rgb, second: Rgb, pattern: int) -> Image:
-    """Draw cloth: plain, with stripes across, a broad band, or checks."""
+    """Draw cloth that is plain or has horizontal stripes, a broad band, or checks."""
     picture, other = draw_paint(first, 96, 64), draw_paint(second, 96, 64)
     rows, columns = np.arange(96)[:, None], np.arange(64)[None, :]
     masks: tuple[Callable[[], NDArray[np.bool_]], ...] = (
@@ -233,7 +233,7 @@ def _car_end(rgb: Rgb, *, front: bool) -> Image:
 
 
 def _glass(rgb: Rgb, *, panes: int) -> Image:
-    """Draw panes with the car's colour around them, and a bright streak."""
+    """Draw panes surrounded by the car's colour, with a bright streak."""
     picture = draw_paint(rgb, 64, 128)
     width = 128 // panes
     for pane in range(panes):

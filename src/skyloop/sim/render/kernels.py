@@ -1,12 +1,12 @@
-"""The planar renderer's work as loops over quads and pixels, for Numba to compile (``compiled``).
+"""The planar renderer's work as loops over quads and pixels that Numba can compile (``compiled``).
 
-They compute the same as ``visibility`` and ``shading``, operation by operation in the same order and precision, so the
-picture is identical bit by bit; those modules explain the mathematics. The loops also run uncompiled, slowly, for tests
-without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled, they do
-not hold the interpreter lock.
+The loops compute the same as ``visibility`` and ``shading``, operation by operation in the same order and precision, so
+the image is identical bit by bit; those modules explain the mathematics. They also run uncompiled, slowly, for tests
+without Numba. Each is one flat function, because a compiled function can't call an uncompiled one. Compiled loops don't
+hold the interpreter lock.
 
-Inner loops are short, write one array each, and stay in single precision: others would not become vector instructions.
-Constants of other modules are arguments, because Numba's cache checks only this file for changes.
+Inner loops are short, write one array each and stay in single precision, because others would not become vector
+instructions. Constants from other modules are arguments, because Numba's cache checks only this file for changes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     Shorts = NDArray[np.int16]
 
 BLOCK = 512  # pixels per batch: few enough for the working arrays to stay in the cache
-BAND = 16  # rows of the grid per batch, for the same reason
-FEW = 8  # rows of the grid compared at a time
+BAND = 16  # grid rows per batch, for the same reason
+FEW = 8  # grid rows compared at a time
 NUMBER = 0x7FFF  # the bits of a sample's number; the sign marks a different sample nearby
-_ROUND = np.float32(3 << 22)  # adding and subtracting it rounds a number up to 2^22 to an integer, halves to even
+_ROUND = np.float32(3 << 22)  # adding and subtracting this rounds a number up to 2^22 to an integer, halves to even
 
 
 def prepare(
@@ -51,24 +51,24 @@ def prepare(
     """Select the quads that may be visible, like ``visible_quads`` and ``sampling_table``.
 
     Args:
-        vectors: See ``Quads``, as for the following ones.
+        vectors: See ``Quads``, also for the next three.
         starts: See ``Quads``.
         two_sided: See ``Quads``.
         lit: See ``Quads``.
         shown: Whether to draw a quad at all, (n,).
-        weight: Factor on each quad's inverse depth, by its priority, (n,).
+        weight: Factor on each quad's inverse depth, from its priority, (n,).
         density: See ``Quads``.
         origin: x, y and span in the atlas of each quad's texture, (n, 3).
-        position: The camera's position.
-        rotation: World from optical axes.
+        position: Position of the camera.
+        rotation: Rotation from optical to world axes.
         constants: Edge-on limit [m], ambient light, direct light, unit of light, factor of the footprint,
             direction to the light, unit.
         grid: width, height, fx, fy, cx, cy.
         pixel_area: 1/(fx fy) of the image.
-        edges: Output: planes through the edges of each selected quad: slopes on the grid along x and y, start,
+        edges: Output: planes through the edges of each selected quad, as slopes on the grid along x and y, and start,
             (n, 4, 3).
-        planes: Output: its 1/z on the grid as slope along x, slope along y and start, (n, 3).
-        box: Output: the first grid row it may cover, the one after the last, and columns likewise, (n, 4).
+        planes: Output: each selected quad's 1/z on the grid as slope along x, slope along y and start, (n, 3).
+        box: Output: the first grid row it may cover and the one after the last, then the same for columns, (n, 4).
         table: Output: see ``sampling_table``, (13, n + 1).
 
     Returns:
@@ -109,7 +109,7 @@ def prepare(
         if off_left or off_right or off_top or off_bottom or behind:
             continue
         first_row, last_row, first_column, last_column = 0.0, height, 0.0, width
-        if ahead:  # with a margin of two samples for rounding: the edges decide
+        if ahead:  # with a margin of two samples for rounding, because the edges decide
             first_row, last_row, first_column, last_column = height, -1.0, width, -1.0
             for i in range(4):
                 row, column = y[i] / z[i] * fy + cy, x[i] / z[i] * fx + cx
@@ -180,51 +180,50 @@ def draw(
     picture: NDArray[np.uint8],
     packed: NDArray[np.int32],
 ) -> None:
-    """Draw a picture like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+    """Draw an image like ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
 
-    For each band of the grid, find the nearest quad at each sample; then colour the picture rows that need no further
-    bands, while this one is still in the cache.
+    For each band of the grid, find the nearest quad at each sample. Then colour the image rows that need no further
+    bands, while this band is still in the cache.
 
     Args:
-        count: The result of :func:`prepare`, which also wrote the next four.
-        count: What :func:`prepare` returned, and it wrote the next four.
+        count: The result of :func:`prepare`, which also wrote the next four arguments.
         edges: See :func:`prepare`.
         planes: See :func:`prepare`.
         box: See :func:`prepare`.
         table: See :func:`prepare`.
         samples: Samples per pixel, 1 or 4.
         to_grid: See ``Raster``.
-        rows_for: Number of grid rows needed for each row of the picture, (height,).
+        rows_for: Number of grid rows needed for each row of the image, (height,).
         ray_x: x of each pixel's ray (x, y, 1), (height, width).
-        ray_y: y of it, (height, width).
+        ray_y: y of each pixel's ray, (height, width).
         sample_x: x of the ray of each column of the grid.
         sample_y: y of the ray of each row of the grid.
         nearest: Work array: 1/z at each sample of a band, (BAND, columns).
         numbers: Work array, (BAND, columns).
-        seen: Work array: the table's column for each sample, 0 for none, and the sign bit if a sample may differ from
-            its neighbours to the right and below. Holds the last processed rows of the grid, as many as the picture
-            needs at a time; a power of two. (rows, columns).
+        seen: Work array: the table's column for each sample, 0 for none, with the sign bit set if a sample may differ
+            from its neighbours to the right and below. Holds the last processed grid rows, as many as the image needs
+            at a time; a power of two. (rows, columns).
         pairs: The atlas: each texel and the next one, BGRA each, in one number.
-        atlas_size: Its rows and columns.
-        gap: Between two levels of a texture in the atlas [texels].
-        farthest: 1/z assumed for a ray beyond a quad's horizon [1/m].
+        atlas_size: Number of rows and columns of the atlas.
+        gap: Gap between two levels of a texture in the atlas [texels].
+        farthest: 1/z to assume for a ray beyond a quad's horizon [1/m].
         boxes: Box of each shadow: first row, row after the last, first column, column after the last, (s, 4).
-        axes: World from optical.
+        axes: Rotation from optical to world axes.
         shadows: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it,
             (s, 7).
         picture: Output: BGR, (height, width, 3).
-        packed: The picture's memory as one number per pixel except the last, at intervals of three bytes.
+        packed: The image's memory as one number per pixel except the last, at intervals of three bytes.
     """
     zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
-    three, parts = np.float32(3.0), np.float32(32.0)  # a texel has 32 parts along each side
+    three, parts = np.float32(3.0), np.float32(32.0)  # a texel is divided into 32 parts along each side
     most_u, most_v = np.float32(atlas_size[1] - 2), np.float32(atlas_size[0] - 2)
     between, far = np.float32(gap), np.float32(farthest)
     stride = np.int32(atlas_size[1])
-    next_row = np.uint64(atlas_size[1])  # unsigned: Numba then skips the check for negative indices
+    next_row = np.uint64(atlas_size[1])  # unsigned, so that Numba skips the check for negative indices
     scale_x, scale_y, start_x, start_y = to_grid[0], to_grid[1], to_grid[2], to_grid[3]
     height, width = ray_x.shape
     grid_rows, columns = len(sample_y), len(sample_x)
-    kept = len(seen) - 1  # mask from a row of the grid to its row in ``seen``
+    kept = len(seen) - 1  # mask that turns a grid row into its row in ``seen``
     kept_, columns_ = np.int32(kept), np.int32(columns)
     seen_ = seen.reshape(-1)
     wide = float(columns)
@@ -238,7 +237,7 @@ def draw(
             crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
     differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
     none, sign = np.int16(0), np.int16(~NUMBER)
-    room = 5 * BLOCK  # each pixel, and its four samples where they differ
+    room = 5 * BLOCK  # space for each pixel, and for its four samples where they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
     u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -249,7 +248,7 @@ def draw(
     colours = np.empty(room, np.int32)
     depth, shade = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
     flat_x, flat_y = ray_x.reshape(-1), ray_y.reshape(-1)
-    known = compared = 0  # rows of the grid
+    known = compared = 0  # counts of grid rows
     for begin in range(0, height * width, BLOCK):
         count_ = min(BLOCK, height * width - begin)
         first_row, last_row = begin // width, (begin + count_ - 1) // width
@@ -342,7 +341,7 @@ def draw(
             end = start + 1
             while end < count_ and number[end] == quad:
                 end += 1
-            # Round up to a multiple, so that there is no remainder; the next run overwrites the excess.
+            # Round up to a multiple, to avoid a remainder; the next run overwrites the excess.
             stop = min(start + (end - start + 31) // 32 * 32, count_)
             xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
             into = w_[start:stop]
@@ -438,7 +437,7 @@ def draw(
             height_, away_x, away_y, square = shadows[k, 0], shadows[k, 1], shadows[k, 2], shadows[k, 3]
             strength, thickness, more = shadows[k, 4], shadows[k, 5], shadows[k, 6]
             for row in range(max(first_row, boxes[k, 0]), min(last_row + 1, boxes[k, 1])):
-                at_row = row * width - begin  # start of the row in the block, possibly outside it
+                at_row = row * width - begin  # start of the row relative to the block, possibly outside it
                 start = max(at_row + boxes[k, 2], 0)
                 stop = max(min(at_row + boxes[k, 3], count_), start)
                 xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
@@ -460,7 +459,7 @@ def draw(
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)
                     green = np.int32(np.int32(green + np.int32(green >> 8)) & 0xFF00)
                     out[n] = np.int32(dark | green)
-        # Each number's fourth byte is the next pixel's first one, which is written after it.
+        # Each number's fourth byte is the next pixel's first one, which is written later.
         bytes_ = packed[begin : begin + count_]
         for n in range(len(bytes_)):
             bytes_[n] = colours[n]

@@ -1,4 +1,4 @@
-"""The shapes of quadrotors, marker boards on their stands, platforms, and marker cards, each in its own axes."""
+"""The shapes of quadrotors, marker boards with their stands, platforms and marker cards, each in its own axes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.sim.render.quads import AtlasBuilder, QuadBuilder, Quads
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import MARKER_DICTIONARIES, BoardTarget, FigureTarget, MarkerPattern, PlatformTarget, Rgb, Target
 
-# Hull colours, drone by drone.
+# Hull colours of successive drones.
 HULLS: tuple[Rgb, ...] = (
     (235, 96, 24),
     (34, 132, 214),
@@ -27,12 +27,12 @@ HULLS: tuple[Rgb, ...] = (
     (226, 226, 226),
     (150, 96, 220),
 )
-DRONE_RADIUS_M = 0.26  #: from the centre to the outermost point of a rotor
+DRONE_RADIUS_M = 0.26  #: distance from the centre to the outermost point of a rotor
 _ARM_M = 0.16
 _ROTOR_M = 0.10
-_FEET_M = 0.06  # below the body's origin
+_FEET_M = 0.06  # distance of the feet below the body's origin
 _DARK: Rgb = (46, 48, 52)
-_POLE_M = 12.0  # the stand's pole goes through the floor, which hides the rest
+_POLE_M = 12.0  # length of the stand's pole, which goes through the floor and is hidden below it
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
@@ -45,9 +45,9 @@ def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, prio
 
 
 def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
-    """Return a quadrotor in body axes: a hull with a nose, a crossed frame, four rotors.
+    """Return a quadrotor in body axes: a hull with a nose, a crossed frame and four rotors.
 
-    The front rotors have the hull's colour, to make the heading visible.
+    The front rotors have the hull's colour to make the heading visible.
     """
     shapes = QuadBuilder()
     colour, dark = paint(atlas, hull), paint(atlas, _DARK)
@@ -72,7 +72,7 @@ def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
 
 
 def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    """Draw a spinning rotor: a blur of its colour, darker at the hub, with a bright rim."""
+    """Draw a spinning rotor as a blur of its colour, darker at the hub and with a bright rim."""
     size = 64
     y, x = np.mgrid[0:size, 0:size].astype(np.float32) - (size - 1) / 2
     r = np.hypot(x, y) / (size / 2)
@@ -84,7 +84,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def target(atlas: AtlasBuilder, target: Target) -> Quads:
-    """Return a target's shape without its stand; a figure stands at rest."""
+    """Return a target's shape without its stand. A figure is at rest."""
     if isinstance(target, BoardTarget):
         return board(atlas, target)
     if isinstance(target, FigureTarget):
@@ -93,10 +93,10 @@ def target(atlas: AtlasBuilder, target: Target) -> Quads:
 
 
 def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
-    """Return a marker's card in front of a wooden board on a pole; origin at the card's centre, x along its normal."""
+    """Return a marker's card in front of a wooden board on a pole; origin is the card's centre, x its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # face axes (right, up, normal) to (x ahead, y left, z up)
+    # from face axes (right, up, normal) to (x ahead, y left, z up)
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     half = target.pattern.card_size_m / 2 + 0.02
     wood = atlas.add(("board", round(half, 3)), lambda: draw_surface("wood", 2 * half, 2 * half, min(256, 96 / half)))
@@ -108,7 +108,7 @@ def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
 
 
 def stand(atlas: AtlasBuilder) -> Quads:
-    """Return the foot of a board's pole, origin on the floor."""
+    """Return the foot of a board's pole, with the origin on the floor."""
     shapes = QuadBuilder()
     dark = paint(atlas, _DARK)
     shapes.box((-0.19, -0.15, 0.0), (0.11, 0.15, 0.045), dark)
@@ -116,7 +116,7 @@ def stand(atlas: AtlasBuilder) -> Quads:
 
 
 def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
-    """Return a slab on a column with the marker on its top; origin at the centre of the top, x along its heading."""
+    """Return a slab on a column with a marker on its top; the origin is the top's centre, with x along the heading."""
     x, y, z = (side / 2 for side in target.size_m)
     density = min(200.0, 160.0 / max(x, y))
     top = atlas.add(("slab", target.texture, x, y), lambda: draw_surface(target.texture, 2 * x, 2 * y, density))
@@ -127,7 +127,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
     body.box((-narrow, -narrow, -2 * z - _POLE_M), (narrow, narrow, -2 * z), paint(atlas, _DARK))
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
-    # face axes (right, up, normal) to (x ahead, y left, z up): the picture's up is ahead, its right is -y
+    # from face axes (right, up, normal) to (x ahead, y left, z up): the image's up is ahead and its right is -y
     turn = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     return face.build().moved(np.zeros(3), turn).joined(body.build())
 
@@ -141,8 +141,8 @@ class Card:
     """An image of a marker.
 
     Attributes:
-        image: BGR.
-        uv: The visible part of the image: left, top, right, bottom in texels, with fractions.
+        image: The image, BGR.
+        uv: The visible part of the image: left, top, right, bottom in fractional texels.
     """
 
     image: NDArray[np.uint8]
@@ -152,7 +152,7 @@ class Card:
 def draw_card(pattern: MarkerPattern) -> Card:
     """Draw a marker with its margin.
 
-    The black square is ``pattern.size_m`` of the card's ``card_size_m``, to a fraction of a texel.
+    The black square takes up ``pattern.size_m`` of the card's ``card_size_m``, accurate to a fraction of a texel.
 
     Raises:
         UnknownNameError: OpenCV has no such dictionary.

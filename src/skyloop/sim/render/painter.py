@@ -1,6 +1,6 @@
-"""Drawing of pictures: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
+"""Drawing of images: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
 
-That painter serves without compiled code, and until compilation is done.
+That painter is used without compiled code and until compilation is done.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
 class Raster:
     """Precomputed values for a lens: the positions of its samples on a distortion-free grid.
 
-    A pixel has one sample, the grid point nearest to its centre, or the four around its centre, which without
-    distortion are exactly a quarter of a pixel to each side.
+    A pixel has one sample, the grid point nearest to its centre, or the four around its centre. Without distortion,
+    these are exactly a quarter of a pixel to each side.
 
     Attributes:
         grid: The grid.
         samples: Samples per pixel: 1 or 4.
-        lookup: Flat index on the grid of each pixel's first sample, (pixels,); the others are the next one, and the two
+        lookup: Flat index on the grid of each pixel's first sample, (pixels,). The others are the next one and the two
             below these.
-        to_grid: Scale of x and of y, and start of x and of y: a ray (x, y, 1) of ``rays`` times the scale plus the
-            start is the column and row of its first sample, after truncation. Computed in single precision, like
+        to_grid: Scale of x and of y, and start of x and of y. A ray (x, y, 1) from ``rays``, times the scale plus the
+            start, gives the column and row of its first sample after truncation. Computed in single precision, like
             ``lookup``.
         sample_x: x/z of each column of the grid.
         sample_y: y/z of each row of the grid.
@@ -49,7 +49,7 @@ class Raster:
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Compute one or four samples per pixel: once, 0.2 s for 960×720 pixels with distortion.
+        """Compute one or four samples per pixel, which takes 0.2 s once for 960×720 pixels with distortion.
 
         Raises:
             UsageError: The model's distortion can't be inverted.
@@ -63,7 +63,7 @@ def _raster(
 ) -> Raster:
     model = CameraModel("lens", width, height, 1.0, fx, fy, cx, cy, distortion)
     centre = _rays(model)
-    # From a pixel's centre to its first sample, and from there to its last one, in samples.
+    # Distances from a pixel's centre to its first sample, and from there to its last one, in samples.
     fine, first, more = (2, 0.5, 1) if samples > 1 else (1, 0.0, 0)
     scale = np.array([fine * fx, fine * fy])
     low = centre.min(axis=0) * scale
@@ -87,13 +87,13 @@ def _raster(
 
 
 def _rays(model: CameraModel) -> NDArray[np.float64]:
-    """Return x/z and y/z of the rays of all pixels' centres, (pixels, 2)."""
+    """Return x/z and y/z of the rays of all pixel centres, (pixels, 2)."""
     x, y = np.meshgrid(np.arange(model.width, dtype=np.float64), np.arange(model.height, dtype=np.float64))
     return model.rays(np.column_stack([x.ravel(), y.ravel()]))
 
 
 class Painter(ABC):
-    """Draws through one lens. Reuses buffers, so use it from one thread at a time.
+    """Draws through one lens. It reuses buffers, so use it from one thread at a time.
 
     Args:
         raster: The lens's raster.
@@ -110,11 +110,11 @@ class Painter(ABC):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """Draw a picture.
+        """Draw an image.
 
         Args:
             quads: The scene's quads.
-            shown: Which of them to draw at all, (n,).
+            shown: Whether to draw each quad at all, (n,).
             shadows: The shadows.
             pose: The camera's pose.
             picture: Output: BGR, (height, width, 3), contiguous.
@@ -122,13 +122,13 @@ class Painter(ABC):
 
 
 class PlainPainter(Painter):
-    """Draws with NumPy and OpenCV; see :class:`Painter`."""
+    """Draws with NumPy and OpenCV. See :class:`Painter`."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
         super().__init__(raster, model, atlas)
         self._shader = Shader(atlas)
         self._buffer = DepthBuffer(raster.grid)
-        # From a pixel's first sample to all of them.
+        # Steps from a pixel's first sample to each of its samples.
         self._steps = (0, 1, raster.grid.width, raster.grid.width + 1)[: raster.samples]
         self._numbers = np.empty((raster.samples, len(raster.lookup)), np.int32)
         self._colours = np.empty((model.height, model.width, 4), np.uint8)
@@ -162,7 +162,7 @@ class PlainPainter(Painter):
     def _smooth(
         self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]
     ) -> None:
-        """Colour and average all samples of the pixels whose samples see different quads."""
+        """Colour and average all samples of the pixels whose samples show different quads."""
         raster = self.raster
         places = (raster.lookup[pixels] + np.array(self._steps, dtype=np.int32)[:, None]).reshape(-1)
         row = places // raster.grid.width

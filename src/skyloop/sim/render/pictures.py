@@ -1,6 +1,6 @@
-"""Surfaces with one picture from edge to edge (crate, door, window, posters), and noise to make them irregular.
+"""Surfaces that show one picture from edge to edge (crate, door, window, posters), and noise to make them irregular.
 
-Each is drawn as BGR for a size in pixels with a given random generator.
+Each is drawn as BGR at a size in pixels with a given random generator.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Gray = NDArray[np.float32]
 
 
 def clouds(rng: np.random.Generator, height: int, width: int, cell_x: float, cell_y: float | None = None) -> Gray:
-    """Return smooth noise, about ±1, shape (height, width); its blotches measure ``cell_x`` by ``cell_y`` pixels."""
+    """Return smooth noise, about ±1, shape (height, width), whose blotches measure ``cell_x`` by ``cell_y`` pixels."""
     rows = max(2, round(height / (cell_y or cell_x)) + 1)
     columns = max(2, round(width / cell_x) + 1)
     seeds = rng.standard_normal((rows, columns), dtype=np.float32) * np.float32(0.6)
@@ -24,7 +24,7 @@ def clouds(rng: np.random.Generator, height: int, width: int, cell_x: float, cel
 
 
 def grain(rng: np.random.Generator, height: int, width: int) -> Gray:
-    """Return pixel noise, uniform within ±1, shape (height, width). Repeats every 256 pixels."""
+    """Return pixel noise, uniform within ±1, shape (height, width). It repeats every 256 pixels."""
     patch = rng.random((min(height, 256), min(width, 256)), dtype=np.float32) * np.float32(2.0) - np.float32(1.0)
     return np.tile(patch, (-(-height // 256), -(-width // 256)))[:height, :width]
 
@@ -39,13 +39,13 @@ def fractal(rng: np.random.Generator, height: int, width: int, cell: float, octa
 
 
 def tinted(colour: tuple[float, float, float], brightness: ArrayLike, height: int, width: int) -> NDArray[np.float32]:
-    """Return a picture (height, width, 3) of one BGR colour times a brightness around 1."""
+    """Return a picture (height, width, 3) of one BGR colour multiplied by a brightness around 1."""
     light = np.broadcast_to(np.asarray(brightness, dtype=np.float32), (height, width))
     return np.asarray(cv2.merge([light * np.float32(c) for c in colour]), dtype=np.float32)
 
 
 def finished(picture: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return the picture as bytes, with clipped values."""
+    """Return the picture as bytes after clipping the values."""
     return np.clip(picture, 0.0, 255.0).astype(np.uint8)
 
 

@@ -1,12 +1,12 @@
-"""The renderer of simulated cameras: on one core, without display, GPU or system packages.
+"""The renderer for simulated cameras, which needs one core and no display, GPU or system packages.
 
-The first step finds the quad at each sample of the picture (``visibility``), the second colours each pixel once
-(``shading``), so that hidden surfaces cost little. If the samples of a pixel see different quads, all four are coloured
-and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens; nothing is
-resampled, and textures stay sharp.
+The first step finds the quad at each sample of the image (``visibility``); the second colours each pixel once
+(``shading``), so that hidden surfaces cost little. If the samples of a pixel show different quads, all four are
+coloured and averaged, for smooth silhouettes. With distortion, the samples are at the positions given by the lens:
+nothing is resampled, and textures stay sharp.
 
-:class:`PlainPainter` does this with NumPy and OpenCV; ``compiled`` does the same arithmetic in loops compiled by Numba,
-several times faster, once they are ready. Both give the same picture, bit by bit, for the same scene, state, pose and
+:class:`PlainPainter` does this with NumPy and OpenCV. ``compiled`` does the same arithmetic in loops compiled by Numba,
+several times faster, once they are ready. Both give the same image, bit by bit, for the same scene, state, pose and
 model.
 """
 
@@ -30,12 +30,12 @@ from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import placed
 
 WORTH_COMPILING: Final = (
-    30  #: pictures that a renderer draws first; for fewer, compilation would take longer than it saves
+    30  #: images that a renderer draws before; for fewer, compilation would take longer than it saves
 )
 
 
 class Quality(Enum):
-    """How a picture is sampled."""
+    """How an image is sampled."""
 
     FAST = "fast"  #: one sample per pixel: jagged edges, and with distortion an error of up to half a pixel
     SMOOTH = "smooth"  #: four samples per pixel along edges: as good as BEST except for shimmer within textures
@@ -43,18 +43,18 @@ class Quality(Enum):
 
 
 def use_one_core() -> None:
-    """Restrict OpenCV, in this whole process, to the calling thread.
+    """Restrict OpenCV to the calling thread in this whole process.
 
-    Images this small gain nothing from more threads, and OpenCV's workers would occupy the cores of proxies and
-    applications. A process that only simulates calls this once at its start.
+    Images this small gain nothing from more threads, and OpenCV's workers would take up cores that proxies and
+    applications need. A process that only simulates calls this once at its start.
     """
     cv2.setNumThreads(1)
 
 
 def dimmed(picture: Image, light: float) -> Image:
-    """Multiply all values of an image by a factor of at least 0, in place, rounded, and return it.
+    """Multiply all values of an image in place by a factor of at least 0, rounded, and return the image.
 
-    A table of 256 values makes the result the same bit by bit on every machine.
+    A table of 256 values makes the result identical bit by bit on every machine.
     """
     table = np.clip(np.rint(np.arange(256) * light), 0, 255).astype(np.uint8)
     np.copyto(picture, cv2.LUT(picture, table))
@@ -62,15 +62,15 @@ def dimmed(picture: Image, light: float) -> Image:
 
 
 class PlanarRenderer:
-    """Renders the image of an ideal sensor behind a camera's lens: with distortion, without noise, blur or vignetting.
+    """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
-    Those are added by :class:`SensorEffects`. Reuses buffers, so use it from one thread at a time; several renderers
-    can share a scene.
+    :class:`SensorEffects` adds the latter. The renderer reuses buffers, so use it from one thread at a time. Several
+    renderers can share a scene.
 
     Args:
         scene: The scene.
         quality: Sampling quality.
-        compiler: For compiled drawing; None: always draw without it.
+        compiler: Compiler for compiled drawing; None to always draw without it.
     """
 
     def __init__(
@@ -90,10 +90,10 @@ class PlanarRenderer:
             state: The poses of all moving objects.
             pose: The camera's pose.
             model: The camera's model.
-            out: Where to write the image; None creates an array.
+            out: Array for the image; None creates one.
 
         Returns:
-            BGR, shape (model.height, model.width, 3), uint8.
+            The image, BGR, shape (model.height, model.width, 3), uint8.
 
         Raises:
             UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.
@@ -153,9 +153,9 @@ class PlanarRenderer:
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
-    """Precompute the values for a lens that its first picture would wait for: 0.2 s for 960×720 pixels with distortion.
+    """Precompute a lens's values, so that its first image needn't wait: 0.2 s for 960×720 pixels with distortion.
 
-    They are kept for all renderers of the process.
+    They are kept for all renderers in the process.
     """
     Raster.of(_doubled(model) if quality is Quality.BEST else model, _samples(quality))
 
@@ -177,12 +177,12 @@ def _doubled(model: CameraModel) -> CameraModel:
     return model.scaled(2.0)
 
 
-_NOISE_MARGIN = 61  # rows and pixels of noise beyond the picture's size, so that each frame uses another part
-_BLUR_FROM_PX = 0.8  # a shorter blur is invisible
+_NOISE_MARGIN = 61  # rows and columns of noise beyond the image's size, so that each frame uses another part
+_BLUR_FROM_PX = 0.8  # minimum length of visible blur
 
 
 class SensorEffects:
-    """The flaws of one camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
+    """The flaws of a camera's sensor: motion blur, exposure, vignetting, noise. Use it from one thread at a time.
 
     The flaws of frame ``number`` depend only on the seed and the number, not on earlier frames.
     """
@@ -194,21 +194,21 @@ class SensorEffects:
         self._gain = _gain(model)
         shape = (model.height + _NOISE_MARGIN, (model.width + _NOISE_MARGIN) * 3)
         noise = np.rint(rng.standard_normal(shape, dtype=np.float32) * np.float32(model.noise_sigma))
-        # Saturated addition and subtraction of two byte pictures costs a tenth of one signed addition.
+        # Saturated addition and subtraction of two byte images cost a tenth of one signed addition.
         self._brighter = np.clip(noise, 0, 255).astype(np.uint8)
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Apply the flaws to an image in place, and return it.
+        """Apply the flaws to an image in place and return it.
 
         Args:
-            picture: BGR, of the camera's size.
+            picture: BGR image of the camera's size.
             number: The frame's number.
             body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
                 which blurs the image over the exposure; None for a drone that does not turn.
 
         Raises:
-            UsageError: The image has another size.
+            UsageError: The image has a different size.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
@@ -236,14 +236,14 @@ class SensorEffects:
         steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
         right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
         across, along = abs(right).max(), abs(down).max()
-        # As small as possible: for large kernels OpenCV switches to a slow method in the frequency domain.
+        # As small as possible, because OpenCV uses a slow method in the frequency domain for large kernels.
         kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
         np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 
 def _gain(model: CameraModel) -> Image | None:
-    """Return exposure and vignetting in steps of 1/128; None without either.
+    """Return exposure and vignetting in steps of 1/128; None if there is neither.
 
     Vignetting is like cos⁴: it grows with the square of the distance from the centre.
     """

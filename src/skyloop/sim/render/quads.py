@@ -1,6 +1,6 @@
-"""Textured convex quadrilaterals as arrays, the shapes made of them, and one image with all their textures.
+"""Textured convex quadrilaterals as arrays, the shapes made from them, and one image with all their textures.
 
-Each texture has its smaller versions (mip levels) beside it.
+Each texture has its smaller versions (mip levels) next to it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.sim.render.base import cv2
 
 LEVELS = 7
-BORDER = 4  # pixels repeated around each level, so that interpolation at its rim stays within it
+BORDER = 4  # pixels repeated around each level, so that interpolation at the rim stays within the level
 GAP = 2 * BORDER
-_STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this, so that each level halves exactly
-_LIMIT = 32000  # cv2.remap accepts source pictures of at most 32767 a side
+_STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this, so that each level can be halved exactly
+_LIMIT = 32000  # cv2.remap accepts source images of at most 32767 pixels per side
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,10 +34,10 @@ class Atlas:
     """All textures in one image.
 
     Attributes:
-        image: BGRA (OpenCV samples four channels twice as fast as three).
-        x0: Where each texture's level 0 starts; float64, shape (number of textures,).
-        y0: The same, vertically.
-        span: Twice each texture's padded width.
+        image: The image, BGRA (OpenCV samples four channels twice as fast as three).
+        x0: Column where each texture's level 0 starts; float64, shape (number of textures,).
+        y0: Row where each texture's level 0 starts, likewise.
+        span: Twice the padded width of each texture.
     """
 
     image: NDArray[np.uint8]
@@ -47,14 +47,14 @@ class Atlas:
 
 
 class AtlasBuilder:
-    """Collects textures under keys, each drawn once, and packs them."""
+    """Collects textures under keys, drawing each once, and packs them."""
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
         self._images: list[NDArray[np.uint8]] = []
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
-        """Return the texture for ``key``; if there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
+        """Return the texture for ``key``. If there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
             self._known[key] = Texture(len(self._images), image.shape[1], image.shape[0])
@@ -63,11 +63,11 @@ class AtlasBuilder:
 
     @property
     def images(self) -> list[NDArray[np.uint8]]:
-        """Return the textures so far in the order of their numbers; BGR, shape (h, w, 3)."""
+        """Return the textures so far in the order of their numbers, BGR, shape (h, w, 3)."""
         return self._images
 
     def pack(self) -> Atlas:
-        """Pack all textures on shelves, the tallest first."""
+        """Pack all textures on shelves, starting with the tallest."""
         sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self._images]
         width = max(2048, *(_footprint(w) for w, _ in sizes))
         spots: dict[int, tuple[int, int]] = {}
@@ -111,24 +111,24 @@ def _place(image: NDArray[np.uint8], source: NDArray[np.uint8], x: int, y: int, 
 
 
 Floats = NDArray[np.float64]
-_CORNERS = 4  # the first of a quad's vectors; the normal and the slopes of u and v follow
+_CORNERS = 4  # number of corners, which are a quad's first vectors; then come the normal and the slopes of u and v
 
 
 @dataclass(frozen=True, slots=True)
 class Quads:
-    """``n`` flat convex quadrilaterals; a triangle repeats a corner.
+    """``n`` flat convex quadrilaterals. A triangle repeats a corner.
 
-    Texel u of a point X in the plane is ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from
-    the texture's top left edge.
+    Texel u of a point X in the plane is ``u_slope · X + u_start``, and likewise for v. u points right and v down, both
+    from the texture's top left edge.
     """
 
-    vectors: Floats  #: (n, 7, 3): corners, normal, slope of u, slope of v, in one array, to move them together
-    starts: Floats  #: (n, 2) of u and of v [texel]
-    texture: NDArray[np.intp]  #: (n,) number in the atlas
-    two_sided: NDArray[np.bool_]  #: (n,) also visible from behind
-    priority: NDArray[np.intp]  #: (n,) in one plane the highest is visible
-    lit: NDArray[np.bool_]  #: (n,) brighter when facing the light; false for the sky
-    density: Floats  #: (n,) [texel/m²]
+    vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)
+    starts: Floats  #: starts of u and v, (n, 2) [texel]
+    texture: NDArray[np.intp]  #: number in the atlas, (n,)
+    two_sided: NDArray[np.bool_]  #: whether it is also visible from behind, (n,)
+    priority: NDArray[np.intp]  #: priority, (n,); the highest one in a plane is visible
+    lit: NDArray[np.bool_]  #: whether it is brighter when facing the light, (n,); false for the sky
+    density: Floats  #: density, (n,) [texel/m²]
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -140,7 +140,7 @@ class Quads:
 
     @property
     def normals(self) -> Floats:
-        """Unit vectors towards the front, (n, 3)."""
+        """Unit vectors pointing to the front, (n, 3)."""
         return self.vectors[:, _CORNERS]
 
     @property
@@ -164,16 +164,16 @@ class Quads:
         return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
-        """Return these quads followed by the others."""
+        """Return these quads followed by other ones."""
         return concatenate([self, other])
 
     def moved(self, position_m: Floats, rotation: Floats) -> Quads:
-        """Return the same quads after a rotation (3, 3) and a shift (3,)."""
+        """Return the same quads after a rotation (3, 3) and a translation (3,)."""
         return moved_each(self, position_m[None], rotation[None])
 
 
 def moved_each(many: Quads, positions_m: Floats, rotations: Floats) -> Quads:
-    """Return quads of ``n`` equal bodies, body by body, each after a rotation (n, 3, 3) and a shift (n, 3)."""
+    """Return quads of ``n`` equal bodies, body by body, each after a rotation (n, 3, 3) and a translation (n, 3)."""
     vectors, starts = np.empty_like(many.vectors), np.empty_like(many.starts)
     move_each(many, positions_m, rotations, vectors, starts)
     return replace(many, vectors=vectors, starts=starts)
@@ -190,7 +190,7 @@ def move_each(many: Quads, positions_m: Floats, rotations: Floats, vectors: Floa
 
 
 def concatenate(parts: list[Quads]) -> Quads:
-    """Return all quads of several batches, in order."""
+    """Return all quads from several batches, in order."""
     return Quads(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Quads)))
 
 
@@ -212,15 +212,15 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a rectangle, described as seen from its front.
+        """Add a rectangle, described as seen from the front.
 
         Args:
-            lower_left: Its corner [m].
+            lower_left: The lower left corner [m].
             right: The edge to the right [m].
             up: The edge upwards [m].
-            texture: Its texture.
+            texture: The rectangle's texture.
             two_sided: Whether it is also visible from behind.
-            priority: Of quads in one plane the one with the highest is visible.
+            priority: Priority; the quad with the highest one in a plane is visible.
             lit: Whether it is brighter when facing the light.
             uv: The visible part of the texture (left, top, right, bottom in texels); None for all of it.
         """
@@ -241,7 +241,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """Add a quad (4, 3) cut from the textured rectangle given by the corner and the two edges."""
+        """Add a quad (4, 3) cut from the textured rectangle that is given by the corner and the two edges."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))
@@ -268,13 +268,13 @@ class QuadBuilder:
         sides: Texture | tuple[Texture, Texture],
         ends: Texture | None = None,
     ) -> None:
-        """Add an upright box, visible from outside.
+        """Add an upright box that is visible from outside.
 
         Args:
             low: Its lowest corner [m].
             high: Its highest corner [m].
-            sides: Texture of the four sides; a pair is for the sides facing along x and those facing along y.
-            ends: Texture of top and bottom; None uses the texture of the sides facing along x.
+            sides: Texture of the four sides, or a pair for the sides facing along x and along y.
+            ends: Texture of the top and bottom; None for that of the sides facing along x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
@@ -288,7 +288,7 @@ class QuadBuilder:
         self.rectangle((x0, y1, z0), (dx, 0, 0), (0, -dy, 0), ends)
 
     def disc(self, centre: ArrayLike, radius_m: float, texture: Texture) -> None:
-        """Add a level regular octagon with the whole texture on its enclosing square, visible from both sides."""
+        """Add a level regular octagon, with the whole texture on its enclosing square, visible from both sides."""
         middle = np.asarray(centre, dtype=np.float64)
         angle = np.pi / 8 + np.arange(8) * (np.pi / 4)
         rim = middle + radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(8)])

@@ -1,4 +1,4 @@
-"""A world prepared for rendering: its textures in one atlas, fixed parts as quads, moving parts as templates."""
+"""A world prepared for rendering: textures in one atlas, fixed parts as quads, moving parts as templates."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from skyloop.sim.render.shading import Shadow
 from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import BoardTarget, Box, FigureTarget, PlatformTarget, Room, World
 
-_FADES_AT_M = 4.0  # a drone this high above a surface leaves no visible shadow on it
+_FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """All parts of a scene at one time. ``drone``: the drone whose body a quad belongs to, -1 for none, (n,)."""
+    """All parts of a scene at a point in time. ``drone``: the drone whose body a quad belongs to, or -1, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]
@@ -34,7 +34,7 @@ class Posed:
 class Scene:
     """The renderable parts of a world with a number of drones.
 
-    Building it draws all textures (some tenths of a second); after that it never changes, so renderers on several
+    Building it draws all textures (some tenths of a second). It never changes afterwards, so renderers on several
     threads can share it.
 
     Raises:
@@ -59,9 +59,9 @@ class Scene:
             for target, template in zip(world.targets, self._targets, strict=True)
             for part in ([template, self._stand] if isinstance(target, BoardTarget) else [template])
         ]
-        # All parts in the order of ``posed``, for properties that motion does not change.
+        # All parts in the order of ``posed``, for properties that don't change with motion.
         self._everything = concatenate([self._static, *standing, *self._hulls])
-        #: The target of the world that a quad belongs to, -1 for none, (n,).
+        #: Number of the world's target that a quad belongs to, -1 for none, (n,).
         self.target_of = np.concatenate(
             [np.full(len(self._static), -1, np.intp)]
             + [
@@ -70,7 +70,7 @@ class Scene:
             ]
             + [np.full(len(hull), -1, np.intp) for hull in self._hulls]
         )
-        #: The box of the world that a quad belongs to, -1 for none, (n,).
+        #: Number of the world's box that a quad belongs to, -1 for none, (n,).
         self.box_of = np.full(len(self.target_of), -1, np.intp)
         sides = np.repeat(np.arange(len(world.solids())), SIDES)
         first = len(self._static) - len(world.panels) - len(world.markers) - len(sides)
@@ -80,7 +80,7 @@ class Scene:
         self._owner = np.concatenate(owners)
         self._swarm = concatenate(self._hulls) if self._hulls else None
         self.atlas = atlas.pack()
-        # Surfaces that shadows can fall on: upright solids, as cosine and sine of the yaw, centre, half size, and top.
+        # Surfaces for shadows to fall on: upright solids, as cosine and sine of yaw, centre, half size and top.
         self._tops = [
             (
                 math.cos(box.yaw_rad),
@@ -96,7 +96,7 @@ class Scene:
         """Place all moving parts according to a state.
 
         Raises:
-            UsageError: The state has another number of drones or targets.
+            UsageError: The state has a different number of drones or targets.
         """
         shape = np.shape(state.drone_positions_m), np.shape(state.drone_rotations)
         if shape != ((self.drones, 3), (self.drones, 3, 3)):
@@ -135,7 +135,7 @@ class Scene:
         return Posed(replace(self._everything, vectors=vectors, starts=starts), self._owner, tuple(shadows))
 
     def _drone_shadow(self, position_m: list[float]) -> Shadow | None:
-        """Return the soft spot on the surface below a drone; None if the drone is too high above it."""
+        """Return a drone's soft shadow on the surface below it; None if the drone is too high above that surface."""
         x, y, z = position_m
         surface = 0.0
         for c, s, at_x, at_y, half_x, half_y, top in self._tops:
@@ -155,11 +155,11 @@ def _yaw(angle: float) -> NDArray[np.float64]:
 
 
 _FINEST = 128.0  # texels per metre of a room's surfaces, if its size allows
-_LARGEST = 1280.0  # texels along a side of such a surface
+_LARGEST = 1280.0  # maximum number of texels along a side of a room's surface
 _AFAR_M = 150.0  # extent of the open ground
 _SKY_M = 400.0  # half the side of the sky
-SIDES = 6  #: quads of a box; in ``static_quads`` the shell comes first, then boxes, panels, markers
-# Direction of solids' shadows: away from the light of ``shading``, shortened, as in a room lit from all around.
+SIDES = 6  #: quads per box; ``static_quads`` has the shell first, then boxes, panels, markers
+# Direction of solids' shadows: away from the light in ``shading``, but shorter, as in a room lit from all sides.
 _LEAN = np.array([-0.16, 0.20])
 
 
@@ -223,7 +223,7 @@ def _shaded(picture: NDArray[np.uint8], light: NDArray[np.float32]) -> NDArray[n
 
 
 def _corner_dark(height: int, width: int, per_m: float, sides: float, top: float, bottom: float) -> NDArray[np.float32]:
-    """Return the light near edges: reduced by these shares towards the sides, the top and the bottom."""
+    """Return the light near edges, reduced by these fractions towards the sides, the top and the bottom."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / per_m
     y = (np.arange(height, dtype=np.float32) + 0.5) / per_m
     across = 1.0 - sides * (np.exp(-x / 0.35) + np.exp(-x[::-1] / 0.35))
@@ -255,7 +255,7 @@ def _ceiling(room: Room, density: float) -> NDArray[np.uint8]:
     per_m = density / 2
     picture = draw_surface(room.ceiling, room.size_m[0], room.size_m[1], per_m)
     height, width = picture.shape[:2]
-    bright = 1.16 if room.ceiling == "plaster" else 1.0  # the floor lights surfaces that face down
+    bright = 1.16 if room.ceiling == "plaster" else 1.0  # the floor reflects light onto surfaces that face down
     lit = _shaded(picture, bright * _corner_dark(height, width, per_m, 0.18, 0.18, 0.18))
     for cx in np.arange(1, 2 * max(1, round(room.size_m[0] / 3)), 2) / (2 * max(1, round(room.size_m[0] / 3))):
         for cy in np.arange(1, 2 * max(1, round(room.size_m[1] / 3)), 2) / (2 * max(1, round(room.size_m[1] / 3))):
@@ -295,7 +295,7 @@ def _box(box: Box, atlas: AtlasBuilder) -> Quads:
 
 
 def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
-    """Add the ground around the room's floor, as far as visible, and a sky."""
+    """Add the ground around the room's floor, as far as it is visible, and a sky."""
     x, y, far = room.size_m[0] / 2, room.size_m[1] / 2, _AFAR_M
     ground = _surface(atlas, room.floor, 2 * far, 2 * far, 512 / (2 * far))
     for low, high in (
@@ -305,7 +305,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
         ((x, -y), (far, y)),
     ):
         if high[0] <= low[0] or high[1] <= low[1]:
-            continue  # the floor extends as far
+            continue  # the floor extends this far
         texels = ground.width / (2 * far)
         uv = ((low[0] + far) * texels, (far - high[1]) * texels, (high[0] + far) * texels, (far - low[1]) * texels)
         shapes.rectangle((*low, 0), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), ground, uv=uv)
@@ -322,7 +322,7 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
 
 
 def _sky() -> NDArray[np.uint8]:
-    """Draw a sky, from haze at the horizon to blue above; about the lowest quarter is below the horizon."""
+    """Draw a sky, from haze at the horizon to blue above. About the lowest quarter is below the horizon."""
     rise = np.clip(1.0 - np.arange(256, dtype=np.float32) / 197.0, 0.0, 1.0)[:, None, None]
     low, high = np.array([226.0, 214.0, 198.0]), np.array([206.0, 156.0, 104.0])
     return np.broadcast_to(low + (high - low) * np.sqrt(rise), (256, 64, 3)).astype(np.uint8)

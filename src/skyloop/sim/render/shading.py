@@ -1,4 +1,4 @@
-"""The colour of samples whose quads are known, and soft shadows."""
+"""Colouring of samples whose quads are known, and soft shadows."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from skyloop.sim.render.visibility import View, dot, turned
 
 CHUNK = 16384  # samples per batch: few enough for the working arrays to stay in the cache
 
-# Light from high above, a little from the east and the south, plus ambient light; moderate contrast between faces.
+# Light from high above and slightly from the east and south, plus ambient light: moderate contrast between faces.
 SUN = np.array([0.33, -0.42, 0.85])
 TO_SUN = SUN / np.linalg.norm(SUN)
 AMBIENT, DIRECT = 0.74, 0.30
 UNIT = 128.0  # light 1.0 in the eight-bit gain
-# Pixels count as this much smaller when a level is chosen: a little shimmer for sharper textures. Twice: see below.
+# Factor on the pixel size when choosing a level: sharper textures for a little shimmer. Twice, as explained below.
 FOOTPRINT = 2.0 * 0.6
-FARTHEST = np.float32(1e-6)  # 1/z assumed for a ray beyond a quad's horizon [1/m]
+FARTHEST = np.float32(1e-6)  # 1/z to assume for a ray beyond a quad's horizon [1/m]
 _ONE = 0x3F800000  # 1.0 as the bits of a float32
 
 
 def light_on(normals: Floats) -> Floats:
-    """Return the brightness of faces from their normals, shape (n,), around 1."""
+    """Return the brightness of faces, around 1, from their normals, shape (n,)."""
     return np.asarray(AMBIENT + DIRECT * np.maximum(dot(normals, TO_SUN), 0.0))
 
 
 def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pixel_area: float) -> NDArray[np.float32]:
-    """Return one column per quad of the view, after a column 0 for "nothing".
+    """Return one column per quad in the view, after a column 0 for "nothing".
 
     The rows are a', b', c (three each), footprint, atlas x and y, and light; float32, shape (13, m + 1). ``pixel_area``
     is 1/(fx fy) of the image.
@@ -40,7 +40,7 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     c = view.inverse_depth
     u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
     texture = quads.texture[k]
-    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0, see ``Atlas``.
+    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0 (see ``Atlas``).
     under_u = dot(u_slope, pose.position_m) + quads.u_start[k] - atlas.span[texture]
     under_v = dot(v_slope, pose.position_m) + quads.v_start[k]
     table = np.zeros((13, len(k) + 1))
@@ -52,12 +52,12 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     table[11, 1:] = atlas.y0[texture] - 0.5
     facing = np.where(view.height_m > 0.0, 1.0, -1.0)[:, None]
     table[12, 1:] = np.where(quads.lit[k], light_on(quads.normals[k] * facing), 1.0) * UNIT
-    table[8, 0] = 1.0  # any finite depth serves for "nothing", as its light is 0
+    table[8, 0] = 1.0  # any finite depth will do for "nothing", because its light is 0
     return table.astype(np.float32)
 
 
 class Shader:
-    """Colours samples from an atlas. Reuses buffers, so use it from one thread at a time."""
+    """Colours samples from an atlas. It reuses buffers, so use it from one thread at a time."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._image = atlas.image
@@ -77,15 +77,15 @@ class Shader:
         colours: NDArray[np.uint8],
         inverse_depth: NDArray[np.float32],
     ) -> None:
-        """Write the colours and inverse depths of samples.
+        """Write the samples' colours and inverse depths.
 
         Args:
-            table: From :func:`sampling_table`.
+            table: The table from :func:`sampling_table`.
             seen: The table's column for each sample, (n,).
             ray_x: x of the ray (x, y, 1), (n,).
             ray_y: y of the ray, (n,).
-            colours: Output: BGRA, shape (n, 4).
-            inverse_depth: Output [1/m], (n,).
+            colours: Output: colours, BGRA, shape (n, 4).
+            inverse_depth: Output: inverse depths [1/m], (n,).
         """
         for start in range(0, len(seen), CHUNK):
             part = slice(start, min(start + CHUNK, len(seen)))
@@ -141,7 +141,7 @@ class Shader:
         np.add(v, got, out=v)
         np.clip(u, 0.0, self._image.shape[1] - 2.0, out=u)
         np.clip(v, 0.0, self._image.shape[0] - 2.0, out=v)
-        # In 1/32 texel: all versions of OpenCV round these alike, and sample them faster.
+        # In 1/32 texel, which all versions of OpenCV round the same way and sample faster.
         cv2.convertMaps(u[None], v[None], cv2.CV_16SC2, dstmap1=self._places[:, :n], dstmap2=self._parts[:, :n])
         places, parts = self._places[:, :n], self._parts[:, :n]
         cv2.remap(self._image, places, parts, cv2.INTER_LINEAR, dst=colours, borderMode=cv2.BORDER_REPLICATE)
@@ -152,7 +152,7 @@ class Shader:
         cv2.multiply(colours, light4, dst=colours, scale=1.0 / UNIT)
 
 
-# Distance of a pixel from a shadow's plane, as a share of its depth, up to which the shadow darkens it.
+# Maximum distance of a pixel from the plane of a shadow that darkens it, as a fraction of the pixel's depth.
 _THICKNESS = 4e-3
 _MORE_M = 4e-3
 _NEAR_M = 0.01
@@ -160,12 +160,12 @@ _NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A level round spot with less light.
+    """A level round spot that gets less light.
 
     Attributes:
-        centre_m: World axes.
-        radius_m: Radius of its edge.
-        strength: Share of light missing in its middle, 0 to 1.
+        centre_m: Centre in world axes.
+        radius_m: Radius of the edge.
+        strength: Fraction of the light missing in the middle, 0 to 1.
     """
 
     centre_m: NDArray[np.float64]
@@ -175,7 +175,7 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class Extremes:
-    """Minimum and maximum of x/z or y/z in each column or row of a picture, (n,), and overall."""
+    """Minimum and maximum of x/z or y/z in each column or row of an image, (n,), and overall."""
 
     least: NDArray[np.float32]
     most: NDArray[np.float32]
@@ -184,12 +184,12 @@ class Extremes:
 
     @staticmethod
     def along(values: NDArray[np.float32], axis: int) -> Extremes:
-        """Compute them; axis 0: of columns."""
+        """Compute the extremes; axis 0 is for those of columns."""
         least, most = values.min(axis=axis), values.max(axis=axis)
         return Extremes(least, most, float(least.min()), float(most.max()))
 
     def span(self, low: float, high: float) -> tuple[int, int] | None:
-        """Return the first column or row that may see something between two bounds, and the end; None if empty."""
+        """Return the first column or row that may see between two bounds, and the end; None if there is none."""
         if not (low <= self.high and high >= self.low):
             return None
         where = ((self.most >= low) & (self.least <= high)).nonzero()[0]
@@ -202,8 +202,8 @@ class Rays:
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
-    columns: Extremes  #: of x
-    rows: Extremes  #: of y
+    columns: Extremes  #: extremes of x
+    rows: Extremes  #: extremes of y
 
     @staticmethod
     def of(x: NDArray[np.float32], y: NDArray[np.float32]) -> Rays:
@@ -216,10 +216,10 @@ class Placed:
     """A shadow in a camera's view.
 
     Attributes:
-        box: First row that may show it, row after the last, first column, column after the last.
-        axes: World from optical.
+        box: First row that may show the shadow, row after the last, first column, column after the last.
+        axes: Rotation from optical to world axes.
         numbers: Its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius
-            [m²]; strength of 255; tolerance of a pixel's distance from the plane: share of the depth, and more [m].
+            [m²]; strength of 255; tolerance of a pixel's distance from the plane: fraction of depth, constant part [m].
     """
 
     box: tuple[int, int, int, int]
@@ -228,7 +228,7 @@ class Placed:
 
 
 def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
-    """Return a shadow in a camera's view; None if it is nowhere visible."""
+    """Return a shadow in a camera's view; None if it is not visible anywhere."""
     away = pose.position_m - shadow.centre_m
     at = _seen_at((-away @ pose.rotation).tolist(), (shadow.radius_m * pose.rotation[:2]).tolist())
     if not at:
@@ -243,10 +243,10 @@ def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
 
 
 def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth: NDArray[np.float32]) -> None:
-    """Darken the pixels of an image that show the shadow's area.
+    """Darken the pixels of an image that show the area of a shadow.
 
     Args:
-        picture: BGR, (height, width, 3), changed in place.
+        picture: BGR image, (height, width, 3), changed in place.
         shadow: The shadow.
         rays: The lens's rays.
         inverse_depth: Inverse depth of each pixel [1/m], (height, width).
@@ -267,11 +267,11 @@ def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth
 
 
 def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float, float]]:
-    """Return x/z and y/z of the corners of a square's part more than 1 cm ahead, optical axes.
+    """Return x/z and y/z of the corners of the part of a square that is more than 1 cm ahead, in optical axes.
 
     Args:
         centre: The square's centre [m].
-        sides: Vectors from there to the middles of two sides [m].
+        sides: Vectors from the centre to the middles of two sides [m].
     """
     (ax, ay, az), (bx, by, bz) = sides
     signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

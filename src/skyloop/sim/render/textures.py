@@ -1,4 +1,4 @@
-"""The surfaces of a world, drawn by program: every name in :data:`skyloop.sim.world.TEXTURES`.
+"""Procedurally drawn surfaces for worlds: every name in :data:`skyloop.sim.world.TEXTURES`.
 
 Materials (parquet, brick …) keep their scale at any size of the surface; objects (crate, door, window, posters) fill it
 once. All are reproducible: the same size and seed give the same pixels.
@@ -23,7 +23,7 @@ Picture = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A surface to draw on: its size in pixels, pixels per metre, and its own random generator."""
+    """A surface to draw on, with its size in pixels, pixels per metre and its own random generator."""
 
     height: int
     width: int
@@ -32,16 +32,16 @@ class Sheet:
 
     @property
     def x_m(self) -> NDArray[np.float32]:
-        """Metres from the left of each column, shape (1, width)."""
+        """Distance of each column from the left [m], shape (1, width)."""
         return (np.arange(self.width, dtype=np.float32) + 0.5)[None, :] / np.float32(self.per_m)
 
     @property
     def y_m(self) -> NDArray[np.float32]:
-        """Metres from the bottom of each row, shape (height, 1)."""
+        """Distance of each row from the bottom [m], shape (height, 1)."""
         return (np.arange(self.height, 0, -1, dtype=np.float32) - 0.5)[:, None] / np.float32(self.per_m)
 
     def px(self, metres: float) -> int:
-        """Pixels of a length, at least 1."""
+        """Number of pixels for a length, at least 1."""
         return max(1, round(metres * self.per_m))
 
 
@@ -61,7 +61,7 @@ def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed:
 
 
 def draw_paint(rgb: tuple[int, int, int], height: int = 64, width: int = 64) -> NDArray[np.uint8]:
-    """Draw a painted surface, BGR: one colour with a faint unevenness and a worn rim."""
+    """Draw a painted surface, BGR: one colour with slight unevenness and a worn rim."""
     rng = np.random.default_rng(zlib.crc32(bytes(rgb)))
     light = 1.0 + 0.05 * clouds(rng, height, width, max(4, width / 6)) + 0.02 * grain(rng, height, width)
     picture = tinted((rgb[2], rgb[1], rgb[0]), light, height, width)
@@ -88,13 +88,13 @@ def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple
 
 
 def _per_piece(piece: NDArray[np.intp], salt: int) -> Picture:
-    """Return a number within ±1 for each piece, constant over the piece."""
+    """Return a number within ±1 for each pixel that is constant over each piece."""
     values = np.random.default_rng([salt, 7]).random(1009, dtype=np.float32) * np.float32(2.0) - np.float32(1.0)
     return np.asarray(values[piece % 1009])
 
 
 def _joints(sheet: Sheet, along: Picture, across: Picture, length_m: float, course_m: float, gap_m: float) -> Picture:
-    """Return 1 in the joints between pieces, 0 within, with soft edges."""
+    """Return 1 in the joints between pieces and 0 elsewhere, with soft edges."""
     gap_m = max(gap_m, 0.8 / sheet.per_m)
     distance = np.minimum(np.minimum(along, 1 - along) * length_m, np.minimum(across, 1 - across) * course_m)
     return np.asarray(np.clip(1.5 - distance * np.float32(2.0 / gap_m), 0.0, 1.0), dtype=np.float32)
@@ -216,7 +216,7 @@ def _books(s: Sheet) -> Picture:
 
 
 def _book(s: Sheet, picture: Picture, x: int, bottom: int, room: int) -> int:
-    """Draw the back of one book, standing at a column; return the column after it."""
+    """Draw the spine of a book that stands at a column, and return the column after it."""
     wide = max(2, s.px(s.rng.uniform(0.018, 0.055)))
     end = min(x + wide, s.width)
     if s.rng.random() < 0.08:  # a gap

@@ -1,9 +1,9 @@
-"""Find the quad visible at each sample of a picture: geometry without clipping, then a depth buffer.
+"""Finding the quad visible at each sample of an image, by geometry without clipping and a depth buffer.
 
-A ray r through the eye meets a convex polygon in front of the eye exactly if it lies on the inner side of every plane
+A ray r through the eye meets a convex polygon in front of the eye exactly if it is on the inner side of every plane
 through the eye and an edge: (v_i × v_{i+1}) · r has the same sign for all edges. This also holds for corners behind the
-eye, so nothing is clipped and no wall is lost at a grazing angle. On one row of the picture each edge becomes a bound
-on x. Across the picture 1/z is linear: 1/z = (n · r) / (n · v_0).
+eye, so nothing is clipped and no wall is lost at a grazing angle. On one row of the image, each edge becomes a bound on
+x. Across the image, 1/z is linear: 1/z = (n · r) / (n · v_0).
 Source: M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates", Graphics Hardware 1997.
 """
 
@@ -18,16 +18,16 @@ from skyloop.sim.camera import CameraPose
 from skyloop.sim.render.base import cv2
 from skyloop.sim.render.quads import Floats, Quads
 
-# How much nearer a picture on a wall counts than the wall behind it, per step of priority, as a share of the distance.
+# How much closer a picture counts than the wall behind it, per step of priority, as a fraction of the distance.
 PRIORITY_SHARE = 1e-3
-# A quad this nearly edge-on (distance of the eye from its plane [m]) covers nothing visible.
+# Maximum distance of the eye from the plane of a quad that is edge-on and covers nothing visible [m].
 EDGE_ON_M = 1e-5
 _BAND = 32768  # samples of a quad per batch: few enough for the working arrays to stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Samples of a distortion-free image plane: sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
+    """Samples of a distortion-free image plane, where sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
 
     width: int
     height: int
@@ -39,11 +39,11 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The quads that may be visible from a pose, and their place on the grid. The first axis of all arrays is m long.
+    """The quads that may be visible from a pose, and their position on the grid. All arrays have m as their first axis.
 
-    ``index``: their numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
-    ``height_m``: of the eye above the plane, signed, (m,). ``first``, ``end``: columns covered in each row,
-    (m, height). ``box``: x0, y0, x1, y1 around it, (m, 4).
+    ``index``: numbers in the batch. ``inverse_depth``: c with 1/z = c · ray, ray = (x/z, y/z, 1), shape (m, 3).
+    ``height_m``: signed height of the eye above the plane, (m,). ``first``, ``end``: columns covered in each row,
+    (m, height). ``box``: bounds x0, y0, x1, y1, (m, 4).
     """
 
     index: NDArray[np.intp]
@@ -55,19 +55,19 @@ class View:
 
 
 def dot(a: Floats, b: Floats) -> Floats:
-    """Return a · b along the last axis of three, summed in order: independent of libraries, so the same bits."""
+    """Return a · b along the last axis of three, summed in order: independent of libraries, so always the same bits."""
     return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
 
 
 def turned(vectors: Floats, rotation: Floats) -> Floats:
-    """Return vectors, shape (…, 3), times a rotation from the right, with the sums of :func:`dot`."""
+    """Return vectors, shape (…, 3), multiplied by a rotation from the right, with sums as in :func:`dot`."""
     return np.stack([dot(vectors, rotation[:, axis]) for axis in range(3)], axis=-1)
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return the ``shown`` quads, (n,), that are separately visible from a pose through a grid.
+    """Return those of the ``shown`` quads, (n,), that are individually visible from a pose through a grid.
 
-    Occlusion is left to :class:`DepthBuffer`.
+    :class:`DepthBuffer` handles occlusion.
     """
     height_m = dot(quads.normals, pose.position_m - quads.corners[:, 0])
     facing = (height_m > EDGE_ON_M) | (quads.two_sided & (height_m < -EDGE_ON_M))
@@ -92,7 +92,7 @@ def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid
 
 
 def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
-    """Return False for quads entirely beyond one side of the view or behind the eye; corners (m, 4, 3) optical."""
+    """Return False for quads entirely beyond one side of the view or behind the eye. Corners (m, 4, 3) are optical."""
     x, y, z = corners[..., 0], corners[..., 1], corners[..., 2]
     left, right = -(0.5 + grid.cx) / grid.fx, (grid.width - 0.5 - grid.cx) / grid.fx
     top, bottom = -(0.5 + grid.cy) / grid.fy, (grid.height - 0.5 - grid.cy) / grid.fy
@@ -102,11 +102,11 @@ def _touches_view(corners: Floats, grid: Grid) -> NDArray[np.bool_]:
 
 
 def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Return the first and one-past-last column in each row, (m, height), inside of edge planes, (m, 4, 3)."""
+    """Return the first and one-past-last column in each row, (m, height), inside edge planes, (m, 4, 3)."""
     slope_x = edges[..., 0] / grid.fx
     slope_y = edges[..., 1] / grid.fy
     start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
-    # An exactly level edge bounds no column; the tiny slope makes it all or nothing for a whole row.
+    # An exactly level edge bounds no columns; with this tiny slope it includes all or none of a row.
     slope_x[slope_x == 0.0] = 1e-30
     crossing = (slope_y / -slope_x)[..., None] * np.arange(grid.height) + (start / -slope_x)[..., None]
     rising = (slope_x > 0.0)[..., None]
@@ -121,8 +121,8 @@ class DepthBuffer:
     """Finds the nearest quad at each sample.
 
     Attributes:
-        seen: Its index in the view plus one, 0 for none; int32, shape (height, width). Overwritten by the
-            next :meth:`draw`.
+        seen: Index in the view of the quad at each sample plus one, 0 for none; int32, shape (height, width).
+            Overwritten by the next :meth:`draw`.
     """
 
     def __init__(self, grid: Grid) -> None:
@@ -138,7 +138,7 @@ class DepthBuffer:
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
-        """Update :attr:`seen`. ``priority``: of each quad of the view, (m,)."""
+        """Update :attr:`seen`. ``priority``: that of each quad in the view, (m,)."""
         grid = self._grid
         slope = view.inverse_depth * (1.0 + PRIORITY_SHARE * priority)[:, None] / (grid.fx, grid.fy, 1.0)
         start = slope[:, 2] - slope[:, 0] * grid.cx - slope[:, 1] * grid.cy
@@ -159,7 +159,7 @@ class DepthBuffer:
         along_y: NDArray[np.float32],
         box: tuple[int, int, int, int],
     ) -> None:
-        """Draw the part of one quad within a box wherever it is nearer than earlier quads."""
+        """Draw the part of a quad within a box wherever it is closer than earlier quads."""
         x0, y0, x1, y1 = box
         size = (y1 - y0) * (x1 - x0)
         shape = (y1 - y0, x1 - x0)
