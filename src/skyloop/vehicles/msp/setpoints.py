@@ -58,8 +58,8 @@ STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means in
 #: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but still shows sinking at 0.15 m/s.
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction while it seems to be on the ground, fraction per second
-OFF_BELOW: Final = 0.6  #: it counts as on the ground below this fraction of the hover throttle
-BLIND: Final = 0.93  #: fraction of the hover throttle, for sinking, while the climb is unknown
+OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
+BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
 BLIND_NS: Final = nanoseconds(6.0)  #: it is disarmed if the climb is unknown for this long
 MOST_LEARNT: Final = 0.9  #: greatest hover throttle that is learnt
 LEAST_LEARNT: Final = 0.05
