@@ -185,10 +185,7 @@ EARTH_RADIUS_M: Final = 6_371_000.0
 
 
 class VelocityFilter:
-    """A critically damped g-h filter that turns positions into velocity.
-
-    See E. Brookner, "Tracking and Kalman Filtering", 1998.
-    """
+    """A critically damped g-h filter for velocity (E. Brookner, "Tracking and Kalman Filtering", 1998)."""
 
     def __init__(self) -> None:
         self.velocity: Vector | None = None  #: None until the second position

@@ -349,9 +349,8 @@ PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older than this or i
 class CaptureClock:
     """Converts one topic's stamps to this host's monotonic clock.
 
-    A stamp slightly older than the system clock's time is taken to be from that clock. Other stamps come from a
-    simulation or from a clock that is not set; for them the smallest recent delay counts as zero. Times never go
-    backwards.
+    A stamp slightly older than the system clock's time belongs to that clock. Other stamps come from a simulation or
+    an unset clock; for them the smallest recent delay counts as zero. Times never go backwards.
     """
 
     def __init__(self) -> None:

@@ -42,9 +42,8 @@ AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.BETAFLIGHT: "racer",
     AutopilotKind.PX4: "iris",
 }
-#: Lag beyond which steps are skipped with firmware that uses the computer's clock. Such firmware can't catch up, so
-#: world time would fall behind and images would appear old.
-REAL_TIME_LAG_S: Final = 0.02
+#: Firmware on the computer's clock can't catch up: world time would fall behind, and images would appear old.
+REAL_TIME_LAG_S: Final = 0.02  #: lag beyond which steps are skipped with such firmware
 TRUTH_HZ: Final = 100.0  #: rate at which the truth that accompanies the firmware's state is stored
 
 

@@ -1,9 +1,8 @@
 """The AR.Drone's AT commands (UDP port 5556): format and parse their text lines. Pure.
 
-A command is ``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several commands, but a command
-never spans two datagrams. Numbers are signed decimals, texts are enclosed in double quotes, and a float is sent as the
-signed integer with the same 32 bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` in the
-AR.Drone SDK 2.0.1.
+A command is ``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several, but none spans two.
+Numbers are signed decimals, texts are in double quotes, and a float is sent as the signed integer with the same 32
+bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` in the AR.Drone SDK 2.0.1.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def become_prompt() -> None:
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
 
-TERMINATE_S: Final = 2.0  #: time allowed for the firmware to exit on request
+TERMINATE_S: Final = 2.0  #: for the firmware to exit on request
 PROMPT: Final = "--prompt"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 

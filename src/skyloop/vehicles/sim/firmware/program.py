@@ -96,9 +96,8 @@ class Program:
             prepare: Called before each start with the working folder; writes the files that the firmware reads there.
                 Raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
             report: Called with each event, on one of this object's threads.
-            verify: Called once the process is running, before the start is reported. It raises ``OSError`` if the
-                start failed and the process must be ended and restarted, or :class:`StartedInVainError` to do so at
-                once. None for no check.
+            verify: Called once the process is running, before the start is reported; None for no check. Raises
+                ``OSError`` to have it ended and restarted, or :class:`StartedInVainError` to do that at once.
             folder: Working folder with the firmware's settings; None for a new one that is removed at the end.
             restart_s: Time from the process's end to its next start [s].
         """
