@@ -54,7 +54,7 @@ _CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 
 
 class _Observer:
-    """Makes the observations of all drones of a task in the requested form.
+    """Makes observations in the requested form for all drones of a task.
 
     Attributes:
         space: The observation space of one drone.

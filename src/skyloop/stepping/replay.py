@@ -65,7 +65,7 @@ class SteppedReplay:
         self._ended = False
 
     def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (the proxy is already serving)
-        """Return a dialer for the proxy, which is already serving."""
+        """Return a dialer for the proxy, which already accepts clients."""
         return self._server.dial
 
     def close(self) -> None:

@@ -91,7 +91,7 @@ class Entry:
 
     parameter: Parameter
     key: str
-    like: bool | int | float | str | tuple[float, ...]  #: a value of the key's type
+    like: bool | int | float | str | tuple[float, ...]  #: any value of the key's type
     divisor: float = 1.0
     names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if it has no named values
 

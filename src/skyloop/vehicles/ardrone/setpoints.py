@@ -124,7 +124,7 @@ class Condition:
 
     state: State
     control: ControlState | None = None
-    altitude_m: float | None = None  #: above the surface below; None: unknown
+    altitude_m: float | None = None  #: height above the surface below; None if unknown
 
     @property
     def flying(self) -> bool:

@@ -217,7 +217,7 @@ def _name(kind: type[Any]) -> str:
 
 #: Names of each option's fields.
 _FIELDS: Final = {kind: tuple(f"{_name(kind)}.{field}" for field in kind._fields) for kind in LAYOUTS}
-#: Tags by option name, as used in ``navdata_options`` of an address.
+#: Tags by option name, as in an address's ``navdata_options``.
 OPTION_TAGS: Final = {_name(kind): layout.tag for kind, layout in LAYOUTS.items()}
 #: Number of useful fields in the demo option: its matrices are deprecated, and most tag fields are empty.
 _DEMO_FIELDS: Final = len(Demo._fields) - 6
@@ -280,7 +280,7 @@ def emergency_reason(state: State) -> str:
 
 
 class Health:
-    """Reports each change of the drone's health bits once."""
+    """Reports each change in the drone's health bits once."""
 
     def __init__(self) -> None:
         self._reported = State(0)

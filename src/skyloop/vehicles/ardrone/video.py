@@ -340,7 +340,7 @@ def _codec_name(codec: int) -> str:
         return str(codec)
 
 
-# Encoded pictures for recorders --------------------------------------------------------------------------------------
+# Encoded images for recorders ----------------------------------------------------------------------------------------
 
 
 class EncodedStream:

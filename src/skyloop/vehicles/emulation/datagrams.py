@@ -117,7 +117,7 @@ Address = tuple[str, int]
 
 MAX_DATAGRAM: Final = 65_507
 _MOST_AT_ONCE: Final = 64  # datagrams read before other callbacks run
-_SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
+_SEND_BUFFER: Final = 1 << 20  # bytes, with room for an AR.Drone 1's images
 
 
 class DatagramPort:
@@ -146,7 +146,7 @@ class DatagramPort:
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
@@ -229,7 +229,7 @@ class ByteServer:
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return int(self._server.getsockname()[1])
 
     def send(self, data: bytes) -> None:

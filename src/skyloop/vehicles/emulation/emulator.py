@@ -91,7 +91,7 @@ class RunningEmulator(ABC):
             self._video.show(model.name, pixels, captured_ns)
 
     def failed(self, error: Exception) -> None:
-        """Log an error of the simulation or the renderer.
+        """Log an error in the simulation or the renderer.
 
         Once reports stop, the firmware sends nothing, like a dead drone.
         """

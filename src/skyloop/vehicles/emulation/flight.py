@@ -35,7 +35,7 @@ class Vehicle(Protocol):
 
 
 class SimulatedVehicle:
-    """A drone of a simulation; see :class:`Vehicle`."""
+    """A drone in a simulation; see :class:`Vehicle`."""
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
         self._simulation = simulation
@@ -117,7 +117,7 @@ class FlightControl:
 
     @property
     def time_s(self) -> float:
-        """Simulation time of the newest report [s]."""
+        """Simulation time at the newest report [s]."""
         return self._time_s
 
     @property

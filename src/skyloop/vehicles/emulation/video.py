@@ -212,7 +212,7 @@ class Encoder:
         bitrate_kbps: Average bitrate.
         group: Number of images from one key frame to the next.
         profile: H.264 profile.
-        buffer_s: Size of the rate control's buffer, in seconds of the bitrate; None: images may have any size.
+        buffer_s: Size of the rate control's buffer, in seconds of the bitrate; None to let images have any size.
 
     Raises:
         MissingExtraError: PyAV is not installed.

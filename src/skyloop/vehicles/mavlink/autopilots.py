@@ -108,7 +108,7 @@ class _SafetyNet:
     name: str  #: name of the parameter
     what: str
     good: Callable[[float], bool]  #: returns whether a value is safe
-    otherwise: str  #: consequence of any other value
+    otherwise: str  #: consequence of a value that is not safe
     advised: float  #: a safe value
     unit: str = ""
 

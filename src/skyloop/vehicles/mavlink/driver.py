@@ -1,4 +1,4 @@
-"""The driver for ``mavlink://`` addresses: the proxy's interface to the vehicle."""
+"""The driver for ``mavlink://`` addresses, through which the proxy uses the vehicle."""
 
 from __future__ import annotations
 

@@ -15,8 +15,8 @@ from skyloop.vehicles.mavlink.autopilots import AutopilotProfile
 from skyloop.vehicles.mavlink.manoeuvres import STRAYED_NS
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 
-LATE_NS: Final = nanoseconds(3.0)  #: how late a requested mode change may take effect
-PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a longer pause is a new decision, not a repeat
+LATE_NS: Final = nanoseconds(3.0)  #: longest delay with which a requested mode change may take effect
+PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a pause longer than this is a new decision, not a repeat
 _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 

@@ -76,7 +76,7 @@ class Setup:
     inav_expo: tuple[int, int] = (0, 0)  #: INAV's expo for roll and pitch, and for yaw
     angle_limit_deg: float | None = None
     cells: CellVoltages = field(default_factory=CellVoltages)
-    receiver_is_msp: bool | None = None  #: INAV only
+    receiver_is_msp: bool | None = None  #: whether MSP is the receiver; reported only by INAV
 
     # Modes -------------------------------------------------------------------------------------------------------
 

@@ -216,7 +216,7 @@ class Motion:
 
     climb_m_s: float | None = None
     height_m: float | None = None  #: height above the place where it was last on the ground
-    velocity_m_s: Vector | None = None  #: in world axes
+    velocity_m_s: Vector | None = None  #: velocity in world axes
     position_m: Vector | None = None
     yaw_rad: float | None = None
     precise: bool = False  #: whether height and climb come from poses rather than a barometer

@@ -1,4 +1,4 @@
-"""A simulated drone flown by real firmware: its process, and the driver that treats it like a real vehicle."""
+"""A simulated drone flown by real firmware: the process, and the driver that treats it as a real vehicle."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ class FirmwareFlight:
 
 
 class _InnerSink:
-    """Relays the reports of the firmware's driver."""
+    """Relays reports from the firmware's driver."""
 
     def __init__(self, flight: FirmwareFlight, sink: Sink) -> None:
         self._flight = flight

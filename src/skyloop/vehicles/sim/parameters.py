@@ -51,7 +51,7 @@ class _Settable(NamedTuple):
 
 
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
-    """Return all parameters with their present values; ``standard`` contains the defaults."""
+    """Return all parameters with their present values; ``standard`` provides the defaults."""
     return [entry.parameter for entries in _GROUPS.values() for entry in entries(state, standard)]
 
 

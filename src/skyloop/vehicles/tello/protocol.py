@@ -143,7 +143,7 @@ _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 
 
 class TelloSession(VehicleSession):
-    """The protocol between one opened driver and its drone. Not thread-safe.
+    """The protocol between an open driver and its drone. Not thread-safe.
 
     Args:
         options: Options of the vehicle's address.
@@ -171,7 +171,7 @@ class TelloSession(VehicleSession):
         self.sdk: Sdk | None = None  #: None until there is a reply to ``sdk?``; SDK 1.3 replies with an error
         self.serial = ""
         self.ready = False  #: whether state arrives and commands are answered
-        self.remembered: dict[str, str] = {}  #: by parameter, the command that set it, for a link loss
+        self.remembered: dict[str, str] = {}  #: the command that last set each parameter, for a link loss
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()

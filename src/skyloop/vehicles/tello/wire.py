@@ -51,7 +51,7 @@ MAX_STICK: Final = 100
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: all commands and replies of the SDK are much shorter
+MAX_COMMAND: Final = 256  #: characters; all commands and replies in the SDK are much shorter
 
 
 class Sdk(StrEnum):

@@ -66,7 +66,7 @@ class FrameSize:
     width: int  #: width [px]; for a range, the largest
     height: int
     fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, its two ends
-    smallest: tuple[int, int] | None = None  #: of a range
+    smallest: tuple[int, int] | None = None  #: the smallest size in a range
 
     def __str__(self) -> str:
         size = f"{self.width}x{self.height}"
@@ -264,8 +264,8 @@ class CameraDevice:
     """A local camera."""
 
     path: Path  #: path such as ``/dev/video0``
-    name: str  #: as reported by its driver
-    allowed: bool  #: whether this user may open it
+    name: str  #: name reported by its driver
+    allowed: bool  #: whether this user is allowed to open it
 
     def __str__(self) -> str:
         why = "" if self.allowed else ", but this user may not open it: sudo usermod -aG video $USER, and log in again"

@@ -57,7 +57,7 @@ def with_ardrones(options: SimOptions | None = None) -> SimOptions:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
 
     version: int
     bind: str

@@ -136,7 +136,7 @@ class ArdroneLogic:
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Execute the commands of a datagram. Never raises for any content."""
+        """Execute the commands in a datagram. Never raises, whatever the content."""
         commands, malformed = parse_commands(datagram)
         self.malformed += malformed
         for command in commands:

@@ -442,7 +442,7 @@ class Wifi(NamedTuple):
 
 @_option(27, "i f")
 class Zimmu3000(NamedTuple):
-    """Another estimate of vertical speed, sent up to firmware 2.2."""
+    """Another estimate of vertical speed, sent by firmware up to 2.2."""
 
     lsb: int = 0
     find: float = 0.0

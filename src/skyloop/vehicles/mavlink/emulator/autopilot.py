@@ -167,7 +167,7 @@ class Autopilot(ABC):
     # Time passes -----------------------------------------------------------------------------------------------
 
     def tick(self, report: Report) -> None:
-        """Handle a new report: fly, and send what is due."""
+        """Handle a new report: fly, and send the messages that are due."""
         self.report = report
         self._captured_ns = report.captured_ns
         if self._begun_s is None:

@@ -44,7 +44,7 @@ class Ports:
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports counted from a base, 10 higher for each further drone.
+        """Return ports numbered from a base, which increases by 10 with each drone.
 
         The autopilot's own UDP port comes first, then the remote one, then TCP.
 
@@ -103,7 +103,7 @@ def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPO
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
 
     kind: Kind
     bind: str
@@ -209,7 +209,7 @@ class UdpPort:
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._port.port
 
     def send(self, message: Message) -> None:
@@ -246,7 +246,7 @@ class TcpPort:
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def send(self, message: Message) -> None:

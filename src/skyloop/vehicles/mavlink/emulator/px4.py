@@ -110,7 +110,7 @@ class Px4(Autopilot):
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its mode."""
+        """Whether it can be armed in its present mode."""
         return self.mode != "OFFBOARD" or self._fresh
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station

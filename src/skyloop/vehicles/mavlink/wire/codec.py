@@ -322,7 +322,7 @@ _INTEGERS: Final = {
 
 
 def is_integer(kind: int) -> bool:
-    """Return whether this ``MAV_PARAM_TYPE`` is a whole number."""
+    """Return whether this ``MAV_PARAM_TYPE`` is for whole numbers."""
     return kind in _INTEGERS
 
 

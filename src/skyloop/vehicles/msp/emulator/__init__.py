@@ -58,7 +58,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def _receive(self, data: bytes) -> None:
@@ -116,7 +116,7 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._started.port
 
     @property

@@ -75,7 +75,7 @@ class SimulatedState:
 
 
 def decode_servos(packet: bytes) -> ServoPacket:
-    """Decode a packet of outputs. Raises :class:`DecodeError`."""
+    """Decode a packet with outputs. Raises :class:`DecodeError`."""
     if len(packet) < _HEADER.size:
         raise DecodeError(f"{len(packet)} bytes are too few for ArduPilot's outputs")
     magic, rate, frame = _HEADER.unpack_from(packet)

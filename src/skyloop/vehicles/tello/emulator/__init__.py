@@ -46,7 +46,7 @@ __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
 
 REPORTS_HZ: Final = 50.0
-TAKEOFF_ALTITUDE_M: Final = 0.8  #: as in a recorded flight
+TAKEOFF_ALTITUDE_M: Final = 0.8  #: height at the end of a take-off, as in a recorded flight
 
 #: A small, light drone. Mass, size and flight time come from Ryze's Tello specifications; it has 3-inch rotors. The
 #: rest is as for the simulator's own vehicle.
@@ -96,7 +96,7 @@ def with_tellos(options: SimOptions | None = None) -> SimOptions:
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
 
     sdk: Sdk
     bind: str

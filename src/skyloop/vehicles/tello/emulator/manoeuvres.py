@@ -41,7 +41,7 @@ class Rising:
         self._commanded_s: float | None = None
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         now_s, state = report.truth.time_s, report.truth.state
         elapsed_s = now_s - self._begun_s
         if self._commanded_s is None:
@@ -59,7 +59,7 @@ class Landing:
     """``land``, and the Tello's automatic landing if it receives no commands."""
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
             return None, OK
         return (None if report.truth.state is FlightState.LANDING else Land()), None
@@ -89,7 +89,7 @@ class Turning:
         self._yaw_rad = report.truth.yaw_rad
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         self._left_rad -= wrap_angle(report.truth.yaw_rad - self._yaw_rad)
         self._yaw_rad = report.truth.yaw_rad
         if abs(self._left_rad) < _NEAR_RAD:
@@ -112,7 +112,7 @@ class Going:
         self._until_s = report.truth.time_s + PATIENCE_S
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         truth = report.truth
         if truth.time_s > self._until_s:
             return Hover(), "error"
