@@ -281,7 +281,7 @@ class ArdroneSession(VehicleSession):
 
     def _setup_done(self, setup: Setup, failure: str | None) -> None:
         if self._setup_ns is None or self._received_ns is None:
-            return  # lost in the meantime
+            return  # the link has been lost
         if failure is not None:
             self._setups_failed += 1
             self.configurator.trouble = failure

@@ -261,7 +261,7 @@ _CONDITIONS: Final = (
     (State.MAGNETOMETER_UNCALIBRATED, "magnetometer", "the drone's magnetometer needs calibration", Severity.INFO),
     (State.TIMER_ELAPSED, "timer", "the drone's timer elapsed", Severity.WARNING),
 )
-#: Reasons for cutting the motors that have a bit of their own.
+#: Reasons for cutting the motors that have a dedicated bit.
 _REASONS: Final = (
     (State.USER_EMERGENCY, "user"),
     (State.ANGLES_OUT_OF_RANGE, "angles"),

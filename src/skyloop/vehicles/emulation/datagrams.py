@@ -150,7 +150,7 @@ class DatagramPort:
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram. As usual with UDP, it is lost if the buffer is full or nobody receives it."""
+        """Send a datagram. As usual with UDP, it is lost if the buffer is full or there is no receiver."""
         for each in self._outward.packets(datagram):
             self._later(partial(self._send, each, to))
 

@@ -119,7 +119,7 @@ class Emulator(ABC, Generic[R]):
         self._running = self._switched_on()
 
     def stop(self) -> None:
-        """Switch the firmware off, whatever it is doing. Does nothing if it is already off.
+        """Switch the firmware off at once, even during an activity. Does nothing if it is already off.
 
         The vehicle continues to follow its last command. The ports are free when this returns.
         """

@@ -60,7 +60,7 @@ class SimulatedVehicle:
         self._simulation.set_limits(self._drone, limits)
 
 
-LIFT_M: Final = 0.3  #: height to which the simulated vehicle takes off by itself before these loops take over
+LIFT_M: Final = 0.3  #: height of the simulated vehicle's built-in take-off, after which these loops take over
 LIMITS: Final = Limits(
     tilt_rad=0.52, climb_m_s=2.5, yaw_rate_rad_s=2.5, altitude_m=100.0, speed_m_s=8.0, takeoff_altitude_m=LIFT_M
 )

@@ -87,7 +87,7 @@ class Packer(Protocol[S_contra]):
 
 
 class VideoEncoding(Generic[S]):
-    """Encodes on a separate thread. Of the images that arrive in the meantime, only the newest is kept.
+    """Encodes on a separate thread. Of the images that arrive during encoding, only the newest is kept.
 
     Args:
         packer: The encoder; used only on that thread.

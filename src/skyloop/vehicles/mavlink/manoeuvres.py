@@ -302,7 +302,7 @@ class TakeoffSequence:
             refused = f": the take-off was {result_name(result)}" if result not in (None, ACCEPTED) else ""
             self.given_up = f"it does not leave the ground{refused}"
         elif self._other_ns is not None:
-            pass  # a mode chosen by somebody else never completes a take-off, whatever the height
+            pass  # a mode chosen by another operator never completes a take-off, whatever the height
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:

@@ -1,4 +1,4 @@
-"""Who is flying the vehicle: this program, another operator, or the vehicle's own failsafe. Pure.
+"""Control of the vehicle by this program, another operator, or the vehicle's own failsafe. Pure.
 
 A remote control, a ground station or the autopilot itself may change the mode. Skyloop leaves the vehicle in a mode
 that it did not choose; only a new action from an application takes the vehicle back.
@@ -24,7 +24,7 @@ class FlightOwnership:
     """Decides who is flying, based on the modes that the vehicle reports and those requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
-        self.left_to = ""  #: the mode, chosen elsewhere, that now flies the vehicle; empty if we fly it, or nobody does
+        self.left_to = ""  #: the mode, chosen elsewhere, that now flies the vehicle; empty if we do, or without a pilot
         self._autopilot = autopilot
         self._by_itself = False  # its own failsafe chose the mode, so we may still hold or land the vehicle
         self._steering = False  # whether this program started or took over the flight
@@ -36,7 +36,7 @@ class FlightOwnership:
 
     @property
     def others(self) -> str:
-        """The mode in which another operator is flying the vehicle; empty if nobody else is."""
+        """The mode in which another operator is flying the vehicle; empty if there is none."""
         return "" if self._by_itself else self.left_to
 
     def is_foreign(self, vehicle: VehicleState) -> bool:

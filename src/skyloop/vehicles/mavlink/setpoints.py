@@ -433,7 +433,7 @@ class SetpointController:
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
         """Disarm the vehicle after a take-off that failed or was interrupted by a lost link.
 
-        A vehicle that is rising or in another mode was armed by somebody else.
+        A vehicle that is rising or in another mode was armed by another operator.
         """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0

@@ -338,7 +338,7 @@ class MspSession(VehicleSession):
     def _holds_back(self, now_ns: int) -> bool:
         """Return whether to withhold sticks, which might wait in a buffer and be obeyed late, or be another pilot's.
 
-        A paused flight controller resumes as if no time had passed and obeys everything that arrived in the meantime;
+        A paused flight controller resumes as if no time had passed and obeys everything that arrived during the pause;
         only its replies show that it is reading. Until the link is lost, a few frames are sent anyway, to hold off the
         failsafe if only its replies are lost.
         """

@@ -124,7 +124,7 @@ class RosContext:
     """An rclpy context, its nodes, and the threads that run their callbacks.
 
     Args:
-        purpose: What rclpy is needed for, stated in the error if it is missing.
+        purpose: The purpose of rclpy, stated in the error if it is missing.
         domain: DDS domain; None to use ``ROS_DOMAIN_ID``.
         arguments: Arguments for ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
 

@@ -76,7 +76,7 @@ class SimDriver(Driver):
         if host is not None:
             self.options = replace(host.options, autopilot=own.autopilot, autopilot_folder=own.autopilot_folder)
         self.drone = drone
-        self.host = host  #: the world; None until :meth:`open` if the driver has a world of its own
+        self.host = host  #: the world; None until :meth:`open` unless a shared one was given
         self._shared = host is not None
         self._changing = threading.Lock()
         self._limits = Limits()
@@ -164,7 +164,7 @@ class SimDriver(Driver):
             self._firmware.driver.check(action)
 
     def left_to(self) -> str:
-        """Return the firmware's mode if somebody else selected it; empty for the built-in autopilot."""
+        """Return the firmware's mode if another operator selected it; empty for the built-in autopilot."""
         return "" if self._firmware is None else self._firmware.driver.left_to()
 
     def failsafe(self, action: Hover | Land) -> bool:
@@ -329,7 +329,7 @@ DOWN_M: Final = 0.08  #: below this height, a descending drone counts as landed
 class SetpointController:
     """Starts the motors for a set-point that climbs, and stops them on the ground for one that descends.
 
-    The simulated firmware accepts set-points only in the air, so it first takes off by itself to the lowest height.
+    The simulated firmware accepts set-points only in the air, so its own take-off to the lowest height comes first.
     """
 
     def __init__(self, simulation: Simulation, drone: int) -> None:

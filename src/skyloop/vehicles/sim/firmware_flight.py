@@ -178,7 +178,7 @@ class FirmwareFlight:
     def link(self, state: LinkState, reason: str) -> tuple[LinkState, str, str]:
         """Translate a link state reported by the firmware's driver, with a reason and remedy that fit this drone.
 
-        The driver assumes a vehicle that somebody else starts, at an address that a user has given.
+        The driver assumes a vehicle that is started separately, at an address that a user has given.
         """
         self._found = self._found or state in (LinkState.UP, LinkState.DEGRADED)
         if not self._found:

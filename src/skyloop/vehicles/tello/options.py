@@ -49,7 +49,7 @@ class TelloOptions:
 
     @property
     def own_ports(self) -> bool:
-        """Whether the drone must be told by a command where to send state and video."""
+        """Whether a command must set the ports to which the drone sends state and video."""
         return (self.state_port, self.video_port) != (STATE_PORT, VIDEO_PORT)
 
 

@@ -321,7 +321,7 @@ class TelloSession(VehicleSession):
         return [text.encode("ascii") for text in texts]
 
     def _left_to_land(self, now_ns: int) -> bool:
-        """Return whether to send only landings and stops: without other commands, a lost drone lands by itself."""
+        """Return whether to send only landings and stops: without other commands, a lost drone lands automatically."""
         if not self.setpoints.flies_unheard or now_ns - self._lost_ns < KEPT_NS:
             return False
         if now_ns - self._sent_ns >= ALONE_NS:

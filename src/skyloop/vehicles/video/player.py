@@ -241,7 +241,7 @@ class FilePacer:
 
 
 class CameraPublisher:
-    """Publishes one camera's images and feedback to a sink, waiting as required in between."""
+    """Publishes one camera's images and feedback to a sink, waiting for the right times."""
 
     def __init__(
         self, sink: Sink, camera: str, intrinsics: Callable[[int, int], Intrinsics | None], stop: threading.Event

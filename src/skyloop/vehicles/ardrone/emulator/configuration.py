@@ -92,7 +92,7 @@ class Configuration:
         """Handle a ``CONFIG`` with the ids received immediately before it, if any; return whether it was accepted.
 
         While a custom session, user or application is in force, only commands with its ids are accepted, except for
-        ``custom:…_id``: otherwise no other client could ever start one of its own.
+        ``custom:…_id``: otherwise no other client could ever start a custom one.
         """
         name = name.strip().lower()
         key = self._keys.get(name)

@@ -142,7 +142,7 @@ class StreamPort:
         while True:
             try:
                 connection, _ = self._socket.accept()
-            except OSError:  # none pending, or closed in the meantime
+            except OSError:  # none pending, or already closed
                 return
             if len(self.outlets) >= MOST_CLIENTS:
                 connection.close()

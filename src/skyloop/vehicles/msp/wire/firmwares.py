@@ -166,7 +166,7 @@ INAV_FLAGS: Final = {
     29: "DSHOT_BEEPER",
     30: "LANDING_DETECTED",
 }
-#: Readable meaning and remedy for each flag. Flags that clear by themselves have no remedy.
+#: Readable meaning and remedy for each flag. Flags that clear with time have no remedy.
 MEANINGS: Final = {
     "NOGYRO": "no gyroscope was found",
     "FAILSAFE": "failsafe is active until sticks arrive for half a second",

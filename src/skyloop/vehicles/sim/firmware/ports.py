@@ -170,7 +170,7 @@ class Relay:
             try:
                 inside = socket.create_connection((LOOPBACK, self._tcp_port), CONNECT_S)
             except OSError:
-                outside.close()  # nobody is listening yet
+                outside.close()  # there is no listener yet
                 continue
             inside.settimeout(None)
             for ends in ((outside, inside), (inside, outside)):
