@@ -1,4 +1,4 @@
-"""Environments for reinforcement learning on the simulator, much faster than real time (extra ``[gym]``).
+"""Reinforcement learning environments that run on the simulator much faster than real time (extra ``[gym]``).
 
 ::
 
@@ -45,7 +45,7 @@ TASKS = ("Reach", "Hover", "Follow", "Gates")
 
 
 def register() -> None:
-    """Register ``skyloop/Reach-v0`` and the other :data:`TASKS` with ``gymnasium.make``. May be called twice."""
+    """Register ``skyloop/Reach-v0`` and the other :data:`TASKS` for ``gymnasium.make``. Safe to call repeatedly."""
     for task in TASKS:
         if f"skyloop/{task}-v0" not in gymnasium.registry:
             gymnasium.register(

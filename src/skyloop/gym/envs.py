@@ -1,4 +1,4 @@
-"""The tasks as Gymnasium environments: one drone, or many in one simulation; with numbers, pictures, or both."""
+"""The tasks as Gymnasium environments for one drone, or many in one simulation, observed as numbers, images or both."""
 
 from __future__ import annotations
 
@@ -31,30 +31,30 @@ from skyloop.gym.tasks import (
 )
 from skyloop.sim.camera import look_at
 
-#: Centre in the cell [m], normal (None: it faces the camera), radius [m].
+#: Rings to draw, each with its centre in the cell [m], normal (None: facing the camera) and radius [m].
 Rings = Iterable[tuple[Floats, Floats | None, float]]
 Observe = Literal["state", "pixels", "both"]
-#: An observation: numbers, a picture, or a dict of picture and motion.
+#: An observation: a state vector, an image, or a dict with an image and the motion.
 Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
 
-SIZES_PX: Final = (16, 512)  #: smallest and largest edge of a picture
+SIZES_PX: Final = (16, 512)  #: smallest and largest edge length of an observed image
 SIZE: Final = (320, 240)
-ONBOARD_PX: Final = 64  #: edge of the pictures on board, by default
-_FOCAL_PX: Final = 260.0  #: of the rendering camera
-_ONBOARD_FOCAL: Final = 40.0 / 64.0  # as a share of the edge: 77° field of view
-_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera, from the middle of the first cell's floor [m]
-_AT: Final = np.array([0.0, 0.0, 1.8])  #: the point it looks at
-_EYE_M: Final = np.array([0.12, 0.0, 0.0])  # in front of the drone's own body
-_AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
-_RED: Final = (40, 40, 230)  # BGR
-_LATER: Final = (40, 160, 230)  # BGR, of the goal after it
+ONBOARD_PX: Final = 64  #: default edge length of the onboard camera's images
+_FOCAL_PX: Final = 260.0  #: focal length of the rendering camera
+_ONBOARD_FOCAL: Final = 40.0 / 64.0  # focal length divided by the edge length: 77° field of view
+_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: rendering camera, relative to the middle of the first cell's floor [m]
+_AT: Final = np.array([0.0, 0.0, 1.8])  #: point at which the rendering camera looks, in the same axes [m]
+_EYE_M: Final = np.array([0.12, 0.0, 0.0])  # onboard camera, just in front of the drone's body
+_AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # rotates optical axes into body axes
+_RED: Final = (40, 40, 230)  # the next goal's colour, BGR
+_LATER: Final = (40, 160, 230)  # the following goal's colour, BGR
 _NEAREST_M: Final = 0.05  #: near plane: rings with closer points are not drawn
 _TURN: Final = np.linspace(0.0, 2.0 * np.pi, 25)
 _CIRCLE: Final = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)  # (25, 2)
 
 
 class _Observer:
-    """Makes the observations of all drones of a task in the requested form.
+    """Makes observations in the requested form for all drones of a task.
 
     Attributes:
         space: The observation space of one drone.
@@ -79,7 +79,7 @@ class _Observer:
         self._camera: OnBoard | None = None
 
     def renew(self) -> None:
-        """Use the new world; the renderer is made only once, as that takes long."""
+        """Switch to the new world, keeping the renderer because it is slow to create."""
         if self._camera is not None:
             self._camera.arena = self._task.arena
 
@@ -99,16 +99,16 @@ class _Observer:
 
 
 class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
-    """One drone and one task; subclasses name the task.
+    """An environment with one drone and one task, which subclasses choose.
 
-    Action, shape (4,), float32, from -1 to 1: velocity ahead, left, up as shares of 1 m/s, turn rate counter-clockwise
-    as a share of 1.5 rad/s, for 40 ms. Observation with ``observe="state"``, shape (10,), float32: position of the goal
-    ahead, left, up [m]; the drone's estimate of its velocity [m/s]; roll (right side down), pitch (nose down) [rad];
-    sine and cosine of the turn to the desired heading. With ``"pixels"``: the front camera's picture, RGB, shape
-    (size_px, size_px, 3), uint8, with the goal as a red ring. With ``"both"``: a dict of ``pixels`` and ``motion``,
-    which is velocity, roll and pitch. ``info`` has ``is_success`` and ``distance_m``, also after a reset. Leaving the
-    cell of 7 m costs 5 and ends the episode. ``vehicle`` is one of ``skyloop.sim.vehicles.VEHICLES``.
-    ``render_mode="rgb_array"``: a picture of the drone and its goal.
+    An action, shape (4,), float32, from -1 to 1, lasts 40 ms: velocity forward, left and up in units of 1 m/s, and
+    counter-clockwise turn rate in units of 1.5 rad/s. The observation with ``observe="state"``, shape (10,), float32:
+    position of the goal (forward, left, up) [m]; the drone's own velocity estimate [m/s]; roll (positive right side
+    down) and pitch (positive nose down) [rad]; sine and cosine of the turn to the desired heading. With ``"pixels"``:
+    the front camera's image, RGB, shape (size_px, size_px, 3), uint8, showing the goal as a red ring. With ``"both"``:
+    a dict of ``pixels`` and ``motion`` (velocity, roll and pitch). ``info`` has ``is_success`` and ``distance_m``, also
+    after a reset. Leaving the 7 m cell costs 5 and ends the episode. ``vehicle`` is one of
+    ``skyloop.sim.vehicles.VEHICLES``. ``render_mode="rgb_array"`` renders an image of the drone and its goal.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # noqa: RUF012
@@ -147,7 +147,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         return self._observer.first(), float(rewards[0]), bool(ended[0]), truncated, _one(infos)
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return RGB, shape (240, 320, 3), uint8, or None without a render mode."""
+        """Return an RGB image, shape (240, 320, 3), uint8; None if no render mode was chosen."""
         if self.render_mode is None:
             return None
         arena = self._task.arena
@@ -158,7 +158,7 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
 
 
 class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
-    """Many drones in one simulation, many times faster than as many simulations.
+    """Many drones in one simulation, which is many times faster than a simulation for each.
 
     Like :class:`TaskEnv`, with a leading axis; a finished episode starts over in the next step
     (``AutoresetMode.NEXT_STEP``).
@@ -205,7 +205,7 @@ class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
         if again.any():
             self._task.restart(again, self.np_random)
         rewards, ended, over, infos = self._task.step(np.asarray(actions, dtype=float))
-        # The first step of a new episode is its reset: it has no reward and can't end it.
+        # The first step of a new episode is its reset, which earns no reward and cannot end the episode.
         rewards[again], ended[again], over[again] = 0.0, False, False
         over &= ~ended
         self._ended = ended | over
@@ -217,25 +217,25 @@ def _one(infos: Infos) -> dict[str, Any]:
 
 
 class ReachEnv(TaskEnv):
-    """Fly to a position and stay there: up to 0.1 per step at the goal, less with distance and jerky actions."""
+    """Fly to a position and stay there. Up to 0.1 per step at the goal, less with distance and for jerky actions."""
 
     task = Reaching
 
 
 class HoverEnv(TaskEnv):
-    """Hold a position in gusts; rewarded as :class:`ReachEnv`."""
+    """Hold a position in gusts, with the same reward as :class:`ReachEnv`."""
 
     task = Hovering
 
 
 class FollowEnv(TaskEnv):
-    """Follow a walking target from 1.5 m, with the target in the middle of the picture."""
+    """Follow a walking target from 1.5 m away, keeping it in the middle of the image."""
 
     task = Following
 
 
 class GatesEnv(TaskEnv):
-    """Fly through four gates in order: 1 for each, plus the approach to the next one in m; ends at the last."""
+    """Fly through four gates in order. Rewards are 1 per gate and per metre closer to the next; the last ends it."""
 
     task = Racing
 
@@ -265,7 +265,7 @@ class GatesVectorEnv(TaskVectorEnv):
 
 
 class _View:
-    """Draws one drone of an arena, and rings, without the other drones, which share the world only to save time.
+    """Draws one of an arena's drones, and rings, but not the other drones: they share the world only to save time.
 
     Raises :class:`MissingExtraError` without OpenCV.
     """
@@ -276,14 +276,14 @@ class _View:
             from skyloop.sim.render import PlanarRenderer, Scene, SceneState
         except ImportError:
             raise MissingExtraError("drawing the simulator's world", "sim") from None
-        self.arena = arena  #: replaceable by another one with as many drones, as the world is the same
+        self.arena = arena  #: may be replaced by another one with as many drones, because their worlds are the same
         self._model = CameraModel("view", width, height, 25.0, focal_px, focal_px, width / 2, height / 2)
         self._pose: Any = CameraPose
         self._state = SceneState
         self._renderer = PlanarRenderer(Scene(arena.world, 1))
 
     def render(self, drone: int, eye: Floats, rotation: Floats, rings: Rings) -> NDArray[np.uint8]:
-        """Return RGB of shape (height, width, 3), uint8, from a point in world axes."""
+        """Return an RGB image, shape (height, width, 3), uint8, as seen from a point in world axes."""
         import cv2
 
         positions, rotations = self.arena.poses()
@@ -302,37 +302,37 @@ class _View:
 
 
 class Picture(_View):
-    """Draws the first drone of an arena for a person."""
+    """Draws the first drone of an arena for a human viewer."""
 
     def __init__(self, arena: Arena) -> None:
         super().__init__(arena, *SIZE, _FOCAL_PX)
 
     def draw(self, rings: Rings) -> NDArray[np.uint8]:
-        """Return RGB, shape (240, 320, 3), uint8; the next goal is a red ring."""
+        """Return an RGB image, shape (240, 320, 3), uint8, with the next goal as a red ring."""
         middle = np.array([*self.arena.centres[0], 0.0])
         return self.render(0, middle + _FROM, look_at(_FROM, _AT), rings)
 
 
 class OnBoard(_View):
-    """The pictures of the front cameras of an arena's drones.
+    """Renders the images of the front cameras of an arena's drones.
 
     Args:
         arena: The drones.
-        size_px: Edge of the pictures.
+        size_px: Edge length of the images.
     """
 
     def __init__(self, arena: Arena, size_px: int = ONBOARD_PX) -> None:
         super().__init__(arena, size_px, size_px, _ONBOARD_FOCAL * size_px)
 
     def draw(self, drone: int, rings: Rings) -> NDArray[np.uint8]:
-        """Return RGB, shape (size, size, 3), uint8; the next goal is a red ring."""
+        """Return an RGB image, shape (size, size, 3), uint8, with the next goal as a red ring."""
         positions, rotations = self.arena.poses()
         rotation = rotations[drone]
         return self.render(drone, positions[drone] + rotation @ _EYE_M, rotation @ _AHEAD, rings)
 
 
 def _circle(centre: Floats, normal: Floats, radius: float) -> Floats:
-    """Return points of a circle around a normal, shape (25, 3)."""
+    """Return points on a circle perpendicular to a normal, shape (25, 3)."""
     x, y, z = normal.tolist()
     level = abs(z) < 0.9
     aside = np.array([y, -x, 0.0] if level else [0.0, z, -y]) / math.hypot(*((x, y) if level else (y, z)))

@@ -1,4 +1,4 @@
-"""The environments' tasks, each for all drones of an arena at once: reach a position, hover, follow, fly gates."""
+"""The environments' tasks, each run for all drones of an arena at once: reach a position, hover, follow, fly gates."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
 from skyloop.sim.vehicles import VEHICLES
 
-CELL_M: Final = 8.0  #: edge of each drone's own square
+CELL_M: Final = 8.0  #: edge length of each drone's own square
 REACH_M: Final = 3.5  #: a drone further than this from its cell's centre has left it
 LOWEST_M: Final = 0.3
 HIGHEST_M: Final = 4.5
-_UP_S: Final = 15.0  #: limit for the take-off of all drones
+_UP_S: Final = 15.0  #: time allowed for all drones to take off
 
 
 class Arena:
-    """A number of hovering drones. Deterministic: the same seed and actions give the same numbers."""
+    """A set of hovering drones. Deterministic: the same seed and actions give the same numbers."""
 
     def __init__(
         self, drones: int, seed: int, *, gusts_m_s: float, period_s: float, vehicle: VehicleParameters
@@ -45,19 +45,19 @@ class Arena:
         self._state = self._poses = None
 
     def put(self, drone: int, place: Floats, yaw: float) -> None:
-        """Move a drone within its cell, at rest; ``place`` is relative to the cell's centre on the floor [m]."""
+        """Place a drone at rest within its cell; ``place`` is relative to the cell's centre on the floor [m]."""
         x, y, z = place.tolist()
         middle_x, middle_y = self.centres[drone].tolist()
         self.simulation.put(drone, (middle_x + x, middle_y + y, z), yaw)
         self._state = self._poses = None
 
     def state(self) -> tuple[Floats, Floats, Floats]:
-        """Return the drones' positions in their cells, velocities and angles; do not modify them.
+        """Return the drones' positions in their cells, their velocities and their angles. Do not modify the arrays.
 
         Returns:
             Positions, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll, pitch and
-            yaw, shape (n, 3) [rad]. Positions and angles are the true ones, as from motion capture; velocities are the
-            drones' estimates.
+            yaw, shape (n, 3) [rad]. Positions and angles are true values, as motion capture would give; velocities are
+            the drones' estimates.
         """
         if self._state is None:
             self._state = self.simulation.motions()
@@ -65,13 +65,13 @@ class Arena:
         return self._state
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Return the drones' poses in the world; see :meth:`Simulation.poses`. Do not modify them."""
+        """Return the drones' poses in the world; see :meth:`Simulation.poses`. Do not modify the arrays."""
         if self._poses is None:
             self._poses = self.simulation.poses()
         return self._poses
 
     def airborne(self) -> NDArray[np.bool_]:
-        """Return which drones fly, shape (n,)."""
+        """Return which drones are flying, shape (n,)."""
         return self.simulation.airborne()
 
     def _take_off(self) -> None:
@@ -94,7 +94,7 @@ def outside(places: Floats) -> NDArray[np.bool_]:
 
 
 def _hall(drones: int) -> World:
-    """Return an empty hall with a cell for each drone, and a spawn in the middle of each."""
+    """Return an empty hall with one cell per drone and a spawn in the middle of each."""
     side = math.ceil(math.sqrt(drones))
     half = (side - 1) * CELL_M / 2
     lines = [f'[room]\nsize = [{side * CELL_M + 2}, {side * CELL_M + 2}, 8]\nfloor = "concrete"\nwalls = "plaster"\n']
@@ -109,25 +109,25 @@ Bools = NDArray[np.bool_]
 Observation = NDArray[np.float32]
 Infos = dict[str, NDArray[Any]]
 
-PERIOD_S: Final = 0.04  #: between two actions
-SPEED_M_S: Final = 1.0  #: at a full action
-TURN_RAD_S: Final = 1.5  #: at a full action
-NEAR_M: Final = 0.2  #: distance from the goal that counts as reached
+PERIOD_S: Final = 0.04  #: time between two actions
+SPEED_M_S: Final = 1.0  #: velocity commanded by an action of 1
+TURN_RAD_S: Final = 1.5  #: turn rate commanded by an action of 1
+NEAR_M: Final = 0.2  #: a goal closer than this counts as reached
 FOLLOWED_M: Final = 1.5  #: the desired distance from a followed target
 GATES: Final = 4
 GATE_RADIUS_M: Final = 0.5
-_GATE_RING_M: Final = 1.8  #: the gates stand on a circle of this radius
-_FOLLOWING_M: Final = 0.3  #: tolerance of the distance and …
-_FOLLOWING_RAD: Final = 0.35  #: … of the target's bearing within which it counts as followed
-_SPREAD: Final = (2.0, 2.0, 0.8)  #: goals and starts: up to this far from the middle of a cell [m] …
-_HEIGHT: Final = 2.0  #: … whose middle is this high
-_WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there [m]
-_WALK_RAD_S: Final = 0.18  #: angular rate of the walk, for at most 0.3 m/s
-_FAILURE: Final = -5.0  #: reward for leaving the cell or falling
+_GATE_RING_M: Final = 1.8  #: radius of the circle on which the gates are placed
+_FOLLOWING_M: Final = 0.3  #: greatest error in distance with which a target counts as followed
+_FOLLOWING_RAD: Final = 0.35  #: greatest bearing of the target with which it counts as followed
+_SPREAD: Final = (2.0, 2.0, 0.8)  #: greatest distance of goals and starts from the middle of a cell, per axis [m]
+_HEIGHT: Final = 2.0  #: height of the middle of a cell [m]
+_WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from the middle of its cell, per axis [m]
+_WALK_RAD_S: Final = 0.18  #: angular rate of the walk, which limits its speed to 0.3 m/s
+_FAILURE: Final = -5.0  #: reward for leaving the cell or crashing
 _FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
-#: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to desired heading: sine, cosine
+#: Bounds of: goal forward, left, up [m]; velocity forward, left, up [m/s]; roll, pitch [rad]; sine, cosine of the turn
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
-MOTION: Final = slice(3, 8)  #: the drone's own motion within an observation: velocity, roll, pitch
+MOTION: Final = slice(3, 8)  #: the part of an observation that holds the drone's own motion: velocity, roll, pitch
 
 ACTIONS: Final = spaces.Box(-1.0, 1.0, (4,), np.float32)
 OBSERVATIONS: Final = spaces.Box(-_HIGHEST, _HIGHEST, dtype=np.float32)
@@ -135,7 +135,7 @@ MOTIONS: Final = spaces.Box(-_HIGHEST[MOTION], _HIGHEST[MOTION], dtype=np.float3
 
 
 class Reaching:
-    """Fly to a position and stay there, at a heading. Base of the other tasks."""
+    """Fly to a position and stay there, facing a given heading. Base class of the other tasks."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         if not (1.0 <= seconds <= 600.0):
@@ -167,21 +167,21 @@ class Reaching:
         return self._arena is not None
 
     def begin(self, seed: int) -> None:
-        """Make a new world from this seed, with all drones hovering."""
+        """Create a new world from this seed, with all drones hovering."""
         self._arena = Arena(
             self.drones, seed, gusts_m_s=self.gusts_m_s, period_s=PERIOD_S, vehicle=VEHICLES[self.vehicle]
         )
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
-        """Choose another start and another goal for these drones."""
-        self.age[which] = 0  # before placing them: in a task with moving goals, these depend on the age
+        """Choose a new start and a new goal for these drones."""
+        self.age[which] = 0  # must precede placing: moving goals depend on the age
         for drone in np.flatnonzero(which):
             start, heading = self._place(int(drone), rng)
             self.arena.put(int(drone), start, heading)
         self._before[which] = 0.0
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Return rewards, terminated episodes, truncated episodes, and further values for each drone."""
+        """Return the rewards, which episodes terminated, which were truncated, and further values for each drone."""
         bounded = np.minimum(np.maximum(np.where(np.isnan(actions), 0.0, actions), -1.0), 1.0)
         self.arena.step(bounded * _FULL)
         self.age += 1
@@ -194,7 +194,7 @@ class Reaching:
         return rewards - 0.002 * jerk + _FAILURE * failed, failed | done, self.age >= self.steps, infos
 
     def infos(self) -> Infos:
-        """Return the further values for each drone, as in :meth:`step`."""
+        """Return the further values for each drone, as :meth:`step` does."""
         places, _, angles = self.arena.state()
         return self._judge(places, angles[:, 2])[2]
 
@@ -216,7 +216,7 @@ class Reaching:
         return np.maximum(seen, -_HIGHEST, out=seen)
 
     def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
-        """Return the task's goals to draw: centre in the cell, normal (None: faces the camera), radius [m]."""
+        """Return the goals to draw: centre in the cell [m], normal (None: facing the camera), radius [m]."""
         return [(self.goals[drone], None, 0.2)]
 
     # For subclasses ---------------------------------------------------------------------------------------------
@@ -229,7 +229,7 @@ class Reaching:
         return start, heading
 
     def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others need it
-        """Return rewards, completed tasks and further values."""
+        """Return the rewards, which tasks are completed, and further values."""
         distances = np.linalg.norm(self.goals - places, axis=1)
         rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
         infos: Infos = {"distance_m": distances, "is_success": distances < NEAR_M}
@@ -240,7 +240,7 @@ class Reaching:
 
 
 class Hovering(Reaching):
-    """Stay at the starting position and heading, whatever the gusts."""
+    """Hold the starting position and heading in gusts."""
 
     def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
         start = rng.uniform(-1, 1, 3) * _SPREAD + [0, 0, _HEIGHT]
@@ -250,7 +250,7 @@ class Hovering(Reaching):
 
 
 class Following(Reaching):
-    """Follow a walking target at a distance, with the target in the middle of the picture."""
+    """Follow a walking target at a distance, keeping it in the middle of the image."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         super().__init__(drones, seconds, gusts_m_s, vehicle)
@@ -258,7 +258,7 @@ class Following(Reaching):
         self._rates = np.zeros((drones, 3))
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Do a step of the base class after the targets have moved."""
+        """Move the targets, then do the base class's step."""
         self._walk(self.age + 1)
         return super().step(actions)
 
@@ -292,7 +292,7 @@ class Following(Reaching):
 
 
 class Racing(Reaching):
-    """Fly through gates on a circle, in order; done when all are passed."""
+    """Fly in order through gates placed on a circle; done after the last one."""
 
     def __init__(self, drones: int, seconds: float, gusts_m_s: float, vehicle: str = "quadrotor") -> None:
         super().__init__(drones, seconds, gusts_m_s, vehicle)
@@ -320,21 +320,21 @@ class Racing(Reaching):
         return start, float(self.headings[drone])
 
     def _aim(self) -> None:
-        """Set each drone's goal to the middle of its next gate, with the heading of the passage."""
+        """Set each drone's goal to the middle of its next gate, facing the direction of passage."""
         rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
         self.goals = self._gates[rows, following]
         normals = self._normals[rows, following]
         self.headings = np.arctan2(normals[:, 1], normals[:, 0])
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Do a step of the base class, with a reward of 1 for each gate, and for approaching the next one."""
+        """Do the base class's step, rewarding each gate with 1 and the approach to the next one."""
         before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
         rewards, done, over, infos = super().step(actions)
         nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)
         return rewards + nearer + 1.0 * (self.passed - counts), done, over, infos
 
     def restart(self, which: Bools, rng: np.random.Generator) -> None:
-        """Choose another course for these drones."""
+        """Choose a new course for these drones."""
         super().restart(which, rng)
         self._places[which] = self.arena.state()[0][which]
 

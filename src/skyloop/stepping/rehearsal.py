@@ -1,8 +1,8 @@
 """Rehearsals: flights in simulated time, with a clock that stops while the controller computes.
 
-Simulator, driver, proxy and application share this process. Whenever the application waits, in
-:meth:`Controller.run`, for the next frame or for a state, time advances to the next event. A flight of a minute
-therefore takes as long as its computation, a slow machine misses nothing, and the same seeds give the same flight.
+Simulator, driver, proxy and application share this process. Whenever the application waits in :meth:`Controller.run`,
+for the next frame or for a state, time advances to the next event. A one-minute flight therefore takes only as long as
+its computation, a slow machine misses nothing, and the same seeds give the same flight.
 Delay, loss and position noise between proxy and vehicle are simulated.
 """
 
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera, SteppedCameraPipeline
 
 _BEGIN_NS: Final = 10 * NS_PER_S  #: start of the simulated clock
-_CONNECT_S: Final = 20.0  #: limit for connecting
+_CONNECT_S: Final = 20.0  #: connection timeout
 
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """Delays, losses and noise between proxy and vehicle.
+    """Simulated delay, loss and noise between proxy and vehicle.
 
     Raises:
         UsageError: A number is negative or not finite, or ``drop`` is not below 1.
@@ -56,7 +56,7 @@ class Radio:
     command_delay_s: float = 0.04
     feedback_delay_s: float = 0.02
     picture_delay_s: float = 0.02  #: delay of frames, in addition to the camera's own latency
-    drop: float = 0.05  #: probability that a command, a sample of feedback or a frame is lost
+    drop: float = 0.05  #: probability that a command, a feedback sample or a frame is lost
     position_noise_m: float = 0.01  #: standard deviation of each component of the position in feedback
     seed: int = 0
 
@@ -70,13 +70,13 @@ class Radio:
 
 @contextmanager
 def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
-    """Connect as a pilot to a drone of a simulated world.
+    """Connect as a pilot to a drone in a simulated world.
 
     Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, not in real time.
 
     Args:
         uri: A ``sim://`` address without ``speed``.
-        radio: Between proxy and vehicle; None takes the defaults.
+        radio: The radio link between proxy and vehicle; None uses the defaults.
 
     Yields:
         The connected drone.
@@ -106,7 +106,7 @@ def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) ->
 
 
 class _RehearsalDriver(SimDriver):
-    """The simulated drone behind a radio, moved step by step; all on one thread."""
+    """The simulated drone behind a radio, advanced step by step on a single thread."""
 
     def __init__(self, uri: VehicleUri, host: SimHost, radio: Radio, clock: ManualClock) -> None:
         super().__init__(uri, host=host)
@@ -115,7 +115,7 @@ class _RehearsalDriver(SimDriver):
         self._random = random.Random(f"rehearsal/{radio.seed}")
         # A separate generator, so that cameras don't change the losses of commands and feedback.
         self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
-        self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap by time of arrival
+        self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap ordered by arrival time
         self._numbers = itertools.count()
 
     @property
@@ -128,7 +128,7 @@ class _RehearsalDriver(SimDriver):
         return min(step_ns, self._on_the_way[0][0])
 
     def step(self) -> None:
-        """Do the due work, arrivals first."""
+        """Do the work that is due, arrivals first."""
         assert isinstance(self.host, SteppedHost)
         if self._on_the_way and self._on_the_way[0][0] <= self._clock.now_ns:
             heapq.heappop(self._on_the_way)[2]()
@@ -185,7 +185,7 @@ _STEPS = round(TICK_S / STEP_S)
 class SteppedHost(SimHost):
     """A :class:`SimHost` without threads.
 
-    :meth:`step` advances by :data:`~skyloop.sim.host.TICK_S`, reports to the observers and delivers due frames, on the
+    :meth:`step` advances by :data:`~skyloop.sim.host.TICK_S`, reports to the observers and delivers due frames on the
     caller's thread. The option ``speed`` has no effect.
     """
 
@@ -194,7 +194,7 @@ class SteppedHost(SimHost):
 
         Args:
             options: Options of the simulation.
-            clock: Clock of the observers' samples; the caller moves it to :attr:`due_ns` before a step.
+            clock: The clock that stamps the observers' samples; the caller moves it to :attr:`due_ns` before each step.
             drones: Number of drones in the world.
         """
         super().__init__(options, drones)
@@ -216,7 +216,7 @@ class SteppedHost(SimHost):
         return self._manual_stepper
 
     def ended(self) -> None:
-        """Forget the stepper after the last observer was detached."""
+        """Discard the stepper after the last observer has been detached."""
         self._manual_stepper = None
 
 

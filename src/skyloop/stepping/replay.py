@@ -1,9 +1,9 @@
 """A replay in step with its application: ``skyloop.connect("replay://flight.mcap?speed=max")``.
 
 Proxy, recording and application share this process, with a clock that stops while the application's code runs. Whenever
-the application waits, for the next frame, for a state or in :meth:`Controller.run`, the clock advances to the next
-event: a sample of the recording, a repeat of a command, a tick of the proxy. Each sample is therefore consumed before
-the next one exists, the application sees the recording's times, and two runs of one controller give the same commands.
+the application waits for the next frame, for a state or in :meth:`Controller.run`, the clock advances to the next
+event: a recorded sample, a repeated command or a proxy tick. Each sample is therefore consumed before the next one
+exists, the application sees the recording's times, and two runs of the same controller produce the same commands.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from skyloop.stepping.transport import StepExecutor, SteppedServer
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
-LEAD_NS: Final = NS_PER_S  #: time before the recording starts, to connect in a few ticks
+LEAD_NS: Final = NS_PER_S  #: how long before the recording's start the clock begins: a few ticks in which to connect
 
 
 def connector(uri: str) -> SteppedReplay | None:
-    """Create a stepped replay; this is the entry point ``replay`` of the group ``skyloop.connectors``.
+    """Create a stepped replay. Entry point ``replay`` in the group ``skyloop.connectors``.
 
     Args:
         uri: The address, ``replay://…``.
 
     Returns:
-        The replay for ``speed=max``; None for other addresses, which a private proxy serves.
+        The replay if the address says ``speed=max``; otherwise None, because a private proxy serves such addresses.
 
     Raises:
         UsageError: The address or the recording is invalid.
@@ -39,7 +39,7 @@ def connector(uri: str) -> SteppedReplay | None:
 
 
 class SteppedReplay:
-    """The proxy of a replay, and the time shared with its one application."""
+    """The proxy of a replay, and the simulated time that it shares with its only application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
         """Start the proxy.
@@ -65,7 +65,7 @@ class SteppedReplay:
         self._ended = False
 
     def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (the proxy is already serving)
-        """Return a dialer for the proxy, which is already serving."""
+        """Return a dialer for the proxy, which already accepts clients."""
         return self._server.dial
 
     def close(self) -> None:

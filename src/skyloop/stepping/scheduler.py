@@ -1,4 +1,4 @@
-"""Simulated time for a client, which advances while the application waits and stops while its code runs."""
+"""Simulated time for a client: it advances while the application waits and stops while the application's code runs."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 from skyloop.proxy.proxy import Proxy
 from skyloop.stepping.transport import StepExecutor
 
-AFTER_NS: Final = 60 * NS_PER_S  #: after the recording's end, for a wait without a limit
+AFTER_NS: Final = 60 * NS_PER_S  #: an unlimited wait gives up this long after the end of the recording
 _TICK_NS: Final = nanoseconds(PERIOD_S)
 _NEVER_NS: Final = 1 << 62
 
 
 class StepSource(Protocol):
-    """Makes time advance: the samples of a recording, or the steps of a simulated world."""
+    """The events that drive simulated time: a recording's samples or a simulated world's steps."""
 
     @property
     def due_ns(self) -> int | None:
-        """When the next one is due; None after the last."""
+        """When the next event is due; None after the last one."""
 
     def step(self) -> None:
-        """Publish the next sample or do the next step, which is due now."""
+        """Publish the sample or run the step that is due now."""
 
 
 class StepScheduler(Scheduler):
@@ -44,13 +44,13 @@ class StepScheduler(Scheduler):
         source: Callable[[], StepSource | None],
         begin_ns: int,
     ) -> None:
-        """Initialise the time.
+        """Set up simulated time.
 
         Args:
             clock: The clock to advance.
-            executor: The thread that runs everything but the application's code.
-            proxy: Its ticks are part of the time.
-            source: Returns the source of samples or steps; None while there is none yet.
+            executor: The thread that runs everything except the application's code.
+            proxy: The proxy, which is ticked as time advances.
+            source: Returns the source of samples or steps; None if it does not exist yet.
             begin_ns: Start of the recording.
         """
         super().__init__(clock)
@@ -62,43 +62,43 @@ class StepScheduler(Scheduler):
         self._supervisor: ConnectionSupervisor | None = None
         self._supervisor_due_ns = 0
         self._tick_due_ns = clock.now_ns
-        self._begun = False  # the application is connected and the recording runs
+        self._begun = False  # whether the application is connected and the recording has started
         self._end_ns = _NEVER_NS
-        self._turn = threading.Lock()  # held by the one thread that advances the time
+        self._turn = threading.Lock()  # held by the thread that is advancing time
         self._interrupted = False
 
     def notifier(self) -> Notifier:
-        """Return a notifier whose waits advance the time."""
+        """Return a notifier whose waits advance simulated time."""
         return StepNotifier(self)
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:  # noqa: ARG002
-        """Return a notifier whose waits advance the time."""
+        """Return a notifier whose waits advance simulated time."""
         return StepNotifier(self)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
-        """Store the connection's supervisor, which is called as the time advances."""
+        """Store the connection's supervisor, to be called as time advances."""
         self._supervisor = supervisor
 
     def opened(self) -> None:
-        """Advance to the recording's start; from now on its samples are published."""
+        """Advance to the recording's start and begin to publish its samples."""
         self.wait_for(lambda: False, (self._begin_ns - self._time.now_ns) / NS_PER_S, lambda: False)
         self._begun = True
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None, sleep: Callable[[], bool]) -> bool:
-        """Advance the time until ``ready()`` is true.
+        """Advance simulated time until ``ready()`` is true.
 
-        If another thread is already waiting, it advances the time, and ``sleep()`` waits here as usual.
+        If another thread is already advancing time, this one just waits in ``sleep()``.
 
         Args:
             ready: Evaluated after each step, on the executor's thread.
-            timeout_s: In the recording's time; None waits until 60 s after the recording's end.
+            timeout_s: Limit in simulated time; None waits until 60 s after the recording's end.
             sleep: Waits in real time.
 
         Returns:
             Whether it became ready.
 
         Raises:
-            UsageError: Called on the executor's thread, as from an inline callback.
+            UsageError: Called on the executor's thread, for example by an inline callback.
         """
         if self._executor.is_current:
             raise UsageError("a callback in step with the recording can't wait for the next sample")
@@ -124,7 +124,7 @@ class StepScheduler(Scheduler):
         return True
 
     def _step(self, until_ns: int) -> bool:
-        """Process the next event; return False if it is later than the given time, or if there is none."""
+        """Process the next event; return False if there is none or it is due later than the given time."""
         supervisor, steps, time = self._supervisor, self._source(), self._time
         if supervisor is not None and (supervisor.connection.poked or self._supervisor_due_ns <= time.now_ns):
             self._attend(supervisor)
@@ -160,7 +160,7 @@ class StepScheduler(Scheduler):
 
 
 class StepNotifier(Notifier):
-    """A notifier whose waits advance the time."""
+    """A notifier whose waits advance simulated time."""
 
     __slots__ = ("_scheduler",)
 
@@ -170,11 +170,11 @@ class StepNotifier(Notifier):
         self._scheduler = scheduler
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true, which is evaluated after each step.
+        """Wait until ``ready()`` is true; it is evaluated after each step.
 
         Args:
             ready: Whether the wait is over.
-            timeout_s: In the recording's time; None sets no limit.
+            timeout_s: Limit in simulated time; None for no limit.
 
         Returns:
             Whether it became ready within that time.

@@ -1,4 +1,4 @@
-"""A transport within one thread: a packet reaches the other end before anything else happens."""
+"""A single-threaded transport: each packet reaches the other end before anything else happens."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _log = logging.getLogger("skyloop")
 
 
 class StepExecutor:
-    """One thread that runs everything but the application's own code, in the order of posting."""
+    """A thread that runs everything except the application's own code, in the order in which it was posted."""
 
     def __init__(self, name: str) -> None:
         """Start the thread.
@@ -51,7 +51,7 @@ class StepExecutor:
         """Queue a job.
 
         Args:
-            job: Its exceptions are logged.
+            job: The job; its exceptions are logged.
         """
         self._jobs.put(job)
 
@@ -85,7 +85,7 @@ class StepExecutor:
             raise raised[0]
 
     def run_pending(self) -> None:
-        """Run all posted jobs and those that they post. Call it only on the executor's thread."""
+        """Run all posted jobs, including those they post themselves. Call this only on the executor's thread."""
         while True:
             try:
                 job = self._jobs.get_nowait()
@@ -97,7 +97,7 @@ class StepExecutor:
             _run_logged(job)
 
     def close(self) -> None:
-        """Run the posted jobs, then end the thread. Idempotent."""
+        """Run the remaining jobs, then end the thread. Idempotent."""
         self._jobs.put(None)
         if not self.is_current:
             self._thread.join()
@@ -118,7 +118,7 @@ ADDRESS: Final = "this process, in step with one application"
 
 
 class SteppedServer(TransportServer):
-    """A proxy's end, for one client at a time. Handlers are called on the executor's thread."""
+    """The proxy's end, which serves one client at a time. Handlers are called on the executor's thread."""
 
     def __init__(self, executor: StepExecutor) -> None:
         self._executor = executor
@@ -194,12 +194,12 @@ class SteppedServer(TransportServer):
         return ADDRESS
 
     def receive(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet of the client. Call it only on the executor's thread."""
+        """Handle a packet from the client. Call this only on the executor's thread."""
         if self._handler is not None:
             self._handler.packet(peer, packet)
 
     def drop(self, client: SteppedClient, reason: str) -> None:
-        """End a connection, once; each end's handler is called after the earlier packets."""
+        """End a connection once; each end's handler is called after all earlier packets have been delivered."""
         if self._client is not client:
             return
         self._client = None
@@ -214,7 +214,7 @@ class SteppedServer(TransportServer):
 
 
 class SteppedClient(TransportClient):
-    """A client's end."""
+    """The client's end."""
 
     def __init__(self, server: SteppedServer, executor: StepExecutor, peer: Peer, handler: ClientHandler) -> None:
         self.peer = peer
@@ -256,16 +256,16 @@ class SteppedClient(TransportClient):
     # On the executor's thread -------------------------------------------------------------------------------------
 
     def packet(self, packet: bytes) -> None:
-        """Deliver a packet of the server."""
+        """Deliver a packet from the server."""
         if not self._closing:
             self._handler.packet(packet)
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:  # noqa: ARG002
-        """Deliver a frame of the server."""
+        """Deliver a frame from the server."""
         if not self._closing:
             self._handler.frame(header, pixels)
 
     def ended(self, reason: str) -> None:
-        """Report the end of the connection to the handler, once."""
+        """Tell the handler once that the connection has ended."""
         self._handler.closed(reason)
         self._closed.set()

@@ -1,4 +1,4 @@
-"""One folder for each vehicle: its driver, the pure part of its protocol (``wire``), and its ``emulator``.
+"""One folder per vehicle, with its driver, the pure part of its protocol (``wire``) and its ``emulator``.
 
-``docs/drivers.md`` shows how to write one. A driver is found by its entry point, never imported by the core.
+``docs/drivers.md`` shows how to write a driver. The core finds drivers by their entry points and never imports them.
 """

@@ -1,1 +1,1 @@
-"""``ardrone://HOST``: the Parrot AR.Drone, 1 and 2."""
+"""``ardrone://`` addresses: the Parrot AR.Drone 1 and 2."""

@@ -1,8 +1,8 @@
-"""Read and write the drone's configuration, and set the drone up again after each link loss. Pure.
+"""Reading and writing the drone's configuration, and setting the drone up after each link loss. Pure.
 
-``CONFIG`` writes a key once the acknowledge bit of navdata is clear. The drone sets the bit when it has accepted the
-command, which says nothing about the value, and ``CTRL 5`` clears it for the next one. ``CTRL 4`` makes the drone send
-all keys over a TCP connection; :attr:`Configurator.wants_dump` requests that connection.
+``CONFIG`` writes a key once the acknowledge bit in navdata is clear. The drone sets the bit when it has received the
+command, which does not mean that it accepted the value; ``CTRL 5`` clears the bit for the next command. ``CTRL 4``
+makes the drone send all keys over a TCP connection; :attr:`Configurator.wants_dump` requests that connection.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, Ctrl
 from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_value, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
 
-REPEAT_NS: Final = nanoseconds(0.15)  #: between repeats of an unacknowledged CONFIG; two periods of the demo mode
-REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: between repeats of a request for the dump
-MAX_DUMP: Final = 1 << 18  #: bytes; real dumps have about 5000
+REPEAT_NS: Final = nanoseconds(0.15)  #: time between repeats of an unacknowledged CONFIG: two periods of demo mode
+REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: time between repeats of a request for the dump
+MAX_DUMP: Final = 1 << 18  #: greatest accepted size of a dump in bytes; real ones have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
 _SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
@@ -45,16 +45,16 @@ Step: TypeAlias = Write | Read
 
 @dataclass(eq=False)
 class Exchange:
-    """Steps in order, and a callback for the end."""
+    """A sequence of steps, and a callback that is called at the end."""
 
     steps: Iterator[Step]  #: may be a generator: each step is fetched after the previous one has finished
-    deadline_ns: int  #: for all steps together
-    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with the failure, or None
+    deadline_ns: int  #: deadline for all steps together
+    done: Callable[[str | None], None] = field(default=lambda _: None)  #: called at the end with the failure or None
 
 
 @dataclass(frozen=True, slots=True)
 class Ids:
-    """Ids of session, user and application on a drone with multi-configuration: eight hex digits each."""
+    """The session, user and application ids on a drone with multi-configuration, eight hex digits each."""
 
     session: str
     profile: str
@@ -63,27 +63,27 @@ class Ids:
 
 class _Phase(Enum):
     IDLE = auto()
-    CLEARING = auto()  # clear the previous acknowledgement, so that a new one is noticed
+    CLEARING = auto()  # waiting for the previous acknowledgement to be cleared, so that a new one can be recognised
     ASKING = auto()
-    SETTLING = auto()  # acknowledged; wait until the bit is clear again
+    SETTLING = auto()  # acknowledged; waiting for the bit to be cleared again
 
 
 class Configurator:
-    """Runs exchanges one at a time, in the order of submission."""
+    """Runs exchanges one at a time, in the order in which they are submitted."""
 
     def __init__(self) -> None:
-        self.values: dict[str, str] = {}  #: as last read
-        self.ids: Ids | None = None  #: sent before each CONFIG
-        self.wants_dump = 0  #: number of the dump that needs a connection to the control port; 0: none
+        self.values: dict[str, str] = {}  #: the configuration as last read
+        self.ids: Ids | None = None  #: ids sent before each CONFIG
+        self.wants_dump = 0  #: number of the dump for which a connection to the control port is needed; 0 if none is
         self.trouble = ""  #: why the last dump failed
         self._queue: deque[Exchange] = deque()
         self._exchange: Exchange | None = None
         self._step: Step | None = None
         self._phase = _Phase.IDLE
-        self._acknowledged = False  # the last received bit
+        self._acknowledged = False  # the acknowledge bit as last received
         self._asked_ns = 0
         self._dumps = 0
-        self._dump: bytearray | None = None  # None: not connected
+        self._dump: bytearray | None = None  # bytes received so far; None if not connected
 
     @property
     def busy(self) -> bool:
@@ -122,7 +122,7 @@ class Configurator:
         return True
 
     def dump_opened(self) -> None:
-        """Handle the open connection to the control port."""
+        """Begin a dump: the connection to the control port is open."""
         self._dump, self._asked_ns = bytearray(), 0
 
     def dump_received(self, data: bytes) -> bool:
@@ -141,7 +141,7 @@ class Configurator:
         return True
 
     def dump_failed(self, reason: str) -> None:
-        """Handle a control port that refused or closed early; retried until the exchange's deadline."""
+        """Handle a connection that was refused or closed early; it is retried until the exchange's deadline."""
         self._dump = None
         self.trouble = reason
 
@@ -222,13 +222,13 @@ class Configurator:
         self._end_step()
         self._exchange = None
         exchange.done(failure)
-        if self._exchange is None:  # unless it submitted another one
+        if self._exchange is None:  # unless the callback submitted another one
             self._next_exchange()
 
 
 # Set-up --------------------------------------------------------------------------------------------------------------
 
-_NEW_MOTHER_BOARD: Final = 32  #: the AR.Drone 2 has at least this version, the AR.Drone 1 at most 17
+_NEW_MOTHER_BOARD: Final = 32  #: lowest mother board version of an AR.Drone 2; those of an AR.Drone 1 go up to 17
 _ID_KEYS: Final = {
     "session": "custom:session_id",
     "profile": "custom:profile_id",
@@ -237,7 +237,7 @@ _ID_KEYS: Final = {
 
 
 def version_of(configuration: Mapping[str, str]) -> int | None:
-    """Tell an AR.Drone 1 from a 2 by the firmware or mother board in its configuration; None if both are missing."""
+    """Return 1 or 2 according to the firmware or mother board in the configuration; None if both are missing."""
     major = configuration.get("general:num_version_soft", "").partition(".")[0]
     if major.isdecimal() and int(major) >= 1:
         return 1 if int(major) == 1 else 2
@@ -248,7 +248,7 @@ def version_of(configuration: Mapping[str, str]) -> int | None:
 
 
 def own_ids(session: int) -> Ids:
-    """Return Skyloop's ids. Settings of application and user persist; those of a session end with it."""
+    """Return Skyloop's ids. Application and user settings persist; session settings last as long as the session."""
     return Ids(
         session=f"{session & 0xFFFFFFFF:08x}",
         profile=f"{crc32(b'skyloop user'):08x}",
@@ -257,7 +257,7 @@ def own_ids(session: int) -> Ids:
 
 
 def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
-    """Return the ids that the drone's configuration names; None for a drone without multi-configuration."""
+    """Return the ids named in the drone's configuration; None for a drone without multi-configuration."""
     if not all(key in configuration for key in _ID_KEYS.values()):
         return None
     return Ids(**{name: configuration[key] for name, key in _ID_KEYS.items()})
@@ -266,15 +266,15 @@ def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
 class Setup:
     """The steps that set up one drone.
 
-    ``version`` is known once the steps are done, unless the drone does not report it. ``refused_ids`` is then True if
-    the drone did not accept settings of our own.
+    Once the steps are done, ``version`` is known, unless the drone does not report it, and ``refused_ids`` is True if
+    the drone did not accept our own settings.
 
     Args:
         options: Options of the vehicle's address.
         configurator: Runs the steps.
-        ids: Ours.
-        remembered: Keys that an application wrote before the link was lost. Those that the drone has forgotten are
-            written again.
+        ids: Our own ids.
+        remembered: Keys that an application wrote before the link was lost; those that the drone has since forgotten
+            are written again.
     """
 
     def __init__(
@@ -288,7 +288,7 @@ class Setup:
         self._remembered = remembered
 
     def steps(self, state: State) -> Iterator[Step]:
-        """Yield the steps for the first received state bits; each must be done before the next one is fetched."""
+        """Yield the steps, given the first state bits received; finish each one before fetching the next."""
         options, configurator = self._options, self._configurator
         in_demo = bool(state & State.DEMO)
         if state & State.BOOTSTRAP or in_demo is options.full:

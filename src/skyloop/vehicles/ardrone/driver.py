@@ -1,4 +1,4 @@
-"""The driver of ``ardrone://``, which joins link, video and parameters."""
+"""The driver for ``ardrone://``, which combines the link, the video and the parameters."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ArdroneDriver(Driver):
     def capabilities(self) -> Capabilities:
         """Return the drone's capabilities.
 
-        Cameras are those of an AR.Drone 2 unless the address says version 1.
+        The cameras are those of an AR.Drone 2 unless the address specifies version 1.
         """
         version = self.options.version
         return Capabilities(
@@ -63,7 +63,7 @@ class ArdroneDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.video:
-            make_decoder(self.options.version or 2)  # raises if a decoder's library is not installed
+            make_decoder(self.options.version or 2)  # raises an error now if the decoder's library is not installed
         ids = own_ids(secrets.randbits(32))
         session = ArdroneSession(self.options, ids, monotonic_ns(), extra=self._video_telemetry)
         self._session = session
@@ -97,7 +97,7 @@ class ArdroneDriver(Driver):
         return self._link.command(action)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return preflight findings from the drone's state and configuration."""
+        """Return preflight findings based on the drone's state and configuration."""
         link = self._link
         if link is None:
             raise DriverError(f"{self.uri} is not open")
@@ -108,7 +108,7 @@ class ArdroneDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the commands that are not actions and, once it has been read, the drone's configuration."""
+        """Return the commands that are not actions, and the drone's configuration once it has been read."""
         if self._link is None or self._commands is None:
             return []
         with self._link.lock:
@@ -117,7 +117,7 @@ class ArdroneDriver(Driver):
         return known + [entry.parameter for entry in self._entries().values()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a key, with acknowledgement and read-back, or send a command. Takes up to 0.9 s."""
+        """Write a key, wait for its acknowledgement and read it back; or send a command. Takes up to 0.9 s."""
         link, commands = self._link, self._commands
         if link is None or commands is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
@@ -179,7 +179,7 @@ class ArdroneDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the active camera's intrinsics; those in the address belong to the front camera."""
+        """Return the active camera's intrinsics; intrinsics in the address apply to the front camera."""
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:

@@ -1,4 +1,4 @@
-"""The sockets of one drone: navdata, AT commands and the control port."""
+"""One drone's sockets: navdata, AT commands and the control port."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Read,
 from skyloop.vehicles.ardrone.protocol import REPEATS, START_NAVDATA, ArdroneSession
 from skyloop.vehicles.ardrone.wire.at import AtMessage
 
-WRITE_S: Final = 0.9  #: limit for writing a key, its acknowledgement and the read-back
+WRITE_S: Final = 0.9  #: time allowed for writing a key, including the acknowledgement and reading it back
 
 
 class ArdroneLink(VehicleLink[ArdroneSession]):
-    """Navdata, AT commands and the control port of one drone."""
+    """The link to one drone: navdata, AT commands and the control port."""
 
     def __init__(
         self, session: ArdroneSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
@@ -34,12 +34,12 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
     # From the proxy's threads ----------------------------------------------------------------------------------
 
     def send(self, message: AtMessage, times: int = REPEATS) -> None:
-        """Send a command without acknowledgement in this many ticks. Any thread."""
+        """Send an unacknowledged command in each of the next ``times`` ticks. May be called from any thread."""
         with self.lock:
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back; return the failure, or None. Takes up to 0.9 s. Any thread but the link's."""
+        """Write a key and read it back; return the failure or None. Takes up to 0.9 s; not for the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
@@ -102,7 +102,7 @@ def _connected(address: str, port: int) -> socket.socket:
 
 
 def _discard(port: socket.socket) -> None:
-    """Empty the AT port. It receives only errors of the host, and the navdata socket gets those as well."""
+    """Discard what the AT port received: only errors from the host, which the navdata socket reports too."""
     with suppress(OSError):
         while port.recv(MAX_DATAGRAM):
             pass
@@ -110,12 +110,12 @@ def _discard(port: socket.socket) -> None:
 
 # The control port ----------------------------------------------------------------------------------------------------
 
-RETRY_NS: Final = nanoseconds(0.25)  #: between attempts to connect to the control port
+RETRY_NS: Final = nanoseconds(0.25)  #: time between attempts to connect to the control port
 _CHUNK: Final = 1 << 16
 
 
 class DumpClient:
-    """Fetches the dump that the configurator wants, over a separate connection to the control port."""
+    """Fetches the dump that the configurator requests, over a separate connection to the control port."""
 
     def __init__(self, port: int, selector: selectors.BaseSelector, ready: Callable[[], None]) -> None:
         """Store the arguments. No I/O."""
@@ -129,7 +129,7 @@ class DumpClient:
         self._tried_ns = -RETRY_NS
 
     def follow(self, configurator: Configurator, now_ns: int) -> None:
-        """Connect or close, as the configurator wants. Called in every step of the link."""
+        """Open or close the connection as the configurator requires. Called in every step of the link."""
         if configurator.wants_dump != self._number:
             self.close()
             self._number, self._tried_ns = configurator.wants_dump, -RETRY_NS
@@ -138,7 +138,7 @@ class DumpClient:
             self._connect(configurator)
 
     def serve(self, configurator: Configurator) -> None:
-        """Handle a connection that is ready: established, failed, or with data to read."""
+        """Handle a socket event: the connection was established or failed, or data can be read."""
         connection = self._connection
         if connection is None:
             return

@@ -1,4 +1,4 @@
-"""Options of an ``ardrone://`` address. Pure. ``docs/ardrone.md`` lists them."""
+"""Options in an ``ardrone://`` address, listed in ``docs/ardrone.md``. Pure."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class ArdroneOptions:
 
     host: str
     ports: Ports = navdata.STANDARD
-    version: int | None = None  #: the drone's version; None: from its configuration
+    version: int | None = None  #: the drone's version; None to read it from the configuration
     full: bool = False  #: navdata at 200 Hz with all options instead of the demo mode
-    navdata_options: int | None = None  #: one bit per tag; None: as configured in the drone
-    rate_hz: float = 50.0  #: highest rate of feedback
+    navdata_options: int | None = None  #: one bit per tag; None to leave the drone's configuration as it is
+    rate_hz: float = 50.0  #: maximum rate of feedback
     video: bool = True
-    ids: bool = True  #: own settings on an AR.Drone 2 (multi-configuration)
+    ids: bool = True  #: whether to use our own settings on an AR.Drone 2 (multi-configuration)
 
 
 def options_of(uri: VehicleUri) -> ArdroneOptions:
@@ -78,7 +78,7 @@ def _one_of(uri: VehicleUri, name: str, usual: str, meanings: dict[str, _Meaning
 
 
 def _mask(uri: VehicleUri) -> int | None:
-    """Return ``navdata_options``: names of options, or a number with one bit per tag.
+    """Return the value of ``navdata_options``, which is given as option names or a number with one bit per tag.
 
     The demo option is always included.
     """

@@ -1,4 +1,4 @@
-"""The drone's keys and commands as parameters, under their own names and the names all drivers share in SI. Pure."""
+"""The drone's keys and commands as parameters, with their own names and the SI names that all drivers share. Pure."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TYPES: Final[dict[type, ParameterType]] = {
     tuple: ParameterType.VECTOR,
     str: ParameterType.TEXT,
 }
-#: Keys that the driver writes itself, or that have a parameter that checks the drone's state first.
+#: Keys that the driver writes itself or that are written by a parameter which checks the drone's state first.
 _OURS: Final = {
     "general:navdata_demo": "the option navdata of the address decides",
     "general:navdata_options": "the option navdata_options of the address decides",
@@ -52,7 +52,7 @@ _OURS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Common:
-    """A name shared by all drivers and the key behind it; the key's number divided by ``divisor`` is SI."""
+    """A name shared by all drivers, and the key it maps to. The key's number divided by ``divisor`` is in SI units."""
 
     name: str
     key: str
@@ -87,19 +87,19 @@ _CHANNELS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A parameter and the key behind it."""
+    """A parameter and the key it maps to."""
 
     parameter: Parameter
     key: str
-    like: bool | int | float | str | tuple[float, ...]  #: a value of the key's type
+    like: bool | int | float | str | tuple[float, ...]  #: any value of the key's type
     divisor: float = 1.0
-    names: tuple[str, ...] = ()  #: of the key's values from 0 on, if the parameter names them
+    names: tuple[str, ...] = ()  #: names for the key's values 0, 1, 2 and so on; empty if it has no named values
 
     def to_text(self, value: Value) -> str:
-        """Return a value in the drone's notation.
+        """Convert a value to the drone's notation.
 
         Raises:
-            ParameterError: Wrong type, not finite, or none of the names.
+            ParameterError: The value has the wrong type, is not finite, or is not one of the names.
         """
         if self.names:
             if value not in self.names:
@@ -115,7 +115,7 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """Return the value for the drone's text.
+        """Convert the drone's text to a value.
 
         Raises:
             DecodeError: The text does not fit the key's type.
@@ -136,7 +136,7 @@ def _wrong(parameter: Parameter, what: str) -> ParameterError:
 
 
 def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entry]:
-    """Return all parameters of a configuration by name. Unknown keys become read-only texts."""
+    """Return all parameters in a configuration by name. Unknown keys become read-only texts."""
     found: dict[str, Entry] = {}
     for name, text in values.items():
         entry = _own_entry(name, text, version)
@@ -151,7 +151,7 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
 
 
 def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value; raise for a wrong name or value."""
+    """Return the entry and the key's text for a new value; raise an error if the name or value is invalid."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -174,7 +174,7 @@ def taken(entry: Entry, wanted: str, reported: str) -> bool:
 
 
 def active_camera(values: Mapping[str, str]) -> str:
-    """Return which camera the video shows according to the configuration; ``front`` by default."""
+    """Return which camera is selected for the video in the configuration; ``front`` by default."""
     try:
         channel = int(values.get(CHANNEL_KEY, "0"))
     except ValueError:
@@ -216,7 +216,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
 
 
 def _choices(name: str, version: int | None) -> tuple[int, ...]:
-    """Return the values of a key whose choices depend on the drone's version."""
+    """Return the allowed values of a key for which they depend on the drone's version."""
     if name == CHANNEL_KEY:
         return tuple(range(len(_CHANNELS[version or 2])))
     if name == "video:video_codec":
@@ -269,7 +269,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """Widen a range that excludes the present value: this drone's range is larger than the documented one."""
+    """Widen the range to include the present value, which shows that this drone allows more than is documented."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))
@@ -285,12 +285,12 @@ def _widened(parameter: Parameter) -> Parameter:
 
 # Commands that are not actions ---------------------------------------------------------------------------------------
 
-#: Sends a command in a number of ticks.
+#: Sends a command in each of a number of ticks.
 Send = Callable[[AtMessage, int], None]
 
 _REPEATS: Final = 3
-_MAGNETOMETER: Final = 0  #: the device of ``CALIB``
-_HALF_TURN: Final = 3.1416  #: rad, rounded up so that π itself fits
+_MAGNETOMETER: Final = 0  #: device number for ``CALIB``
+_HALF_TURN: Final = 3.1416  #: π rounded up [rad], so that π itself is within the range
 
 
 def _switch(name: str, description: str) -> Parameter:
@@ -298,7 +298,7 @@ def _switch(name: str, description: str) -> Parameter:
 
 
 def _once(parameter: Parameter) -> Parameter:
-    """Mark a parameter that triggers one action of the drone each time it is written."""
+    """Mark a parameter that triggers an action each time it is written."""
     return msgspec.structs.replace(parameter, momentary=True)
 
 
@@ -347,7 +347,7 @@ def _flight_animations(version: int | None) -> Parameter:
 
 
 class Commands:
-    """Commands that are not actions, as parameters with their values."""
+    """The commands that are not actions, presented as parameters with values."""
 
     def __init__(self, setpoints: SetpointController, send: Send) -> None:
         self._setpoints = setpoints
@@ -355,7 +355,7 @@ class Commands:
         self._values: dict[str, Value] = {}
 
     def parameters(self, version: int | None) -> list[Parameter]:
-        """Return the parameters of this version of the drone."""
+        """Return the parameters for this version of the drone."""
         known = [_LEDS, _LEDS_FREQUENCY, _LEDS_DURATION, _TRIM, _flight_animations(version)]
         if version != 1:
             known += [_CALIBRATE, _ABSOLUTE, _HEADING]
@@ -365,8 +365,8 @@ class Commands:
         """Send a command and return the parameter's new value.
 
         Raises:
-            ParameterError: The value does not fit, or the command needs a drone on the ground (or in the air) and it
-                is not.
+            ParameterError: The value is invalid, or the command requires the drone to be on the ground (or in the air)
+                and it is not.
         """
         value = checked_value(parameter, value)
         name = parameter.name
@@ -404,7 +404,7 @@ class Commands:
 
     def _fly(self, name: str) -> None:
         number = next(at for at, (known, _) in enumerate(FLIGHT_ANIMATIONS) if known == name)
-        # Sent once: a repeat would fly the animation again.
+        # Sent only once, because a repeat would fly the animation again.
         self._give(("ANIM", (number, FLIGHT_ANIMATIONS[number][1])), on_ground=False, times=1)
 
     def _give(self, message: AtMessage, *, on_ground: bool, times: int = _REPEATS) -> None:

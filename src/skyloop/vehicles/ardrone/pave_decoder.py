@@ -1,4 +1,4 @@
-"""Decode the frames of a PaVE stream, live or from a file, with PyAV. Import this module only where video is needed."""
+"""A PyAV decoder for PaVE streams, live or from a file. Import this module only where video is needed."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
 __all__ = ["PaveDecoder", "av"]
 
 _DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
-# FFmpeg occasionally refuses an MPEG-4 frame that is padded by a single bit, unless the sequence's end follows.
+# FFmpeg occasionally refuses an MPEG-4 frame padded by a single bit, unless an end-of-sequence code follows it.
 _ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
 
 
 class PaveDecoder:
-    """Decodes frames of a PaVE stream: one frame in, at most one picture out, without delay.
+    """Decodes the frames of a PaVE stream: one frame in, at most one image out, without delay.
 
-    Returns nothing before the first key frame (a torn stream, or the stale frame that the drone sends first). After
-    damage or a gap in the frame numbers it returns nothing until the next key frame, because those pictures would be
-    smeared. ``waited`` counts frames dropped for these reasons, ``damaged`` those that could not be decoded.
+    Returns nothing until the first key frame, because the stream may be torn and the drone sends a stale frame first.
+    After damage or a gap in the frame numbers it returns nothing until the next key frame, because the images would be
+    smeared. ``waited`` counts the frames dropped for these reasons, ``damaged`` those that could not be decoded.
 
-    PaVE and H.264 have no checksum, so a flipped bit that makes another valid stream goes unnoticed. TCP has one.
+    PaVE and H.264 have no checksum, so a flipped bit that leaves the stream valid goes unnoticed. TCP has one.
     """
 
     def __init__(self) -> None:
@@ -43,11 +43,11 @@ class PaveDecoder:
         self._number = 0  # number of the previous frame
 
     def restart(self) -> None:
-        """Wait for a key frame, as the stream is interrupted."""
+        """Wait for the next key frame because the stream was interrupted."""
         self._needs_key = True
 
     def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
-        """Return the picture of a frame, or None. Never raises for any content."""
+        """Return a frame's image, or None. Never raises, whatever the content."""
         follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
         self._needs_key = self._needs_key or frame.after_damage or not follows
         self._number = frame.number
@@ -70,7 +70,7 @@ class PaveDecoder:
         return images[-1]
 
     def _start(self, codec: int) -> None:
-        """Make a new decoder: an old one would show remains of pictures from before the damage."""
+        """Create a new decoder: the old one would show remnants of images from before the damage."""
         self._codec, self._context = codec, None
         name = _DECODERS.get(codec)
         if name is None:
@@ -79,5 +79,5 @@ class PaveDecoder:
 
 
 def _fits(image: av.VideoFrame, frame: PaveFrame) -> bool:
-    """Return whether an H.264 picture has the size in its header. Not checked for MPEG-4: real drones' is unknown."""
+    """Return whether an H.264 image has the size in its header; not checked for MPEG-4, whose real size is unknown."""
     return frame.codec != Codec.MPEG4_AVC or (image.width, image.height) == (frame.width, frame.height)

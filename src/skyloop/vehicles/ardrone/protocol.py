@@ -1,4 +1,4 @@
-"""The protocol of one drone from the first datagram on: navdata in, AT commands out. No socket, no clock."""
+"""The protocol with one drone from the first datagram onwards: navdata in, AT commands out. No sockets, no clock."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, format_command
 from skyloop.vehicles.ardrone.wire.navdata import Navdata, State
 from skyloop.vehicles.ardrone.wire.options import Demo
 
-#: Datagrams that begin at sequence 1 after a restart. One may be lost, and only a 1 resets the drone's count.
+#: Number of datagrams that begin at sequence 1 after a restart; one may be lost, and only a 1 resets the drone's count.
 FRESH_DATAGRAMS: Final = 3
 
 
 class Sequencer:
-    """Numbers the commands. The drone executes only commands newer than the last one, and a 1 restarts its count."""
+    """Numbers the commands. The drone executes only those numbered higher than the last; a 1 restarts its count."""
 
     def __init__(self) -> None:
         self._sequence = 0
         self._fresh = FRESH_DATAGRAMS
 
     def restart(self) -> None:
-        """Begin at 1 again, after a link loss in either direction."""
+        """Begin at 1 again after a link loss in either direction."""
         self._fresh = FRESH_DATAGRAMS
 
     def datagram(self, messages: Iterable[AtMessage]) -> bytes:
-        """Return the messages as one datagram; empty for none."""
+        """Return the messages as one datagram, which is empty if there are none."""
         messages = tuple(messages)
         if messages and self._fresh:
             self._fresh -= 1
@@ -54,25 +54,25 @@ class Sequencer:
         return b"".join(lines)
 
 
-TICK_NS: Final = nanoseconds(0.03)  #: between AT commands, as the drone's guide recommends
+TICK_NS: Final = nanoseconds(0.03)  #: time between AT commands, as recommended in the drone's guide
 HURRY_NS: Final = nanoseconds(
     0.01
-)  #: minimum time between a datagram and a new set-point that does not wait for its tick
-DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
-LOST_NS: Final = nanoseconds(1.0)  #: of silence
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
-START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none arrive
-SETUP_NS: Final = nanoseconds(6.0)  #: limit for the drone's set-up, which is then retried
-SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after it the link is DEGRADED, and the drone may fly without set-up
-DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone ignores our commands
-REPEATS: Final = 3  #: of a command without acknowledgement
+)  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
+DEGRADED_NS: Final = nanoseconds(0.25)  #: silence after which the link is DEGRADED
+LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is LOST
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+START_NS: Final = nanoseconds(0.25)  #: time between requests for navdata while none arrives
+SETUP_NS: Final = nanoseconds(6.0)  #: time allowed for setting up the drone before another attempt
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: then the link is DEGRADED and the drone may fly without set-up
+DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit set for this long means that the drone is ignoring our commands
+REPEATS: Final = 3  #: how many times an unacknowledged command is sent
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
 
 _WATCHDOG: Final[AtMessage] = ("COMWDG", ())
 
 
 class ArdroneSession(VehicleSession):
-    """The protocol between one opened driver and its drone. Not thread-safe."""
+    """The protocol between an open driver and its drone. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -91,7 +91,7 @@ class ArdroneSession(VehicleSession):
         self.configurator = Configurator()
         self.reception = Reception()
         self.ready = False  #: whether the drone is set up and its configuration known
-        self.remembered: dict[str, str] = {}  #: written keys, with the values in the drone's notation
+        self.remembered: dict[str, str] = {}  #: keys that were written, with their values in the drone's notation
         self._ids = ids
         self._extra = extra
         self._sequencer = Sequencer()
@@ -100,19 +100,19 @@ class ArdroneSession(VehicleSession):
         self._health = Health()
         self._setup_ns: int | None = None
         self._setups_failed = 0
-        self._state = self._earlier = State(0)  # state bits of the newest datagram and the previous one
+        self._state = self._earlier = State(0)  # state bits in the newest datagram and the previous one
         self._sent_ns = 0
         self._started_ns = 0
         self._published_ns = 0
         self._deaf_since_ns: int | None = None
-        self._once: list[list[AtMessage]] = []  # extra commands for each of the next ticks
+        self._once: list[list[AtMessage]] = []  # additional commands for each of the next ticks
         self._place = f"{options.host}, UDP port {options.ports.navdata}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for navdata from {self._place}")
 
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and send it soon; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)
@@ -124,14 +124,14 @@ class ArdroneSession(VehicleSession):
         return applied
 
     def send(self, message: AtMessage, times: int = REPEATS) -> None:
-        """Send a command without acknowledgement in this many ticks."""
+        """Send an unacknowledged command in each of the next ``times`` ticks."""
         while len(self._once) < times:
             self._once.append([])
         for at in range(times):
             self._once[at].append(message)
 
     def submit(self, exchange: Exchange) -> None:
-        """Queue an exchange of the configuration."""
+        """Queue a configuration exchange."""
         self.configurator.submit(exchange)
         self.due_ns = 0
 
@@ -147,13 +147,13 @@ class ArdroneSession(VehicleSession):
 
     @property
     def state(self) -> State | None:
-        """The newest state bits of the drone; None before the first."""
+        """The drone's newest state bits; None before the first navdata."""
         return None if self._received_ns is None else self._state
 
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_navdata(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the navdata port. Never raises for any content."""
+        """Handle a datagram from the navdata port. Never raises, whatever the content."""
         navdata = self.reception.receive(datagram, now_ns)
         if navdata is None:
             return
@@ -175,9 +175,9 @@ class ArdroneSession(VehicleSession):
             self._publish(navdata, demo, now_ns)
 
     def _detect_break(self, state: State, now_ns: int) -> None:
-        """Detect that the drone restarted or lost us, even in a silence too short to count as a lost link.
+        """Detect that the drone restarted or lost us, even during a silence too short to count as a lost link.
 
-        The drone may have forgotten its set-up meanwhile. Two datagrams in a row must show it.
+        The drone may have lost its set-up in the process. Two consecutive datagrams must show it.
         """
         both, begins = state & self._state, ~self._earlier
         self._earlier = self._state
@@ -203,7 +203,7 @@ class ArdroneSession(VehicleSession):
     # Time ------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
-        """Return the datagram that is due on the AT port; empty if there is none."""
+        """Return the datagram to send from the AT port now; empty if none is due."""
         self._check_silence(now_ns)
         self.due_ns, self._sent_ns = now_ns + TICK_NS, now_ns
         messages: list[AtMessage] = []
@@ -218,7 +218,7 @@ class ArdroneSession(VehicleSession):
         return self._sequencer.datagram(messages)
 
     def wants_start(self, now_ns: int) -> bool:
-        """Return whether to request navdata now because none arrive. True once per :data:`START_NS`."""
+        """Return whether to request navdata now because none is arriving. True once per :data:`START_NS`."""
         silent_ns = now_ns - (self._received_ns if self._received_ns is not None else 0)
         if silent_ns < DEGRADED_NS or now_ns - self._started_ns < START_NS:
             return False
@@ -242,7 +242,7 @@ class ArdroneSession(VehicleSession):
     def _check_deafness(self, now_ns: int) -> None:
         """Restart the sequence if the watchdog bit stays set.
 
-        The drone clears the bit when it accepts commands. If it does not, its count may be ahead of ours.
+        The drone clears the bit when it accepts commands. If the bit stays set, its count may be ahead of ours.
         """
         if self._deaf_since_ns is None:
             self._deaf_since_ns = now_ns
@@ -281,7 +281,7 @@ class ArdroneSession(VehicleSession):
 
     def _setup_done(self, setup: Setup, failure: str | None) -> None:
         if self._setup_ns is None or self._received_ns is None:
-            return  # lost meanwhile
+            return  # the link has been lost
         if failure is not None:
             self._setups_failed += 1
             self.configurator.trouble = failure
@@ -300,5 +300,5 @@ class ArdroneSession(VehicleSession):
         self._set_link_state(LinkState.UP)
 
     def read_limits(self) -> None:
-        """Set the limits of set-points from the configuration."""
+        """Read the limits for set-points from the configuration."""
         self.setpoints.limits = limits_of(self.configurator.values)

@@ -1,10 +1,10 @@
-"""Turn set-points into ``REF`` and ``PCMD``, tick by tick. Pure.
+"""Turning set-points into ``REF`` and ``PCMD``, tick by tick. Pure.
 
 ``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata shows the new state. The
-emergency bit toggles the emergency on each change from clear to set. As packets get lost, it stays set for a request
-until navdata shows the change. It is toggled again only when navdata that the drone made later still shows no effect,
+emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps it
+set until navdata shows the change. It is toggled again only if navdata made later by the drone still shows no effect,
 because one toggle too many would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
-climb (positive up) and yaw rate (positive clockwise), each from -1 to 1: shares of the limits configured in the drone.
+climb (positive up) and yaw rate (positive clockwise), each from -1 to 1 as a fraction of the limit set in the drone.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.configuration import parse_value
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 
-HEADING_ACCURACY: Final = 0.1  #: of the reference sent with ``PCMD_MAG``, as a share of half a turn
+HEADING_ACCURACY: Final = 0.1  #: accuracy of the reference heading sent with ``PCMD_MAG``, as a fraction of half a turn
 _KEYS: Final = ("control:euler_angle_max", "control:control_vz_max", "control:control_yaw")
 
 
 @dataclass(frozen=True, slots=True)
 class StickLimits:
-    """Attitude and rates at a stick value of 1."""
+    """The attitude and rates commanded by a stick value of 1."""
 
     tilt_rad: float
     climb_m_s: float
@@ -51,7 +51,7 @@ class StickLimits:
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """The four values of ``PCMD``, each from -1 to 1, with its signs."""
+    """The four values of ``PCMD``, each from -1 to 1, with the signs used there."""
 
     roll: float
     pitch: float
@@ -60,7 +60,7 @@ class Stick:
 
 
 def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
-    """Return the limits in force in the drone's configuration; None if one is missing or not positive."""
+    """Return the limits in force according to the drone's configuration; None if any is missing or not positive."""
     try:
         tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
     except (KeyError, DecodeError):
@@ -71,7 +71,7 @@ def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
 
 
 def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
-    """Return the stick values for an attitude, and the attitude they stand for within the drone's limits."""
+    """Return the stick values for an attitude, and the attitude that they command within the drone's limits."""
     stick = Stick(
         roll=_share(action.roll, limits.tilt_rad),
         pitch=_share(-action.pitch, limits.tilt_rad),
@@ -88,10 +88,10 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
 
 
 def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
-    """Return ``PCMD`` for these stick values; None: hover.
+    """Return ``PCMD`` for these stick values; None means hover.
 
-    With a reference, return ``PCMD_MAG``: forward and right then refer to that heading (0 magnetic north, positive
-    counter-clockwise) and not to the drone's nose.
+    With a reference, return ``PCMD_MAG``, for which forward and right are relative to that heading (0 magnetic north,
+    positive counter-clockwise) instead of the drone's nose.
     """
     if stick is None:
         return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))
@@ -106,25 +106,25 @@ def _share(value: float, limit: float) -> float:
     return clamped(value / limit, 1.0) + 0.0  # avoids a negative zero
 
 
-TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
-RISES_NS: Final = nanoseconds(3.0)  #: for this long after we sent a take-off, a rise is ours and not another program's
-#: Navdata shows the effect of the emergency bit within this time, by the clocks of both ends.
+TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not taken off by then is refusing to
+RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time of sending a take-off is ours, not another program's
+#: Navdata shows the effect of the emergency bit within this time, on both ends' clocks.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 
-#: Below this height, finish a landing: navdata is up to 0.25 s old, and the take-off bit would restart a landed drone.
+#: Below this height, complete a landing: navdata may be 0.25 s old, and the take-off bit would restart a landed drone.
 BREAK_OFF_M: Final = 0.5
-#: Control states during a landing that continues.
+#: Control states in which a landing continues.
 _LANDING_ON: Final = (ControlState.LANDING, ControlState.LANDED, None)
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """The newest navdata's view of the flight."""
+    """The state of the flight according to the newest navdata."""
 
     state: State
     control: ControlState | None = None
-    altitude_m: float | None = None  #: above the surface below; None: unknown
+    altitude_m: float | None = None  #: height above the surface below; None if unknown
 
     @property
     def flying(self) -> bool:
@@ -138,49 +138,49 @@ class Condition:
 
     @property
     def touches_down(self) -> bool:
-        """Whether a landing has ended or may be about to."""
+        """Whether a landing is over, or may be over at any moment."""
         low = self.altitude_m is None or self.altitude_m < BREAK_OFF_M
         return self.control is ControlState.LANDED or (self.control is ControlState.LANDING and low)
 
 
-#: After this silence a flying drone may have landed: it lands after 2 s without commands.
+#: After this much silence a flying drone may have landed, because it lands after 2 s without commands.
 SILENT_NS: Final = nanoseconds(0.25)
 
 
 class Decision(Enum):
-    """The wish for take-off or landing."""
+    """Whether to take off or land."""
 
-    STAY = auto()  #: in the air if it flies, on the ground otherwise
+    STAY = auto()  #: stay in the air if flying, on the ground otherwise
     TAKE_OFF = auto()
     LAND = auto()
 
 
 class SetpointController:
-    """Remembers the last action and turns it into commands, tick by tick.
+    """Stores the last action and turns it into commands, tick by tick.
 
     ``reference_rad`` makes set-points relative to a heading (see :func:`skyloop.vehicles.ardrone.setpoints.motion`).
     """
 
     def __init__(self) -> None:
-        self.condition: Condition | None = None  #: None while the drone is silent
-        self.limits: StickLimits | None = None  #: None until read
+        self.condition: Condition | None = None  #: as shown by the newest navdata; None while the drone is silent
+        self.limits: StickLimits | None = None  #: None until they have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
         self._decision = Decision.STAY
         self._stick: Stick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
-        self._rises_until_ns = 0  # a take-off that we sent may show until then
-        self._releasing = False  # a reset is requested and not yet visible in navdata
-        self._emergency = False  # in the newest navdata, even after a link loss
+        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
+        self._releasing = False  # whether a reset was requested and navdata does not show it yet
+        self._emergency = False  # whether the newest navdata shows an emergency, kept after a link loss
         self._bit = False  # the emergency bit as last sent
-        self._bit_due = False  # set the bit next, whatever navdata shows
-        self._changed_ns = 0  # last change of or request for the bit, or end of an emergency
-        self._passed_ns = 0  # drone time from then to the newest navdata
+        self._bit_due = False  # whether to set the bit next, whatever navdata shows
+        self._changed_ns = 0  # time of the last change of or request for the bit, or of the end of an emergency
+        self._passed_ns = 0  # the drone's own time from then until the newest navdata
         self._received_ns = 0
-        self._late_ns = 0  # age of delayed navdata that arrives in a burst after a gap
+        self._late_ns = 0  # age of the delayed navdata that arrives in a burst after a gap
         self._warned_blind = False
-        self._steering = False  # we started or took this flight; otherwise another program may fly it
+        self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
         self._events: list[VehicleEvent] = []
 
     @property
@@ -202,8 +202,8 @@ class SetpointController:
             emergency stop is in force.
 
         Raises:
-            DriverError: A take-off without data from the drone or in emergency, a reset without data from the drone,
-                or an action that the drone does not have.
+            DriverError: A take-off while the drone is silent or in an emergency, a reset while it is silent, or an
+                action that the drone does not support.
         """
         if isinstance(action, Idle):
             return action
@@ -289,29 +289,29 @@ class SetpointController:
         """Handle the newest navdata.
 
         Args:
-            condition: Their content.
+            condition: The navdata's content.
             now_ns: The present time.
-            passed_ns: The drone's own time since the previous navdata; None: the same as here. It tells delayed
-                navdata, which arrives in a burst, from new navdata.
+            passed_ns: The drone's own time since the previous navdata; None if it is the same as here. It distinguishes
+                delayed navdata, which arrives in a burst, from new navdata.
         """
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
         self._passed_ns += passed_ns
-        in_a_row = 2 * gap_ns < passed_ns  # a burst of delayed navdata; otherwise the backlog is empty
+        in_a_row = 2 * gap_ns < passed_ns  # a burst of delayed navdata; otherwise there is no backlog
         if gap_ns >= SILENT_NS and self._received_ns:
             self._late_ns = gap_ns - passed_ns
         elif self._late_ns:
             self._late_ns = max(0, self._late_ns + gap_ns - passed_ns) if in_a_row else 0
         found = self.condition is None and gap_ns >= SILENT_NS
         if found or (self._emergency and not condition.emergency):
-            self._changed_ns, self._passed_ns = now_ns, 0  # wait for more navdata that agrees: this may be old
+            self._changed_ns, self._passed_ns = now_ns, 0  # this may be old: wait for more navdata to confirm it
         self._emergency = condition.emergency
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
         broken_off = was_landing and self._steering and self._decision is Decision.STAY
         if broken_off and condition.control not in _LANDING_ON:
-            self._landing_is_ours = False  # the drone may start the next one
+            self._landing_is_ours = False  # the drone itself may start the next one
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)
@@ -325,7 +325,7 @@ class SetpointController:
             self._landing_is_ours = False
 
     def lost(self) -> None:
-        """Forget the condition, a take-off under way and the sticks, as the drone is silent."""
+        """Discard the condition, any take-off under way and the sticks, because the drone is silent."""
         self.condition = self._stick = None
         self._warned_blind = False
         self._releasing = False
@@ -340,10 +340,10 @@ class SetpointController:
         return events
 
     def messages(self, now_ns: int) -> list[AtMessage]:
-        """Return the commands of this tick: ``PCMD``, and ``REF`` if a take-off, landing or emergency needs it.
+        """Return this tick's commands: ``PCMD``, and ``REF`` if a take-off, landing or emergency needs it.
 
-        While another program flies the drone, return only the watchdog's answer. While the drone is silent and we do
-        not fly it, return nothing: another program may fly it, and without a pilot it must land.
+        While another program is flying the drone, return only the reply to the watchdog. While the drone is silent and
+        we are not flying it, return nothing: another program may be flying, and without a pilot the drone must land.
         """
         bits = self._emergency_bits(now_ns)
         if bits is None and not self._steering and (self.condition is None or self.condition.flying):
@@ -354,12 +354,12 @@ class SetpointController:
         return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
 
     def _ask_bit(self, now_ns: int) -> None:
-        self._bit_due = not self._bit  # if already set, wait for its effect
+        self._bit_due = not self._bit  # if it is already set, wait for its effect
         self._on_bit(now_ns)
 
     def _on_bit(self, now_ns: int) -> None:
         self._changed_ns = now_ns
-        self._passed_ns = self._received_ns - now_ns  # minus the age of the newest navdata; more may be under way
+        self._passed_ns = self._received_ns - now_ns  # minus the age of the newest navdata; more may be on its way
 
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         self.stop.step(None if self.condition is None else self.condition.emergency, now_ns)
@@ -370,7 +370,7 @@ class SetpointController:
         if not wanted:
             self._bit = self._bit_due = False
         elif before and without_effect:
-            self._bit, self._bit_due = False, True  # clear for one tick to make another edge
+            self._bit, self._bit_due = False, True  # clear it for one tick to create another edge
         elif self._bit_due or without_effect:
             self._bit, self._bit_due = True, False
         if self._bit is not before:
@@ -394,7 +394,7 @@ class SetpointController:
         if self.condition is None:
             return None  # leave the drone as it is
         if self.condition.flying and max(self._late_ns, now_ns - self._received_ns) >= SILENT_NS:
-            return None  # it may have landed, and would take off again
+            return None  # it may have landed and would take off again
         by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
         lands = by_itself or (self._landing_is_ours and self.condition.touches_down)
         return Ref.TAKEOFF if self.condition.flying and not lands else Ref(0)

@@ -1,8 +1,8 @@
-"""Convert navdata to feedback: order and time of datagrams, units, axes and signs, state bits. Pure.
+"""Converting navdata to feedback: order and time of datagrams, units, axes, signs and state bits. Pure.
 
 The drone's body axes are x forward, y right, z down: positive ``theta`` is nose up, positive ``phi`` right side down,
-positive ``psi`` clockwise seen from above, and ``vy`` points right. A datagram of a real AR.Drone 2 that stood tilted
-confirmed the same axes for accelerometers and gyros.
+positive ``psi`` clockwise seen from above, and ``vy`` points right. A datagram from a real, tilted AR.Drone 2 confirmed
+the same axes for the accelerometers and gyros.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from skyloop.vehicles.ardrone.wire.options import LAYOUTS, Demo, PhysMeasures, R
 
 # Reception -----------------------------------------------------------------------------------------------------------
 
-#: Period of the drone's datagrams, with few options (as before its set-up) or with all.
+#: Period of the drone's datagrams in demo mode (True, as before its set-up) and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
-RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after it a lower sequence is a restart and not a late datagram
+RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: after this, a lower sequence number is a restart, not a late datagram
 _MICROSECOND_BITS: Final = 21
 _TIME_WRAP_S: Final = 1 << 11
 
 
 class Reception:
-    """Decodes navdata and keeps datagrams that are whole and newer than the last.
+    """Decodes navdata, accepting only datagrams that are complete and newer than the last.
 
     ``counts`` has ``received``, ``damaged`` (not navdata, or a wrong checksum), ``late`` (repeated or out of order),
     ``missed`` (gaps in the sequence), ``restarts`` of the sequence and ``unknown`` options.
@@ -41,13 +41,13 @@ class Reception:
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "missed", "restarts", "unknown"), 0))
-        self.passed_ns = 0  #: drone time between the two newest accepted datagrams, from their numbers
+        self.passed_ns = 0  #: the drone's own time between the two newest accepted datagrams, from their numbers
         self._sequence = 0
         self._accepted_ns = 0
         self._watch = RestartWatch()
 
     def receive(self, datagram: bytes, now_ns: int) -> Navdata | None:
-        """Return the content of a datagram; None if it is damaged or late. Never raises."""
+        """Return a datagram's content; None if it is damaged or late. Never raises."""
         try:
             navdata = decode(datagram)
         except DecodeError:
@@ -64,11 +64,11 @@ class Reception:
         return navdata
 
     def expect_restart(self) -> None:
-        """Accept any sequence number next: the drone was silent or lost us."""
+        """Accept any sequence number next, because the drone was silent or lost us."""
         self._accepted_ns = 0
 
     def telemetry(self) -> dict[str, Value]:
-        """Return the counts under their names in ``Feedback.native``."""
+        """Return the counts with the names that they have in ``Feedback.native``."""
         return {f"navdata.{name}": count for name, count in self.counts.items()}
 
     def _is_new(self, sequence: int, now_ns: int) -> bool:
@@ -87,10 +87,10 @@ class Reception:
 
 
 class DroneClock:
-    """Maps a datagram to the time of its state, on this host's clock.
+    """Determines the capture time of a datagram's state on this host's clock.
 
-    Without the option ``time`` that is the datagram's arrival; with it, the drone's stamps minus the smallest recent
-    delay. Times never run backwards.
+    Without the option ``time``, this is when the datagram arrived; with it, the drone's stamps corrected by the
+    smallest recent delay. Times never go backwards.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class DroneClock:
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_WINDOW_NS: Final = nanoseconds(0.3)  #: over which the slope of the altitude is measured
+CLIMB_WINDOW_NS: Final = nanoseconds(0.3)  #: time over which the slope of the altitude is measured
 Vector = tuple[float, float, float]
 
 _FLIGHT_STATES: Final = {
@@ -132,7 +132,7 @@ _FLIGHT_STATES: Final = {
 
 
 def control_state(demo: Demo) -> ControlState | None:
-    """Return the state of the drone's control; None for a number that no known firmware sends."""
+    """Return the drone's control state; None for a number that no known firmware sends."""
     try:
         return ControlState(demo.ctrl_state >> 16)
     except ValueError:
@@ -140,7 +140,7 @@ def control_state(demo: Demo) -> ControlState | None:
 
 
 def flight_state(state: State, control: ControlState | None) -> FlightState:
-    """Return the flight state for the state bits and the control state."""
+    """Return the flight state that follows from the state bits and the control state."""
     if state & State.EMERGENCY:
         return FlightState.EMERGENCY
     resting = FlightState.FLYING if state & State.FLYING else FlightState.LANDED
@@ -148,7 +148,7 @@ def flight_state(state: State, control: ControlState | None) -> FlightState:
 
 
 class ClimbMeter:
-    """Measures climb [m/s] as the slope of altitude over the last 0.3 s, as the firmware leaves ``demo.vz`` at zero."""
+    """Measures climb as the slope of the altitude over the last 0.3 s, because the firmware leaves ``demo.vz`` at 0."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, float]] = deque()
@@ -160,7 +160,7 @@ class ClimbMeter:
         while len(samples) > 2 and at_ns - samples[1][0] >= CLIMB_WINDOW_NS:
             samples.popleft()
         begun_ns, begun_m = samples[0]
-        if at_ns - begun_ns > 4 * CLIMB_WINDOW_NS:  # the slope across a gap is out of date
+        if at_ns - begun_ns > 4 * CLIMB_WINDOW_NS:  # a slope across a gap is out of date
             samples.popleft()
             return None
         return (altitude_m - begun_m) / seconds(at_ns - begun_ns) if at_ns > begun_ns else None
@@ -171,7 +171,7 @@ def feedback_of(
 ) -> Feedback:
     """Return the drone's state in SI units and our axes.
 
-    Values that the drone omits or reports as impossible numbers are None; so is the velocity without a climb.
+    Values that are missing or impossible are None, and so is the velocity if the climb is unknown.
     """
     measured, raw = navdata.get(PhysMeasures), navdata.get(RawMeasures)
     yaw = _angle(demo.psi)
@@ -197,7 +197,7 @@ def _angle(millidegrees: float) -> float | None:
 
 
 def _flipped(forward_right_down: tuple[float, ...], factor: float) -> Vector | None:
-    """Convert from forward, right, down to forward, left, up."""
+    """Convert a vector from forward, right, down to forward, left, up."""
     x, y, z = forward_right_down
     return _vector(x * factor, -y * factor, -z * factor)
 
@@ -215,18 +215,18 @@ def _name(kind: type[Any]) -> str:
     return re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower()
 
 
-#: Field names of each option.
+#: Names of each option's fields.
 _FIELDS: Final = {kind: tuple(f"{_name(kind)}.{field}" for field in kind._fields) for kind in LAYOUTS}
-#: Tags by option name, as used in ``navdata_options`` of an address.
+#: Tags by option name, as in an address's ``navdata_options``.
 OPTION_TAGS: Final = {_name(kind): layout.tag for kind, layout in LAYOUTS.items()}
-#: Useful fields of the demo option: the drone's matrices are deprecated, and most tags empty.
+#: Number of useful fields in the demo option: its matrices are deprecated, and most tag fields are empty.
 _DEMO_FIELDS: Final = len(Demo._fields) - 6
 
 
 def native_of(navdata: Navdata, *, everything: bool) -> dict[str, Value]:
-    """Return all options of a datagram as telemetry, without numbers that are not finite.
+    """Return all options in a datagram as telemetry, except for numbers that are not finite.
 
-    Unless ``everything`` is True, omit the deprecated matrices of the demo option and an empty list of tags.
+    Unless ``everything`` is True, omit the demo option's deprecated matrices and an empty list of tags.
     """
     native: dict[str, Value] = {"state": int(navdata.state), "sequence": navdata.sequence}
     for kind, option in navdata.options.items():
@@ -248,7 +248,7 @@ def _finite(value: Any) -> bool:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-#: Bit, its name in the events' data, and its meaning while set.
+#: Bits, each with its name in the events' data and its meaning while set.
 _CONDITIONS: Final = (
     (State.COMMUNICATION_LOST, "communication_lost", "the drone reports that it lost its link to us", Severity.WARNING),
     (State.BATTERY_LOW, "battery_low", "the drone's battery is low", Severity.WARNING),
@@ -261,7 +261,7 @@ _CONDITIONS: Final = (
     (State.MAGNETOMETER_UNCALIBRATED, "magnetometer", "the drone's magnetometer needs calibration", Severity.INFO),
     (State.TIMER_ELAPSED, "timer", "the drone's timer elapsed", Severity.WARNING),
 )
-#: Reasons for cut motors that have a bit.
+#: Reasons for cutting the motors that have a dedicated bit.
 _REASONS: Final = (
     (State.USER_EMERGENCY, "user"),
     (State.ANGLES_OUT_OF_RANGE, "angles"),
@@ -275,12 +275,12 @@ _REASONS: Final = (
 
 
 def emergency_reason(state: State) -> str:
-    """Return the reasons for the cut motors as names joined by commas, or ``unknown``."""
+    """Return why the motors are cut, as names separated by commas, or ``unknown``."""
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 
 class Health:
-    """Reports each change of the drone's health bits once."""
+    """Reports each change in the drone's health bits once."""
 
     def __init__(self) -> None:
         self._reported = State(0)
@@ -313,7 +313,7 @@ def _emergency(state: State) -> VehicleEvent:
     return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})
 
 
-#: Preflight findings: bit, topic, meaning, remedy, and whether it prevents a take-off.
+#: Preflight findings, each with its bit, topic, meaning, remedy, and whether it prevents a take-off.
 _BITS: Final = (
     (State.MOTORS_PROBLEM, "motors", "a motor does not answer: it won't take off", "turn each rotor by hand", True),
     (State.SOFTWARE_FAULT, "firmware", "the drone reports a fault: it may not fly", "switch it off and on", True),
@@ -331,7 +331,7 @@ _BITS: Final = (
 
 
 def diagnose(state: State | None, values: Mapping[str, str]) -> list[Diagnostic]:
-    """Return findings from the newest bits and from the configuration, which is empty until read."""
+    """Return findings based on the newest bits and the configuration, which is empty until it has been read."""
     found = [
         Diagnostic(what, False, detail, advice, severe)
         for bit, what, detail, advice, severe in _BITS

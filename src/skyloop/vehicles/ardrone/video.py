@@ -1,10 +1,10 @@
 """The drone's video port: streams, frames and their times, decoders, and cameras.
 
-An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each picture as one UDP datagram as long as a client keeps
-requesting them. Stamps in a PaVE header are the drone's own time in milliseconds, 32 bits (``video_encapsulation.h`` of
-the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the capture. Intrinsics of the
-AR.Drone 2 are those of one drone, published with ardrone_autonomy (branch of TUM) for pictures of 640×360; other drones
-differ by some per cent. For the AR.Drone 1 none are known.
+An AR.Drone 2 sends PaVE over TCP. An AR.Drone 1 sends each image as one UDP datagram, as long as a client keeps
+requesting them. The stamps in PaVE headers are the drone's own time in milliseconds, 32 bits
+(``video_encapsulation.h`` in the AR.Drone SDK 2.0.1). No source says which moment they refer to; the driver assumes the
+capture. The intrinsics for the AR.Drone 2 are those of a single drone, published with ardrone_autonomy (TUM's branch)
+for 640×360 images; other drones differ by a few per cent. For the AR.Drone 1 none are known.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _CAMERAS: Final = {
 
 
 def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
-    """Return both cameras; the drone shows one at a time. Intrinsics in the address are the front camera's."""
+    """Return both cameras, of which the drone sends one at a time. Intrinsics in the address apply to the front one."""
     front, bottom = _CAMERAS[version or 2]
     given = intrinsics_of(uri, front.width, front.height)
     return (msgspec.structs.replace(front, intrinsics=given) if given is not None else front, bottom)
@@ -65,19 +65,19 @@ _WRAP: Final = 1 << 32
 
 
 class DroneStamps:
-    """Capture times of one connection's frames.
+    """Determines the capture times of one connection's frames.
 
-    Follows the drift of the drone's clock and the wrap of its stamps. Stamps that go back (a restarted drone) reset
-    the estimate.
+    Follows the drift of the drone's clock and the wrap-around of its stamps. Stamps that go back (after the drone
+    restarted) reset the estimate.
     """
 
     def __init__(self) -> None:
         self._clock = LiveClock()
-        self._stamp_ms = 0  # stamp of the previous frame, as sent
-        self._time_ms = 0  # the same without wraps
+        self._stamp_ms = 0  # the previous frame's stamp as sent
+        self._time_ms = 0  # the same stamp, without wrap-around
 
     def captured_ns(self, stamp_ms: int, arrived_ns: int) -> int:
-        """Return the capture time for the stamp of a PaVE header, never later than the arrival."""
+        """Return the capture time for a stamp in a PaVE header; it is never later than the arrival."""
         step_ms = (stamp_ms - self._stamp_ms + _WRAP // 2) % _WRAP - _WRAP // 2
         self._stamp_ms = stamp_ms
         self._time_ms += step_ms
@@ -90,8 +90,8 @@ class DroneStamps:
 class PaveAssembly:
     """Assembles the frames of one connection.
 
-    The first frame may be seconds old (seen in a capture of a real drone). It is therefore held back until the second
-    one, and returned only if their numbers are consecutive.
+    The first frame may be seconds old (seen in a capture from a real drone). It is therefore held back until the second
+    one arrives, and returned only if their numbers are consecutive.
     """
 
     def __init__(self, connection: int) -> None:
@@ -99,25 +99,25 @@ class PaveAssembly:
         self._parser = PaveParser()
         self._stamps = DroneStamps()
         self._stale = 0
-        self._first: tuple[int, Coded] | None = None  # with its number, until the second one arrives
+        self._first: tuple[int, Coded] | None = None  # the first frame with its number, until the second one arrives
         self._greeted = False
 
     @property
     def broken(self) -> int:
-        """Incomplete or stale frames."""
+        """Number of incomplete or stale frames."""
         return self._parser.broken_frames + self._stale
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes outside of complete frames."""
+        """Number of bytes that did not belong to a complete frame."""
         return self._parser.skipped_bytes
 
     def feed(self, data: bytes, now_ns: int) -> list[Coded]:
-        """Return the frames that these bytes complete. Never raises for any content."""
+        """Return the frames that these bytes complete. Never raises, whatever the content."""
         return [coded for frame in self._parser.feed(data) for coded in self._greet(frame, self._coded(frame, now_ns))]
 
     def end(self) -> None:
-        """Note that the connection ended."""
+        """Handle the end of the connection."""
         self._parser.end()
         self._stale += self._first is not None
 
@@ -139,11 +139,11 @@ class PaveAssembly:
         return [coded]
 
 
-CONNECT_S: Final = 1.0  #: limit for a connection
-POLL_S: Final = 0.1  #: longest wait in one read
-SILENT_S: Final = 3.0  #: limit without a whole frame, after which the connection is closed
-KEEP_ALIVE_S: Final = 0.5  #: between requests to an AR.Drone 1
-WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it running
+CONNECT_S: Final = 1.0  #: connection timeout
+POLL_S: Final = 0.1  #: longest time that a read waits
+SILENT_S: Final = 3.0  #: the connection is closed if no complete frame arrives for this long
+KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
+WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1; any small datagram starts the video and keeps it running
 _CHUNK: Final = 1 << 16
 
 
@@ -168,7 +168,7 @@ class PaveStream:
         return self._assembly.lost_bytes
 
     def read(self) -> list[Coded]:
-        """Return the frames that arrived, within :data:`POLL_S`."""
+        """Return the frames that arrive within :data:`POLL_S`."""
         try:
             data = self._socket.recv(_CHUNK)
         except TimeoutError:
@@ -188,7 +188,7 @@ class PaveStream:
 
 
 class DatagramStream:
-    """The video of an AR.Drone 1: one picture per UDP datagram, as long as the client keeps requesting them."""
+    """The video of an AR.Drone 1: one image per UDP datagram, as long as the client keeps requesting them."""
 
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self.broken = 0
@@ -207,9 +207,9 @@ class DatagramStream:
         self._woken_ns = self._received_ns
 
     def read(self) -> list[Coded]:
-        """Return the picture that arrived, within :data:`POLL_S`.
+        """Return the image that arrives within :data:`POLL_S`.
 
-        A picture has no stamp: its arrival is its capture time.
+        Images have no stamps, so the time of arrival is used as the capture time.
         """
         try:
             data = self._socket.recv(_CHUNK)
@@ -231,7 +231,7 @@ class DatagramStream:
 
 
 def open_stream(version: int, host: str, port: int, connection: int, clock: Clock) -> Stream:
-    """Connect to the drone's video. A missing AR.Drone 1 is noticed only when reading."""
+    """Connect to the drone's video. The absence of an AR.Drone 1 is detected only when reading."""
     return (PaveStream if version == 2 else DatagramStream)(host, port, connection, clock)
 
 
@@ -242,8 +242,8 @@ def _give_up_if_silent(silent_ns: int) -> None:
 
 # Decoders ------------------------------------------------------------------------------------------------------------
 
-REORDERED: Final = 64  #: a number further back than this means a restarted drone, not a late picture;
-OLD_RUN: Final = 4  #: so do this many consecutive pictures older than the newest
+REORDERED: Final = 64  #: a number further back than this means that the drone restarted, not that the image is late
+OLD_RUN: Final = 4  #: this many consecutive images older than the newest also mean that the drone restarted
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
 
 
@@ -288,17 +288,17 @@ class PaveVideo:
 
 
 class UvlcVideo:
-    """Decodes an AR.Drone 1's video and drops pictures that arrive after a newer one."""
+    """Decodes an AR.Drone 1's video and drops images that arrive after a newer one."""
 
     def __init__(self) -> None:
         self.waited = 0
         self.damaged = 0
         self._decoder = UvlcDecoder()
-        self._number: int | None = None  # number of the newest picture
+        self._number: int | None = None  # number of the newest image
         self._old_run = 0
 
     def restart(self) -> None:
-        """Forget the stream so far."""
+        """Discard all state from the stream so far."""
         self._decoder = UvlcDecoder()
         self._number = None
 
@@ -324,12 +324,12 @@ class UvlcVideo:
         return Decoded(picture.number, picture.pixels) if show else None
 
     def _is_old(self, picture: UvlcPicture) -> bool:
-        """Return whether a picture is older than the newest one, or a repetition."""
+        """Return whether an image repeats the newest one or is older."""
         return self._number is not None and 0 <= (self._number - picture.number) % (1 << 32) < REORDERED
 
 
 def make_decoder(version: int) -> Decoder:
-    """Return the decoder for a version of the drone; raise if its library is not installed."""
+    """Return the decoder for a version of the drone; raise an error if its library is not installed."""
     return PaveVideo() if version == 2 else UvlcVideo()
 
 
@@ -340,13 +340,13 @@ def _codec_name(codec: int) -> str:
         return str(codec)
 
 
-# Encoded pictures for recorders --------------------------------------------------------------------------------------
+# Encoded images for recorders ----------------------------------------------------------------------------------------
 
 
 class EncodedStream:
     """Relays H.264 while a recorder subscribes; see :class:`StreamRelay`. Used by the reading thread.
 
-    Frames arrive over TCP, so they are whole; no decoding is needed to check that.
+    Frames arrive complete, over TCP, so they need not be decoded to check that.
     """
 
     def __init__(
@@ -357,7 +357,7 @@ class EncodedStream:
         self._relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
 
     def take(self, coded: Coded) -> None:
-        """Relay a whole frame if it is H.264, requested, and decodable after the last one."""
+        """Relay a complete frame if it is H.264, was requested, and can be decoded after the last one relayed."""
         frame = coded.data
         if not isinstance(frame, PaveFrame) or frame.codec != Codec.MPEG4_AVC:
             self._relay.restart()
@@ -376,7 +376,7 @@ class EncodedStream:
 
 
 class VideoReceiver(LiveVideo):
-    """The live video of an AR.Drone 1 or 2; see :class:`skyloop.drivers.live_video.LiveVideo` for the callbacks."""
+    """Receives an AR.Drone's live video; for the callbacks see :class:`skyloop.drivers.live_video.LiveVideo`."""
 
     def __init__(
         self,

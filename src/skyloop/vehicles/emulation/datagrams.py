@@ -1,6 +1,6 @@
-"""The emulated firmware's thread and ports: a UDP port with faults each way, and a TCP port for one client at a time.
+"""The emulated firmware's thread and ports: UDP with faults in both directions, and TCP for one client at a time.
 
-The thread waits for sockets, for due times and for work from other threads.
+The thread waits for sockets, timers and work from other threads.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 class Loop:
     """Runs callbacks on one thread.
 
-    Everything but :meth:`post`, :meth:`start` and :meth:`stop` belongs to that thread, or to the time before its start.
+    Except for :meth:`post`, :meth:`start` and :meth:`stop`, call methods only on that thread, or before it starts.
     Exceptions in callbacks are logged, and the loop continues.
     """
 
@@ -49,7 +49,7 @@ class Loop:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread. No callback runs after it returns. Must not be called by a callback."""
+        """Stop the thread; no callback runs after this returns. Must not be called by a callback."""
         self._stopping = True
         self._wake()
         if self._thread.is_alive():
@@ -59,18 +59,18 @@ class Loop:
         self._wakened.close()
 
     def post(self, call: Callable[[], None]) -> None:
-        """Call a function on the loop's thread. From any thread."""
+        """Call a function on the loop's thread. May be called from any thread."""
         self._posted.append(call)
         self._wake()
 
     def at(self, due_ns: int, call: Callable[[], None]) -> None:
-        """Call a function at a time of the monotonic clock [ns]."""
+        """Call a function at a given time of the monotonic clock [ns]."""
         heapq.heappush(self._timers, (due_ns, next(self._order), call))
 
     def watch(
         self, sock: socket.socket, readable: Callable[[], None], writable: Callable[[], None] | None = None
     ) -> None:
-        """Call functions from now on when a socket has something to read, or room to write."""
+        """Call functions whenever a socket is readable or writable, until :meth:`forget`."""
         events = selectors.EVENT_READ | (selectors.EVENT_WRITE if writable else 0)
         try:
             self._selector.modify(sock, events, (readable, writable))
@@ -105,7 +105,7 @@ class Loop:
             _log.exception("the emulated firmware raised an error and continues")
 
     def _wake(self) -> None:
-        with suppress(OSError):  # full: already awake
+        with suppress(OSError):  # a full pipe: the loop is already awake
             self._waker.send(b"\0")
 
     def _empty(self) -> None:
@@ -117,11 +117,11 @@ Address = tuple[str, int]
 
 MAX_DATAGRAM: Final = 65_507
 _MOST_AT_ONCE: Final = 64  # datagrams read before other callbacks run
-_SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
+_SEND_BUFFER: Final = 1 << 20  # bytes, with room for an AR.Drone 1's images
 
 
 class DatagramPort:
-    """Answers every sender, at the port that its datagram came from. Used on the loop's thread."""
+    """A UDP port that replies to the address each datagram came from. Used on the loop's thread."""
 
     def __init__(
         self,
@@ -146,11 +146,11 @@ class DatagramPort:
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return int(self._socket.getsockname()[1])
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send a datagram. It is lost without room or recipient, as usual for UDP."""
+        """Send a datagram. As usual with UDP, it is lost if the buffer is full or there is no receiver."""
         for each in self._outward.packets(datagram):
             self._later(partial(self._send, each, to))
 
@@ -163,7 +163,7 @@ class DatagramPort:
         for _ in range(_MOST_AT_ONCE):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
-            except OSError:  # no more datagrams, or an answer that could not be delivered
+            except OSError:  # no more datagrams, or a reply that could not be delivered
                 return
             for each, address in self._inward.items((datagram, sender)):
                 self._later(partial(self._on_datagram, each, address))
@@ -180,9 +180,9 @@ class DatagramPort:
 
 
 def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
-    """Return a non-blocking bound socket; raises LinkError with a remedy if that fails.
+    """Return a non-blocking bound socket; raise LinkError with a remedy if binding fails.
 
-    A TCP port may be bound again while connections of an earlier firmware are still closing. A UDP port must not be
+    A TCP port may be bound again while connections to an earlier firmware are still closing. A UDP port must not be
     shared, or two firmwares would steal each other's datagrams.
     """
     made = socket.socket(socket.AF_INET, kind)
@@ -205,7 +205,7 @@ _BUFFER: Final = 1 << 16
 
 
 class ByteServer:
-    """Serves one client after another: while one is connected, the next waits in the kernel, connected and unanswered.
+    """Serves one client at a time. Meanwhile the next one waits in the kernel's backlog, connected but unanswered.
 
     Used on the loop's thread.
     """
@@ -229,11 +229,11 @@ class ByteServer:
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return int(self._server.getsockname()[1])
 
     def send(self, data: bytes) -> None:
-        """Send to the client, if there is one; bytes that do not fit are lost, as on a serial line."""
+        """Send to the client, if any; bytes that do not fit in its buffer are lost, as on a serial line."""
         if self._client is None:
             return
         try:

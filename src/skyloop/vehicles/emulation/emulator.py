@@ -1,4 +1,4 @@
-"""Base classes of the emulators: firmware that can be switched on and off, and its state while it is on."""
+"""Base classes of the emulators: firmware that can be switched on and off, and the state of running firmware."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ _log = logging.getLogger(__name__)
 
 
 class Closable(Protocol):
-    """A port, or another recipient of pictures."""
+    """A port or another recipient of images that can be closed."""
 
     def close(self) -> None: ...
 
 
 class RunningEmulator(ABC):
-    """Firmware that is on from its construction to :meth:`stop`. A constructor that fails half-way calls that too.
+    """Firmware that runs from its construction to :meth:`stop`, which a constructor that fails half-way calls too.
 
-    Additions of subclasses belong to the loop's thread. The host's threads only store their reports and pictures, and
+    State added by subclasses belongs to the loop's thread. The host's threads only store their reports and images, and
     read values that are replaced as a whole.
 
     Args:
         host: The simulated world.
-        drone: Its number in that world.
-        loop: Name of the loop's thread; or a shared loop, which its maker starts after the firmware and stops before
-            it.
+        drone: Number of the drone in that world.
+        loop: Name for the loop's thread; or a shared loop, which its creator starts after the firmware and stops
+            before it.
     """
 
     def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:
@@ -46,11 +46,11 @@ class RunningEmulator(ABC):
         self._loop = Loop(loop) if isinstance(loop, str) else loop
         self._video: VideoEncoding[Any] | None = None
         self._open: list[Closable] = []
-        self._report: Report | None = None  #: the newest
+        self._report: Report | None = None  #: the newest report
         self._posted = False
 
     def stop(self) -> None:
-        """Switch it off. The ports are free when it returns."""
+        """Switch the firmware off. Its ports are free when this returns."""
         self._host.detach(self._drone, self)
         if self._video is not None:
             self._video.stop()
@@ -71,41 +71,41 @@ class RunningEmulator(ABC):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Store the drone's newest estimate for the loop's thread, in place of one that is still unhandled."""
+        """Store the drone's newest estimate for the loop's thread, replacing one not yet handled."""
         self._report = report
         if not self._posted:
             self._posted = True
             self._loop.post(self._handle_report)
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Log an event such as a collision; its effect shows in the drone's own data."""
+        """Log an event such as a collision; its effect appears in the drone's own data."""
         _log.info("drone %d: %s", occurrence.drone, occurrence.text)
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate for this camera: the full one, or 0."""
+        """Return the frame rate to render this camera at: its full rate or 0."""
         return math.inf if self._video is not None and self._video.wants(camera) else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Encode a due picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
+        """Encode an image: BGR, uint8, shape (height, width, 3). The array must not be modified afterwards."""
         if self._video is not None:
             self._video.show(model.name, pixels, captured_ns)
 
     def failed(self, error: Exception) -> None:
-        """Log an error of the simulation or the renderer.
+        """Log an error in the simulation or the renderer.
 
-        Without reports the firmware sends nothing, like a dead drone.
+        Once reports stop, the firmware sends nothing, like a dead drone.
         """
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 
-LONGEST_DELAY_S: Final = 10.0  #: of datagrams
+LONGEST_DELAY_S: Final = 10.0  #: greatest delay that can be configured for datagrams
 NO_FAULTS: Final = Faults()
 
 R = TypeVar("R", bound=RunningEmulator)
 
 
 class Emulator(ABC, Generic[R]):
-    """The firmware of one drone in a host's world; a context manager that is on within its block."""
+    """The firmware of one drone in a host's world. As a context manager, it is switched on within the block."""
 
     def __init__(self, host: SimHost, drone: int) -> None:
         self.host = host
@@ -113,15 +113,15 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch it on. Everything is reset, except its ports."""
+        """Switch the firmware on. Everything except its ports is reset."""
         if self._running is not None:
             raise UsageError("this firmware is started already")
         self._running = self._switched_on()
 
     def stop(self) -> None:
-        """Switch it off, in the middle of any activity. Does nothing if it is off.
+        """Switch the firmware off at once, even during an activity. Does nothing if it is already off.
 
-        The vehicle keeps following its last command. The ports are free when this returns.
+        The vehicle continues to follow its last command. The ports are free when this returns.
         """
         running, self._running = self._running, None
         if running is not None:
@@ -145,7 +145,7 @@ class Emulator(ABC, Generic[R]):
 
 
 def checked_delay(delay_s: float) -> float:
-    """Return a delay [s] if it is from 0 to :data:`LONGEST_DELAY_S`."""
+    """Return the delay [s]; raise :class:`UsageError` unless it is from 0 to :data:`LONGEST_DELAY_S`."""
     if not 0 <= delay_s <= LONGEST_DELAY_S:
         raise UsageError(f"a delay is from 0 to {LONGEST_DELAY_S:g} s, not {delay_s!r}")
     return delay_s

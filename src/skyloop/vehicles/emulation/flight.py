@@ -1,6 +1,6 @@
-"""The flying body, one drone of a simulation, and the control loops below an autopilot's modes. Pure.
+"""The flying body (one drone of a simulation) and the control loops underneath an autopilot's modes. Pure.
 
-The loops control positions, world velocities and headings.
+The loops control position, world velocity and heading.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from skyloop.sim.world import Vec3
 
 
 class Vehicle(Protocol):
-    """A body with motors and an autopilot that holds attitude, velocity and altitude."""
+    """A body with motors and an autopilot that can hold attitude, velocity and altitude."""
 
     @property
     def state(self) -> FlightState: ...
@@ -29,13 +29,13 @@ class Vehicle(Protocol):
         """Height of its world [m]."""
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the body; return the applied action, :class:`skyloop.messages.Idle` if it was ignored."""
+        """Command the body; return the applied action, or :class:`skyloop.messages.Idle` if it was ignored."""
 
     def set_limits(self, limits: Limits) -> None: ...
 
 
 class SimulatedVehicle:
-    """A drone of a simulation; see :class:`Vehicle`."""
+    """A drone in a simulation; see :class:`Vehicle`."""
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
         self._simulation = simulation
@@ -56,27 +56,27 @@ class SimulatedVehicle:
         return self._simulation.command(self._drone, action)
 
     def set_limits(self, limits: Limits) -> None:
-        """Set the limits of its set-points."""
+        """Set the limits for set-points."""
         self._simulation.set_limits(self._drone, limits)
 
 
-LIFT_M: Final = 0.3  #: height of the simulated vehicle's own take-off, before these loops take over
+LIFT_M: Final = 0.3  #: height of the simulated vehicle's built-in take-off, after which these loops take over
 LIMITS: Final = Limits(
     tilt_rad=0.52, climb_m_s=2.5, yaw_rate_rad_s=2.5, altitude_m=100.0, speed_m_s=8.0, takeoff_altitude_m=LIFT_M
 )
-PLACE_GAIN_PER_S: Final = 0.9  #: speed per distance to a position
-YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per heading error
-YAW_RATE_RAD_S: Final = 1.5  #: limit while turning to a heading
-GO_M_S: Final = 3.0  #: usual horizontal speed towards a position
-SINK_M_S: Final = 1.5  #: usual climb and descent towards a position
-HEADROOM_M: Final = 1.0  #: kept below the ceiling
-_CLIMB_LAG_S: Final = 0.33  #: of the simulated vehicle's climb loop
+PLACE_GAIN_PER_S: Final = 0.9  #: speed per metre of distance from a position
+YAW_GAIN_PER_S: Final = 2.0  #: yaw rate per radian of heading error
+YAW_RATE_RAD_S: Final = 1.5  #: greatest yaw rate while turning to a heading
+GO_M_S: Final = 3.0  #: default horizontal speed towards a position
+SINK_M_S: Final = 1.5  #: default rate of climb and descent towards a position
+HEADROOM_M: Final = 1.0  #: clearance kept below the ceiling
+_CLIMB_LAG_S: Final = 0.33  #: time constant of the simulated vehicle's climb loop
 _AIRBORNE: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """Speeds on the way to a position [m/s]."""
+    """Speeds for flying to a position [m/s]."""
 
     across: float = GO_M_S
     up: float = SINK_M_S
@@ -87,10 +87,10 @@ USUAL: Final = Speeds()
 
 
 class FlightControl:
-    """Flies a simulated vehicle by position, velocity, attitude or thrust.
+    """Flies a simulated vehicle to positions, or with a velocity, an attitude or a thrust.
 
     World axes are east, north, up from the vehicle's position at construction; yaw is counter-clockwise from east.
-    Call one of its commands in every tick.
+    Call one of the commands in every tick.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
@@ -99,7 +99,7 @@ class FlightControl:
         self.velocity: Vec3 = (0.0, 0.0, 0.0)  #: east, north, up [m/s]
         self.yaw = 0.0
         self._home: tuple[float, float] | None = None
-        self._sinking = 0.0  # climb rate under a collective thrust [m/s]
+        self._sinking = 0.0  # climb rate while flying by collective thrust [m/s]
         self._time_s = 0.0
         self._step_s = 0.0
         vehicle.set_limits(LIMITS)
@@ -117,12 +117,12 @@ class FlightControl:
 
     @property
     def time_s(self) -> float:
-        """Simulation time of the newest report [s]."""
+        """Simulation time at the newest report [s]."""
         return self._time_s
 
     @property
     def highest_m(self) -> float:
-        """The greatest height it can reach; a climb beyond it would never end."""
+        """The greatest height that the vehicle can reach; a climb to a greater one would never end."""
         return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
 
     @property
@@ -143,7 +143,7 @@ class FlightControl:
     # Commands; call one in every tick ----------------------------------------------------------------------------
 
     def lift_off(self) -> None:
-        """Take off from the ground, or out of a landing."""
+        """Take off from the ground, or abort a landing and climb."""
         if self.vehicle.state in (FlightState.LANDED, FlightState.LANDING):
             self.vehicle.command(Takeoff())
 
@@ -161,40 +161,40 @@ class FlightControl:
         self.vehicle.command(EmergencyStop())
 
     def lie(self) -> None:
-        """Allow another start after :meth:`cut`, once it lies on the ground."""
+        """Allow another start after :meth:`cut`, once the vehicle is on the ground."""
         if self.vehicle.state is FlightState.EMERGENCY:
             self.vehicle.command(ResetEmergency())
 
     def move(self, east: float, north: float, up: float, yaw_rate: float) -> None:
-        """Fly a world velocity [m/s], with a yaw rate, counter-clockwise [rad/s]."""
+        """Fly a world velocity [m/s] with a yaw rate, positive counter-clockwise [rad/s]."""
         forward, left = turned(east, north, -self.yaw)
         self.move_body(forward, left, up, yaw_rate)
 
     def move_body(self, forward: float, left: float, up: float, yaw_rate: float) -> None:
-        """Fly a velocity in levelled body axes [m/s], with a yaw rate, counter-clockwise [rad/s]."""
+        """Fly a velocity in levelled body axes [m/s] with a yaw rate, positive counter-clockwise [rad/s]."""
         self._fly(VelocityAction(forward, left, up, yaw_rate))
 
     def go(self, place: Vec3, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
-        """Fly towards a position, east, north, up from the origin [m], and slow down near it."""
+        """Fly towards a position (east, north, up from the origin [m]), slowing down near it."""
         east, north, up = (PLACE_GAIN_PER_S * (to - at) for to, at in zip(place, self.place, strict=True))
         speed = math.hypot(east, north)
         share = min(1.0, speeds.across / speed) if speed > 0 else 1.0
         self.move(east * share, north * share, max(-speeds.down, min(speeds.up, up)), yaw_rate)
 
     def lean(self, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
-        """Fly an attitude with a climb rate; signs are those of :class:`skyloop.messages.Attitude`."""
+        """Fly an attitude with a climb rate, with the signs of :class:`skyloop.messages.Attitude`."""
         self._sinking = self.velocity[2]
         self._fly(Attitude(roll, pitch, climb, yaw_rate))
 
     def lean_by_thrust(self, roll: float, pitch: float, thrust: float, yaw_rate: float) -> None:
-        """Fly an attitude with a collective thrust, given as a share of the weight."""
+        """Fly an attitude with a collective thrust, given as a multiple of the weight."""
         upward = GRAVITY_M_S2 * (thrust * math.cos(roll) * math.cos(pitch) - 1.0)
         self._sinking += upward * self._step_s
         self._sinking = max(self.velocity[2] - 1.0, min(self.velocity[2] + 1.0, self._sinking))
         self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
 
     def level_thrust(self) -> None:
-        """Start a thrust set-point from the present climb rate."""
+        """Start flying by thrust from the present climb rate."""
         self._sinking = self.velocity[2]
 
     def yaw_rate_to(self, yaw: float) -> float:
@@ -205,6 +205,6 @@ class FlightControl:
         if not action.finite:
             action = Hover()  # ignore numbers that are not finite
         if self.vehicle.state is FlightState.LANDING:
-            self.lift_off()  # the vehicle's way out of its landing
+            self.lift_off()  # how the vehicle aborts a landing
         if self.airborne:
             self.vehicle.command(action)

@@ -1,6 +1,6 @@
-"""A drone's video: a separate thread encodes the newest picture and passes it to the port.
+"""A drone's video: a separate thread encodes the newest image and passes it to the port.
 
-The first encoder imports PyAV.
+PyAV is imported when the first encoder is created.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ class VideoSettings(Protocol):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The main camera, and then the one inset into its pictures, if any."""
+        """The main camera, followed by the one inset into its images, if any."""
 
     @property
     def inset(self) -> tuple[int, int]:
-        """Width and height [px] of the inset picture."""
+        """Width and height [px] of the inset image."""
 
 
 @dataclass(frozen=True, slots=True)
 class OneCamera:
-    """Pictures of a single camera."""
+    """Video settings that select a single camera."""
 
     camera: str
     fps: float
@@ -52,7 +52,7 @@ class OneCamera:
 
     @property
     def inset(self) -> tuple[int, int]:
-        """None: (0, 0)."""
+        """Always (0, 0), because there is no inset."""
         return 0, 0
 
 
@@ -62,10 +62,10 @@ S_contra = TypeVar("S_contra", bound=VideoSettings, contravariant=True)
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """The data of one picture, with its header."""
+    """The encoded data of one image, including its header."""
 
     data: bytes
-    starts: bool  #: a decoder can begin here
+    starts: bool  #: whether a decoder can begin here
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +81,18 @@ NOTHING_SENT: Final = VideoStatus()
 
 
 class Packer(Protocol[S_contra]):
-    """Encodes pictures in order. Not thread-safe."""
+    """Encodes images in order. Not thread-safe."""
 
     def pack(self, picture: NDArray[np.uint8], settings: S_contra, captured_ns: int, /) -> Piece | None: ...
 
 
 class VideoEncoding(Generic[S]):
-    """Encodes on a separate thread. A picture that arrives meanwhile waits until a newer one replaces it.
+    """Encodes on a separate thread. Of the images that arrive during encoding, only the newest is kept.
 
     Args:
-        packer: The encoder; used on the thread.
+        packer: The encoder; used only on that thread.
         settings: Returns the cameras to send. Called on any thread.
-        send: Called on the thread with each encoded picture.
+        send: Called on that thread with each encoded image.
     """
 
     def __init__(self, packer: Packer[S], settings: Callable[[], S], send: Callable[[Piece], None]) -> None:
@@ -120,11 +120,11 @@ class VideoEncoding(Generic[S]):
             self._thread.join()
 
     def wants(self, camera: str) -> bool:
-        """Return whether to send this camera."""
+        """Return whether this camera's images should be sent."""
         return camera in self._settings().cameras
 
     def show(self, camera: str, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Pass on a picture: BGR, uint8, shape (height, width, 3), which must not change any more."""
+        """Submit an image: BGR, uint8, shape (height, width, 3). The array must not be modified afterwards."""
         shown = self._settings().cameras
         if camera not in shown:
             return
@@ -166,7 +166,7 @@ class VideoEncoding(Generic[S]):
 
 
 def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a copy of a picture with another one, scaled down to (width, height), in its upper left corner."""
+    """Return a copy of an image with another one, scaled down to (width, height), in its upper left corner."""
     width, height = size
     rows = np.arange(height) * other.shape[0] // height
     columns = np.arange(width) * other.shape[1] // width
@@ -175,7 +175,7 @@ def with_inset(picture: NDArray[np.uint8], other: NDArray[np.uint8], size: tuple
     return made
 
 
-GROUP: Final = 15  #: pictures between key frames
+GROUP: Final = 15  #: default number of images from one key frame to the next
 
 _SPS, _PPS, _IDR, _SLICE = 7, 8, 5, 1  # types of NAL units
 _START_CODE: Final = b"\0\0\0\1"
@@ -185,7 +185,7 @@ _X264: Final = {"preset": "ultrafast", "tune": "zerolatency"}
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Format of a stream, as in the header of its frames."""
+    """A stream's format, as given in its frame headers."""
 
     codec: Literal["h264", "mpeg4"]
     width: int
@@ -195,7 +195,7 @@ class Format:
 
 @dataclass(frozen=True, slots=True)
 class Encoded:
-    """A picture's payload. A key picture begins with parameter sets of these sizes, start codes included."""
+    """An encoded image. A key frame begins with parameter sets of these sizes, start codes included."""
 
     payload: bytes
     key: bool
@@ -208,11 +208,11 @@ class Encoder:
 
     Args:
         form: Codec and size.
-        fps: Pictures a second.
+        fps: Images per second.
         bitrate_kbps: Average bitrate.
-        group: Pictures between key frames.
+        group: Number of images from one key frame to the next.
         profile: H.264 profile.
-        buffer_s: The burst limit, in seconds of the bitrate; None: single pictures may have any size.
+        buffer_s: Size of the rate control's buffer, in seconds of the bitrate; None to let images have any size.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -252,7 +252,7 @@ class Encoder:
         self._count = 0
 
     def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
-        """Encode a picture: BGR, uint8, shape (height, width, 3), of any size. None: the encoder returned nothing."""
+        """Encode an image: BGR, uint8, shape (height, width, 3), of any size. None if the encoder returned nothing."""
         import av
 
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
@@ -270,7 +270,7 @@ class Encoder:
 
 
 def as_the_drone_does(stream: bytes) -> Encoded:
-    """Return an access unit in Annex B form reduced to parameters and slices, each after a 4-byte start code."""
+    """Return an access unit in Annex B form with only its parameter sets and slices, each after a 4-byte start code."""
     units = [unit for unit in _ANY_START_CODE.split(stream) if unit]
     kept = [(unit[0] & 31, _START_CODE + unit) for unit in units if unit[0] & 31 in (_SPS, _PPS, _IDR, _SLICE)]
     return Encoded(
@@ -282,7 +282,7 @@ def as_the_drone_does(stream: bytes) -> Encoded:
 
 
 def require_encoder(what: str = "the video of an emulated AR.Drone 2") -> None:
-    """Check that PyAV is installed; the error says that ``what`` needs it."""
+    """Raise :class:`MissingExtraError`, naming ``what`` as the reason, unless PyAV is installed."""
     try:
         import av  # noqa: F401
     except ImportError as error:

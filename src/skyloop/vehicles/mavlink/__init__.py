@@ -1,1 +1,1 @@
-"""``mavlink://…``: ArduCopter and PX4 multirotors."""
+"""``mavlink://`` addresses: multirotors with ArduCopter or PX4."""

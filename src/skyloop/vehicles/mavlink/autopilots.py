@@ -1,4 +1,4 @@
-"""What ArduCopter and PX4 do differently: modes, commands, thrust and safety nets. Pure.
+"""Differences between ArduCopter and PX4 in modes, commands, thrust and safety nets. Pure.
 
 ``docs/mavlink.md`` says where each difference was observed.
 """
@@ -18,22 +18,22 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per climb rate error
-ALTITUDE_GAIN_PER_S2: Final = 0.8  #: acceleration per altitude error, the integral of that
-MOST_ALTITUDE_ERROR_M: Final = 1.5  #: limit of the integral
+CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error
+ALTITUDE_GAIN_PER_S2: Final = 0.8  #: acceleration per unit of altitude error, the integral of the climb rate error
+MOST_ALTITUDE_ERROR_M: Final = 1.5  #: limit of the altitude error
 LEAST_THRUST: Final = 0.1  #: lower limit of the thrust field
-MOST_THRUST: Final = 0.9  #: upper limit
+MOST_THRUST: Final = 0.9  #: upper limit of the thrust field
 
 
 class ThrustModel(Protocol):
-    """Computes ``SET_ATTITUDE_TARGET``'s thrust field from a climb rate, for one flight by attitude.
+    """Computes the thrust field of ``SET_ATTITUDE_TARGET`` from a climb rate, for one flight by attitude.
 
-    ArduCopter takes the field as a climb rate: 0.5 holds the altitude. PX4 takes it as collective thrust and leaves the
-    altitude to us: a proportional-integral loop on the climb rate, whose integral is an altitude error.
+    ArduCopter interprets the field as a climb rate: 0.5 holds the altitude. PX4 interprets it as collective thrust, so
+    we hold the altitude with a proportional-integral loop on the climb rate, whose integral is an altitude error.
     """
 
     def limit_climb(self, climb_m_s: float) -> float:
-        """Return the climb rate that the autopilot accepts, positive up [m/s]."""
+        """Return the climb rate limited to what the autopilot accepts, positive up [m/s]."""
 
     def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
         """Return the thrust field, 0 to 1.
@@ -47,7 +47,7 @@ class ThrustModel(Protocol):
 
 
 class ClimbRateThrust:
-    """ArduCopter: a share of its maximum climb or descent rate."""
+    """Thrust field for ArduCopter: a fraction of its maximum climb or descent rate."""
 
     def __init__(self, up_m_s: float, down_m_s: float) -> None:
         self._up, self._down = up_m_s, down_m_s
@@ -63,10 +63,10 @@ class ClimbRateThrust:
 
 
 class CollectiveThrust:
-    """PX4: collective thrust, from a loop that holds the climb rate.
+    """Thrust field for PX4: collective thrust, computed by a loop that holds the climb rate.
 
     Args:
-        hover: The hover thrust (``MPC_THR_HOVER``); 0.5 replaces an implausible one.
+        hover: The hover thrust (``MPC_THR_HOVER``); an implausible value is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -88,32 +88,32 @@ class CollectiveThrust:
 
 
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-REACHED_M: Final = 0.2  #: a take-off ends this far below its altitude
-EKF_PLACE: Final = 0x10  #: absolute horizontal position, of EKF_STATUS_REPORT and ESTIMATOR_STATUS
+REACHED_M: Final = 0.2  #: a take-off counts as complete this far below its target altitude
+EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position
 EKF_RELATIVE_PLACE: Final = 0x08
-EKF_CONSTANT: Final = 0x80  #: it does not know its position
+EKF_CONSTANT: Final = 0x80  #: flag in the same messages: the position is only assumed to be constant
 EKF_UNINITIALISED: Final = 0x400
-THRUST_AS_THRUST: Final = 8  #: of ArduCopter's GUID_OPTIONS
+THRUST_AS_THRUST: Final = 8  #: bit of ArduCopter's GUID_OPTIONS: the thrust field is collective thrust
 
-Values = Mapping[str, float]  #: the autopilot's parameters by its own names
+Values = Mapping[str, float]  #: the autopilot's parameters by the autopilot's own names
 
 
 @dataclass(frozen=True, slots=True)
 class _SafetyNet:
-    """One of the autopilot's failsafes, set by the value of a parameter.
+    """One of the autopilot's failsafes, configured by a parameter.
 
-    The effect of each value was observed on the real autopilots or is in their parameter references.
+    The effect of each value was observed with the real autopilots or is documented in their parameter references.
     """
 
-    name: str  #: of the parameter
+    name: str  #: name of the parameter
     what: str
-    good: Callable[[float], bool]  #: whether the value is safe
-    otherwise: str  #: consequence of any other value
+    good: Callable[[float], bool]  #: returns whether a value is safe
+    otherwise: str  #: consequence of a value that is not safe
     advised: float  #: a safe value
     unit: str = ""
 
     def diagnostic(self, value: float) -> Diagnostic:
-        """Judge the parameter's value."""
+        """Return a diagnostic for the parameter's value."""
         detail = f"{self.name} is {value:g} {self.unit}".rstrip()
         if self.good(value):
             return Diagnostic(self.what, True, detail)
@@ -130,20 +130,20 @@ def _on(value: float) -> bool:
 
 
 class AutopilotProfile(ABC):
-    """One autopilot's specifics. Stateless."""
+    """The specifics of one autopilot. Stateless."""
 
     NAME: ClassVar[str]
     GUIDED: ClassVar[str]  #: the mode that follows set-points
-    HOLD: ClassVar[str]  #: the mode that holds the position without set-points
+    HOLD: ClassVar[str]  #: the mode that holds position without set-points
     LAND: ClassVar[str]
     ARMING: ClassVar[str]  #: the mode required for arming
-    HOLDING: ClassVar[frozenset[str]]  #: modes that stay in place without set-points
+    HOLDING: ClassVar[frozenset[str]]  #: modes in which the vehicle stays in place without set-points
     LANDING: ClassVar[frozenset[str]]
     TAKING_OFF: ClassVar[frozenset[str]]
-    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes flown by a remote control
-    LEAD_S: ClassVar[float]  #: how long set-points must flow before GUIDED is entered
-    BYTEWISE: ClassVar[bool]  #: encoding of parameter writes, unless its capabilities say otherwise
-    EARTH_RADIUS_M: ClassVar[float]  #: of the sphere with which it converts latitude and longitude
+    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that are flown with a remote control
+    LEAD_S: ClassVar[float]  #: how long set-points must arrive before the vehicle enters GUIDED
+    BYTEWISE: ClassVar[bool]  #: whether writes encode integers bytewise, unless its capabilities say otherwise
+    EARTH_RADIUS_M: ClassVar[float]  #: radius of the sphere that it uses to convert latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
     @abstractmethod
@@ -154,7 +154,7 @@ class AutopilotProfile(ABC):
 
     @abstractmethod
     def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:
-        """Return the take-off command; None while the altitude for it is unknown."""
+        """Return the take-off command; None while the altitude that it needs is unknown."""
 
     @abstractmethod
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
@@ -162,26 +162,26 @@ class AutopilotProfile(ABC):
 
         Args:
             vehicle: The vehicle's state.
-            height_m: Height of the take-off.
-            rose: Whether it has been in the air since the take-off was accepted.
+            height_m: The take-off height.
+            rose: Whether the vehicle has been in the air since the take-off was accepted.
         """
 
     @abstractmethod
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether it can be armed; None if it does not report that."""
+        """Return whether the vehicle can be armed; None if it does not report that."""
 
     @abstractmethod
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the messages needed, by name, and their rates [1/s]."""
+        """Return the rates of the required messages [1/s] by name."""
 
     @abstractmethod
     def thrust_model(self, values: Values) -> ThrustModel:
         """Return the model that turns climb rates into thrust."""
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
-        """Return a diagnostic for each safety net that this autopilot has a parameter for.
+        """Return a diagnostic for each safety net for which this autopilot has a parameter.
 
-        By default, both autopilots only drop the last set-point when this computer or its link dies.
+        By default, both autopilots only stop following the last set-point if this computer or its link fails.
         """
         return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 
@@ -190,7 +190,7 @@ class ArduCopterProfile(AutopilotProfile):
     """ArduCopter."""
 
     NAME = "ArduCopter"
-    EARTH_RADIUS_M = math.degrees(111_318.845_021_45)  # AP_Math/definitions.h: LATLON_TO_M, for 1e-7 °
+    EARTH_RADIUS_M = math.degrees(111_318.845_021_45)  # AP_Math/definitions.h: LATLON_TO_M, per 1e-7 °
     GUIDED = "GUIDED"
     HOLD = "BRAKE"
     LAND = "LAND"
@@ -230,11 +230,11 @@ class ArduCopterProfile(AutopilotProfile):
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
-        """Return whether the altitude is reached: nothing else shows it."""
+        """Return whether the altitude has been reached, which is the only sign of a complete take-off."""
         return rose and vehicle.altitude_m is not None and vehicle.altitude_m >= height_m - REACHED_M
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether its pre-arm checks pass and its estimator has a position."""
+        """Return whether the pre-arm checks pass and the estimator has a position."""
         good = telemetry.prearm_good(now_ns)
         ekf = telemetry.newest("EKF_STATUS_REPORT", now_ns, SLOW_S)
         if not good or ekf is None:
@@ -243,7 +243,7 @@ class ArduCopterProfile(AutopilotProfile):
         return bool(knows) and not ekf.flags & (EKF_CONSTANT | EKF_UNINITIALISED)
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return every message needed: unasked, it sends only a heartbeat each second."""
+        """Return every required message: by default, ArduCopter sends only a heartbeat every second."""
         return {
             "HEARTBEAT": 5.0,
             "ATTITUDE": rate_hz,
@@ -258,13 +258,13 @@ class ArduCopterProfile(AutopilotProfile):
         }
 
     def thrust_model(self, values: Values) -> ThrustModel:
-        """Return a climb-rate model, or a thrust model if ``GUID_OPTIONS`` says so."""
+        """Return the climb-rate model, or the thrust model if ``GUID_OPTIONS`` selects it."""
         if int(values.get("GUID_OPTIONS", 0)) & THRUST_AS_THRUST:
             return CollectiveThrust(hover=values.get("MOT_THST_HOVER", 0.35))
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:
-        """Return the safety nets, and whether it watches for our heartbeats."""
+        """Return diagnostics for the safety nets, and for whether the vehicle monitors our heartbeats."""
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
@@ -339,19 +339,19 @@ class Px4Profile(AutopilotProfile):
             return None
         nan = math.nan
         amsl_m = vehicle.amsl_m - (vehicle.altitude_m or 0.0) + height_m
-        # To the decimetre, so that altitude noise at rest does not turn a repeat into a new command.
+        # Rounded to decimetres, so that altitude noise on the ground does not turn a repeat into a new command.
         return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
 
     def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002
-        """Return whether it holds its position: its take-off mode ends in that."""
+        """Return whether the vehicle holds its position, which is what it does at the end of its take-off mode."""
         return rose and vehicle.mode == self.HOLD and vehicle.landed is not Landed.TAKING_OFF
 
     def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
-        """Return whether it can be armed; None while it does not report that.
+        """Return whether the vehicle can be armed; None while it does not report that.
 
-        It never sets this check's *present* bit, and reports the outcome for its current mode. A mode that can't be
-        armed, such as one left over from a flight, says nothing about the mode in which a take-off begins. Then only
-        the position estimate counts.
+        PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
+        allow arming, like one left over from a flight, the outcome does not apply to the mode in which a take-off
+        begins. In that case only the position estimate is checked.
         """
         status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
         custom_mode = telemetry.custom_mode()
@@ -365,7 +365,7 @@ class Px4Profile(AutopilotProfile):
         return None if estimator is None else bool(estimator.flags & (EKF_PLACE | EKF_RELATIVE_PLACE))
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the messages needed. The heartbeat's rate is fixed; CURRENT_MODE is separate."""
+        """Return the required messages. The heartbeat's rate is fixed; CURRENT_MODE is requested separately."""
         return {
             "ATTITUDE": rate_hz,
             "LOCAL_POSITION_NED": rate_hz,
@@ -380,7 +380,7 @@ class Px4Profile(AutopilotProfile):
         }
 
     def thrust_model(self, values: Values) -> ThrustModel:
-        """Return collective thrust."""
+        """Return the collective-thrust model."""
         return CollectiveThrust(hover=values.get("MPC_THR_HOVER", 0.5))
 
 

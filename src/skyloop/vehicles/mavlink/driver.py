@@ -1,4 +1,4 @@
-"""The driver for ``mavlink://`` addresses: the proxy's interface to the vehicle."""
+"""The driver for ``mavlink://`` addresses, through which the proxy uses the vehicle."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class MavlinkDriver(Driver):
         super().__init__(uri)
         self.options = options_of(uri)
         if self.options.camera is not None:
-            source(uri, self.options.camera)  # raises if the source is invalid
+            source(uri, self.options.camera)  # raises an error now if the source is invalid
         self._link: MavlinkLink | None = None
         self._camera: LiveCamera | None = None
         self._limits = dict(self.options.limits)
@@ -92,17 +92,17 @@ class MavlinkDriver(Driver):
         return self._opened().command(action, new=False)
 
     def left_to(self) -> str:
-        """Return the mode set by a remote control, a ground station or the autopilot itself."""
+        """Return the mode that a remote control, a ground station or the autopilot itself has chosen, if one has."""
         link = self._link
         setpoints = link.session.setpoints if link is not None else None
         return "" if setpoints is None else setpoints.ownership.others
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Hold the position or land in the autopilot's own mode, without streaming set-points."""
+        """Hold position or land using the autopilot's own mode, without streaming set-points."""
         return self._opened().command(action, alone=True)
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Send the pose as ``ODOMETRY``, or as the message set by ``?pose=``."""
+        """Send the pose as ``ODOMETRY``, or as the message chosen with ``?pose=``."""
         link, now_ns = self._opened(), monotonic_ns()
         bounded = pose.bounded(now_ns)
         if why := link.session.pose_problem(bounded.captured_ns, now_ns):
@@ -110,7 +110,7 @@ class MavlinkDriver(Driver):
         link.send(pose_message(bounded, self.options.pose))
 
     def checkup(self) -> list[Diagnostic]:
-        """Return a diagnostic for each of the autopilot's own failsafes, with what to set."""
+        """Return a diagnostic for each of the autopilot's own failsafes, with the recommended setting."""
         link = self._opened()
         with link.lock:
             session = link.session

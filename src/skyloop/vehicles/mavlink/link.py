@@ -1,4 +1,4 @@
-"""The connection to one vehicle over UDP, TCP or a serial port, and the thread that serves and reopens it."""
+"""A connection to one vehicle over UDP, TCP or a serial port, and the thread that serves and reopens it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from skyloop.vehicles.mavlink.protocol import MavlinkSession, Packet
 from skyloop.vehicles.mavlink.wire.codec import Message
 
 MAX_DATAGRAM: Final = 65_536  #: bytes
-BURST: Final = 64  #: maximum datagrams per read, so that other links get their turn
+BURST: Final = 64  #: maximum number of datagrams per read, so that other links get their turn
 
 
 class MavlinkConnection(Protocol):
     """An open socket or port."""
 
-    whole: bool  #: whether each piece is a datagram
-    dropped: int  #: packets dropped instead of sent
+    whole: bool  #: whether each received piece is a whole datagram
+    dropped: int  #: number of packets dropped instead of sent
 
     def fileno(self) -> int: ...
 
@@ -48,7 +48,7 @@ class MavlinkConnection(Protocol):
 
 
 class UdpListener:
-    """A UDP port that answers each sender."""
+    """A UDP port that replies to the sender of the newest datagram."""
 
     whole = True
 
@@ -78,14 +78,14 @@ class UdpListener:
                 came.append((data, _peer_of(source)))
             except BlockingIOError:
                 break
-            except ConnectionError:  # ICMP port unreachable: the peer may come back
+            except ConnectionError:  # ICMP port unreachable, but the peer may come back
                 continue
         return came
 
     def send(self, packet: Packet) -> None:
-        """Send a datagram; drop it while there is no peer or no room."""
+        """Send a datagram; drop it if there is no peer yet or the buffer is full."""
         if packet.peer is None:
-            self.dropped += 1  # no vehicle found yet
+            self.dropped += 1  # no vehicle has been found yet
             return
         try:
             self._socket.sendto(packet.data, self._to_socket(packet.peer))
@@ -109,7 +109,7 @@ _OF_IPV4: Final = "::ffff:"  #: prefix of IPv4 addresses on an IPv6 socket (RFC 
 
 
 def _peer_of(source: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, int]:
-    """Return a datagram's sender in address form: IPv4 without the prefix, link-local with its interface."""
+    """Return a datagram's sender as an address: IPv4 without the prefix, link-local with the interface."""
     host, port = source[:2]
     if len(source) == 4 and source[3] and "%" not in host:
         host = f"{host}%{source[3]}"
@@ -130,7 +130,7 @@ class UdpSender(UdpListener):
 
 
 class _Stream(ByteStream):
-    """An ordered byte stream that carries one vehicle."""
+    """An ordered byte stream to one vehicle."""
 
     whole = False
 
@@ -145,7 +145,7 @@ class _Stream(ByteStream):
 
 
 class TcpClient(_Stream, TcpStream):
-    """A client of the autopilot's TCP server, which serves one client at a time: an open connection may still wait."""
+    """A client of the autopilot's TCP server, which serves one at a time: even an open connection may have to wait."""
 
     def __init__(self, address: Address) -> None:
         super().__init__(address.place, address.number)
@@ -167,16 +167,16 @@ _KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] 
 
 
 def open_connection(address: Address) -> MavlinkConnection:
-    """Open a connection to a numeric host. Takes up to a second."""
+    """Open a connection to a host given as a number. Takes up to a second."""
     return _KINDS[address.kind](address)
 
 
-WRITE_S: Final = 0.9  #: a write that is not confirmed within this time has failed
-_CLOSE_S: Final = 3.0  #: time for the thread to end
+WRITE_S: Final = 0.9  #: a write that is not confirmed within this time fails
+_CLOSE_S: Final = 3.0  #: time allowed for the thread to end
 
 
 class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
-    """The link's thread: keeps the connection open and serves the session."""
+    """The link to one vehicle: its thread keeps the connection open and serves the session."""
 
     RETRY_NS = nanoseconds(1.0)
 
@@ -203,17 +203,17 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Have the session accept an action and send it at once. Any thread. See :meth:`MavlinkSession.command`."""
+        """Pass an action to :meth:`MavlinkSession.command` and send it at once. May be called from any thread."""
         return self._decide(partial(self.session.command, action, alone=alone, new=new))
 
     def send(self, message: Message) -> None:
-        """Send a message to the vehicle now. Any thread."""
+        """Send a message to the vehicle now. May be called from any thread."""
         with self.lock:
             self.session.send(message)
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter; return why it failed, or None. Blocks for up to 0.9 s. Any thread but the link's."""
+        """Write a parameter; return why it failed, or None. Blocks for up to 0.9 s; not for the link's own thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
@@ -232,7 +232,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
                 self.session.receive(data, peer, now_ns, whole=connection.whole)
 
     def _send_due(self, now_ns: int) -> None:
-        """Send due packets. Call with the lock held, on any thread."""
+        """Send the packets that are due. Call it with the lock held, from any thread."""
         packets = self.session.poll(now_ns)
         connection = self._connection
         if connection is None or self._broken:
@@ -257,7 +257,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
         return open_connection(self._address())
 
     def _address(self) -> Address:
-        """Return the address with a numeric host; raise OSError while it can't be resolved."""
+        """Return the address with its host resolved to a number; raise OSError if it can't be resolved."""
         address = self.session.options.address
         if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
             return address

@@ -16,24 +16,24 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
 
-# Frames of SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
+# Frames in SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
 WORLD: Final = 1
-BODY: Final = 8  #: levelled
+BODY: Final = 8  #: levelled body axes
 VELOCITY_AND_YAW_RATE: Final = 0x5C7
 POSITION: Final = 0xDF8
 POSITION_AND_YAW: Final = 0x9F8
-ATTITUDE_AND_THRUST: Final = 0x07  #: without rates
-VELOCITY_PERIOD_NS: Final = 40_000_000  #: between repeats of a velocity or position: 25 Hz
-ATTITUDE_PERIOD_NS: Final = 20_000_000  #: between attitudes, which turn between repeats: 50 Hz
-MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may lead a vehicle that can't follow
-STOPPED_M_S: Final = 0.25  #: slower than this, hold the position instead of a speed of zero;
-STOPPING_S: Final = 3.0  #: after this, hold it in any case
-MOST_STEP_S: Final = 0.1  #: longest step of a set-point, after a pause of the ticks
+ATTITUDE_AND_THRUST: Final = 0x07  #: type mask for an attitude and a thrust without rates
+VELOCITY_PERIOD_NS: Final = 40_000_000  #: time between repeats of a velocity or position: 25 Hz
+ATTITUDE_PERIOD_NS: Final = 20_000_000  #: time between attitudes, whose heading turns with each repeat: 50 Hz
+MOST_YAW_LEAD_RAD: Final = 0.5  #: how far the requested heading may be ahead of a vehicle that can't follow
+STOPPED_M_S: Final = 0.25  #: a vehicle slower than this holds its position instead of a speed of zero
+STOPPING_S: Final = 3.0  #: after this time, it holds its position in any case
+MOST_STEP_S: Final = 0.1  #: longest time step of a set-point, if ticks paused
 WAY_M_S: Final = 1.0  #: default speed to a position
 WAY_TURN_RAD_S: Final = 0.8  #: default turn rate on the way to a position
-WAY_M_S2: Final = 0.8  #: at the start and the end
-LEASH_S: Final = 1.5  #: how far the sent position may lead the vehicle, as time at the requested speed
-LEASH_M: Final = 0.3  #: and at least this
+WAY_M_S2: Final = 0.8  #: acceleration at the start and deceleration at the end of the way
+LEASH_S: Final = 1.5  #: how far the sent position may be ahead of the vehicle, as time at the requested speed
+LEASH_M: Final = 0.3  #: minimum of that distance
 
 Target = tuple[int, int]  #: system and component
 
@@ -89,8 +89,8 @@ class VelocitySetpoint:
 class PositionSetpoint:
     """Flies straight to a position and stays there.
 
-    Autopilots fly to a position as fast as their own parameters allow. Hence the position sent moves to the goal, no
-    faster than the action's speed, and stays near the vehicle.
+    Autopilots fly to a position as fast as their own parameters allow. The position sent therefore moves towards the
+    goal at the action's speed at most, and stays near the vehicle.
     """
 
     period_ns = VELOCITY_PERIOD_NS
@@ -100,21 +100,21 @@ class PositionSetpoint:
         self._at: Vector | None = None  # position sent to the vehicle: north, east, down
         self._speed_m_s = 0.0
         self._yaw: float | None = None  # clockwise from north
-        self._keep_yaw: float | None = None  # heading to keep where the action sets none
+        self._keep_yaw: float | None = None  # heading to keep if the action does not set one
         self._before_ns = 0
 
     def replace(self, action: Position) -> None:
-        """Fly elsewhere, starting from the vehicle's position on the way."""
+        """Fly to another position, starting from where the vehicle is now."""
         if self.action.yaw is not None and action.yaw is None:
-            self._keep_yaw = None  # its present heading
+            self._keep_yaw = None  # keep its present heading
         self.action = action
 
     def hold_back(self) -> None:
-        """Restart from the vehicle's position: it does not follow yet."""
+        """Restart from the vehicle's position, because it is not following yet."""
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due; a velocity of zero while position or heading is unknown."""
+        """Return the set-point if one is due; it is a velocity of zero while the position or heading is unknown."""
         if vehicle.position is None or vehicle.yaw is None:
             self.hold_back()
             return velocity_message(Velocity(), target)
@@ -154,7 +154,7 @@ def _between(start: Vector, end: Vector, share: float) -> Vector:
 
 
 class AttitudeSetpoint:
-    """Flies an attitude with climb rate and yaw rate, turning the requested heading step by step."""
+    """Flies an attitude with a climb rate and a yaw rate, turning the requested heading step by step."""
 
     period_ns = ATTITUDE_PERIOD_NS
 
@@ -196,27 +196,27 @@ Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 PATIENCE_NS: Final = nanoseconds(6.0)  #: give up a take-off not requested for this long if the vehicle is not armed
 RISING_NS: Final = nanoseconds(12.0)  #: give up if an armed vehicle is still on the ground by then; usual: 4.5 s
 ARM_PACE_S: Final = 1.0  #: between repeated commands to arm or take off
-ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledged arming counts without a heartbeat that confirms it
-LANDED_NS: Final = nanoseconds(2.5)  #: a landing has disarmed the vehicle by then, or never will: a PX4 does after 2 s
+ARMED_NS: Final = nanoseconds(2.5)  #: how long acknowledged arming is trusted without a confirming heartbeat
+LANDED_NS: Final = nanoseconds(2.5)  #: a landing that disarms the vehicle does so by then (PX4: after 2 s)
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
-LEFT_GROUND_M: Final = 0.3  #: rise that shows a lift-off, where the vehicle reports none
-CUT_SHORT: Final = 0.5  #: another operator stopped a take-off that holds below this share of its height
-CUT_SHORT_M: Final = 1.05  #: and this far below it: a PX4 ends one NAV_MC_ALT_RAD (0.8 m) below its height
-STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for this long, as messages may overtake one another
-STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long was cancelled
+LEFT_GROUND_M: Final = 0.3  #: climb that shows a lift-off if the vehicle does not report one
+CUT_SHORT: Final = 0.5  #: another operator stopped a take-off that holds below this fraction of its height
+CUT_SHORT_M: Final = 1.05  #: and at least this far below it: PX4 ends one NAV_MC_ALT_RAD (0.8 m) below its height
+STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported, because messages may be reordered
+STALLED_NS: Final = nanoseconds(6.0)  #: a climb without progress for this long has been cancelled
 
 
 class TakeoffSequence:
     """One take-off, from disarmed on the ground in any mode to a hover. Level-triggered.
 
-    Each step requests what is missing: the mode to arm in, arming, the command. Refusals are reported in the vehicle's
-    own words, and retried for as long as the take-off is requested. ``asked_ns``: the time of the last request.
+    Each step requests what is missing: the mode for arming, arming, the command. Refusals are reported in the vehicle's
+    own words and retried as long as the take-off is requested. ``asked_ns`` is the time of the last request.
 
     Args:
         autopilot: The autopilot's profile.
         height_m: Height above the start.
         now_ns: Start of the take-off.
-        disarms: Whether a landing here is not over: it may still disarm the vehicle, which was found armed.
+        disarms: Whether a landing of ours is not over and may still disarm the vehicle, which was found armed.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
@@ -226,8 +226,8 @@ class TakeoffSequence:
         self.taken_over = False  #: another operator chose a mode in the air
         self.declined = False  #: given up because another operator chose a mode before it was armed
         self.rose = False  #: it has left the ground
-        self.lead_ns: int | None = None  #: when set-points began to flow
-        self.reason = ""  #: the vehicle's own reason why it can't be armed
+        self.lead_ns: int | None = None  #: when set-points began to be sent
+        self.reason = ""  #: the vehicle's own reason for refusing to arm
         self._autopilot = autopilot
         self._height_m = height_m
         self._begun_ns = now_ns
@@ -241,15 +241,15 @@ class TakeoffSequence:
         self._ground_m: float | None = None
         self._other_ns: int | None = None
         self._sent_ns = 0
-        self._seen = not autopilot.TAKING_OFF  # its take-off mode was seen, if it has one
+        self._seen = not autopilot.TAKING_OFF  # whether its take-off mode, if it has one, was seen
         self.refused = ""  #: why it is not armed yet
-        self.arm_asked_ns: int | None = None  #: the last arming request; None: it was already armed
+        self.arm_asked_ns: int | None = None  #: when arming was last requested; None if it was already armed
         self._arming_ns: int | None = None  # the first arming request; earlier answers are to the landing's disarming
         self._ready = False  # it was in the mode for taking off, to be armed or armed: another mode is others' choice
 
     @property
     def started(self) -> bool:
-        """Whether the vehicle is armed for this take-off, which then needs no more requests."""
+        """Whether the vehicle is armed for this take-off and no further requests are needed."""
         return self._armed_ns is not None and (self.rose or not self._disarms)
 
     def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
@@ -299,7 +299,7 @@ class TakeoffSequence:
         self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
-        if not vehicle.armed and not self.started:  # disarmed by our previous landing, before this flight began
+        if not vehicle.armed and not self.started:  # our previous landing disarmed it before this flight began
             self._armed_ns, self._climb_command, self._disarms = None, None, False
         elif not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
             self.given_up = "the vehicle disarmed itself"
@@ -308,21 +308,21 @@ class TakeoffSequence:
             refused = f": the take-off was {result_name(result)}" if result not in (None, ACCEPTED) else ""
             self.given_up = f"it does not leave the ground{refused}"
         elif self._other_ns is not None:
-            pass  # a mode chosen by others never completes a take-off, at any height
+            pass  # a mode chosen by another operator never completes a take-off, whatever the height
         elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
             self.done = True
         elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
-            self.done = True  # as high as it gets, by its reported altitude
+            self.done = True  # as high as its reported altitude says it will get
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 
     def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
-        """Return whether the previous landing can no longer disarm it: a later disarming has another cause."""
+        """Return whether our previous landing can no longer disarm it, so that a later disarming has another cause."""
         accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
         return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS
 
     def _is_off_ground(self, landed: Landed, height_m: float) -> bool:
-        """Return whether the vehicle is off the ground: as it reports, else by its altitude."""
+        """Return whether the vehicle is off the ground according to its report or, if there is none, its altitude."""
         if landed is not Landed.UNKNOWN:
             return landed is not Landed.ON_GROUND
         if self._ground_m is None:
@@ -330,12 +330,12 @@ class TakeoffSequence:
         return height_m - self._ground_m > LEFT_GROUND_M
 
     def _is_cut_short(self, vehicle: VehicleState) -> bool:
-        """Return whether another operator chose position hold during the climb, a mode in which take-offs also end."""
+        """Return whether another operator chose position hold during the climb, which is also how take-offs end."""
         if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
             return False
         below_m = None if vehicle.altitude_m is None else self._height_m - vehicle.altitude_m
         if self._climb_command is not None and vehicle.amsl_m is not None:
-            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # its home may move on the way
+            below_m = self._climb_command.arguments[6] - vehicle.amsl_m  # its home may move during the climb
         return below_m is not None and below_m > max(CUT_SHORT * self._height_m, CUT_SHORT_M)
 
     def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:
@@ -351,9 +351,9 @@ class TakeoffSequence:
             self.taken_over = True
 
     def _climb(self, vehicle: VehicleState, target: tuple[int, int], now_ns: int) -> list[Message]:
-        """Return set-points where the guided mode needs them flowing before it starts.
+        """Return set-points if the guided mode requires them to be arriving before it starts.
 
-        If the climb was cancelled, return a position to fly to: nothing else restarts an ArduCopter's climb.
+        If the climb was cancelled, return a position to fly to, because nothing else restarts ArduCopter's climb.
         """
         stalled = now_ns - self._best_ns > STALLED_NS and vehicle.mode == self._autopilot.GUIDED
         if self._position is None:

@@ -20,17 +20,17 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Autopilot
 
-MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may continue from another port
-MOST_OTHERS: Final = 16  #: cap on other vehicles reported: a hostile sender can make up any number
+MOVED_NS: Final = nanoseconds(0.3)  #: after this much silence, the vehicle may have moved to another port
+MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported, because a hostile sender can invent any number
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
-#: MAV_TYPE of aircraft that hover on several rotors.
+#: MAV_TYPE of each kind of aircraft that hovers on several rotors.
 _MULTIROTORS: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleIdentity:
-    """A vehicle whose heartbeats arrive."""
+    """Identifies a vehicle whose heartbeats are received."""
 
     system: int
     component: int
@@ -38,12 +38,12 @@ class VehicleIdentity:
 
 
 class VehicleSelector:
-    """Chooses one vehicle among all whose heartbeats arrive.
+    """Selects one vehicle among all whose heartbeats are received.
 
     Args:
-        system: Its system id; None: the first one found, and from then on only that system.
-        peer: Its address and port; None: any.
-        component: Its component id.
+        system: System id of the vehicle; None selects the first one found and keeps to that system from then on.
+        peer: Address and port of the vehicle; None for any.
+        component: Component id of the vehicle.
     """
 
     def __init__(self, system: int | None, peer: tuple[str, int] | None, component: int = 1) -> None:
@@ -52,12 +52,12 @@ class VehicleSelector:
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
         self._reported: set[VehicleIdentity] = set()
-        self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was: it may have moved there
-        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received beside it
+        self._elsewhere: set[VehicleIdentity] = set()  # received since the chosen one was, which may have moved there
+        self._others: set[VehicleIdentity] = set()  # other vehicles with the same id, received at the same time
         self._received_ns = 0  # when the chosen one was last received
 
     def on_message(self, message: Message, peer: Peer, now_ns: int) -> list[VehicleEvent]:
-        """Handle any message; return events about other vehicles, or about the chosen one moving to another port."""
+        """Handle a message; return events about other vehicles, or about the chosen one's move to another port."""
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
         if self.chosen == found:
             self._received_ns = now_ns
@@ -82,7 +82,7 @@ class VehicleSelector:
         return self._report_other(found)
 
     def _may_have_moved(self, found: VehicleIdentity) -> bool:
-        """Return whether this may be the chosen vehicle on a new port, which its host may have assigned."""
+        """Return whether this may be the chosen vehicle on a new port, for example one assigned by its host."""
         chosen = self.chosen
         if chosen is None or chosen.peer is None or found.peer is None or self._wanted_peer is not None:
             return False
@@ -90,7 +90,7 @@ class VehicleSelector:
         return same and found not in self._others and len(self._others | self._elsewhere) < MOST_OTHERS
 
     def is_chosen(self, message: Message, peer: Peer) -> bool:
-        """Return whether the chosen vehicle sent it."""
+        """Return whether a message was sent by the chosen vehicle."""
         chosen = self.chosen
         return (
             chosen is not None
@@ -100,7 +100,7 @@ class VehicleSelector:
         )
 
     def forget(self) -> None:
-        """Forget the chosen vehicle: the same system may come back from another peer."""
+        """Forget the chosen vehicle, because the same system may come back from another peer."""
         self.chosen = None
         self._others.clear()
         self._elsewhere.clear()
@@ -140,7 +140,7 @@ def _is_vehicle(heartbeat: Message) -> bool:
 
 
 def unsupported_reason(heartbeat: Message) -> str:
-    """Return why this vehicle can't be flown from here; empty if it can."""
+    """Return why Skyloop can't fly this vehicle; empty if it can."""
     if heartbeat.autopilot not in tuple(Autopilot):
         return f"its MAV_AUTOPILOT is {heartbeat.autopilot}; only ArduCopter and PX4 are supported"
     if heartbeat.type not in _MULTIROTORS:
@@ -170,21 +170,21 @@ class VehicleCommand:
 
 
 def result_name(result: int) -> str:
-    """Return a ``MAV_RESULT`` in words."""
+    """Return a ``MAV_RESULT`` as words."""
     return _RESULTS.get(result, f"result {result}")
 
 
 class CommandSender:
-    """Sends commands and keeps their results.
+    """Sends commands and stores their results.
 
-    Level-triggered: a caller that wants an effect keeps calling :meth:`request` until the effect shows.
+    Level-triggered: to achieve an effect, a caller keeps calling :meth:`request` until the effect is visible.
     """
 
     def __init__(self, target: tuple[int, int] = (1, 1)) -> None:
-        self.target = target  #: system and component
+        self.target = target  #: target system and component
         self._out: list[Message] = []
         self._sent: dict[VehicleCommand, tuple[int, int]] = {}  # time of the last request, number of requests
-        self._answers: dict[int, tuple[int, int]] = {}  # command: result, time
+        self._answers: dict[int, tuple[int, int]] = {}  # result of each command, and when it arrived
 
     def request(self, command: VehicleCommand, now_ns: int, pace_s: float = 0.5) -> None:
         """Send a command, unless it was sent within ``pace_s``."""
@@ -192,13 +192,13 @@ class CommandSender:
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
         if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
-            times = 0  # a new request, not a repeat
+            times = 0  # this is a new request, not a repeat
         self._sent[command] = now_ns, times + 1
         arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
         self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
 
     def on_ack(self, message: Message, now_ns: int) -> None:
-        """Handle a ``COMMAND_ACK`` for us."""
+        """Handle a ``COMMAND_ACK`` addressed to us."""
         if message.result != IN_PROGRESS:
             self._answers[message.command] = message.result, now_ns
 
@@ -208,7 +208,7 @@ class CommandSender:
         return found[0] if found is not None and found[1] >= since_ns else None
 
     def reset(self) -> None:
-        """Forget everything: the link was lost."""
+        """Discard everything because the link was lost."""
         self._out.clear()
         self._sent.clear()
         self._answers.clear()
@@ -219,22 +219,22 @@ class CommandSender:
         return out
 
 
-AT_ONCE: Final = 4  #: requests per tick: a slow link needs room for others
-RETRY_S: Final = 3.0  #: then request a message that is slower than requested again
-ENOUGH: Final = 0.5  #: share of the requested rate that is good enough
-PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`: the vehicle may not have the message
-TRIES: Final = 4  #: requests at the faster pace
+AT_ONCE: Final = 4  #: maximum number of requests per tick, because a slow link needs room for other messages
+RETRY_S: Final = 3.0  #: time after which a message that arrives too slowly is requested again
+ENOUGH: Final = 0.5  #: fraction of the requested rate that is good enough
+PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, as the vehicle may not have the message
+TRIES: Final = 4  #: number of requests at the shorter interval
 
 
-CHECK_NS: Final = nanoseconds(0.2)  #: between checks of the rates, once everything was requested
+CHECK_NS: Final = nanoseconds(0.2)  #: time between checks of the rates once everything has been requested
 
 
 class MessageIntervals:
-    """Requests messages at the rates that feedback needs, and again while they are missing."""
+    """Requests messages at the rates that feedback needs, repeating the requests while messages are missing."""
 
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
-        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at the start, number of requests
+        self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, the count then, number of requests
         self._check_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
@@ -261,22 +261,22 @@ class MessageIntervals:
         self._check_ns = now_ns + CHECK_NS
 
 
-ASK_NS: Final = nanoseconds(1.0)  #: between TIMESYNC requests
-HURRY_NS: Final = nanoseconds(0.1)  #: between the first few requests
-FIRST: Final = 5  #: number of fast requests
-KEEP_NS: Final = nanoseconds(10.0)  #: how long clock samples count
-PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this on arrival is from another clock
-BEHIND_MS: Final = 1000  #: stamps behind by more than this may mean that the vehicle rebooted
-_WRAP: Final = 1 << 32  #: of stamps in ms: after 49 days
+ASK_NS: Final = nanoseconds(1.0)  #: time between TIMESYNC requests
+HURRY_NS: Final = nanoseconds(0.1)  #: time between the first few requests
+FIRST: Final = 5  #: number of requests at the shorter interval
+KEEP_NS: Final = nanoseconds(10.0)  #: how long a clock sample is used
+PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that appears older than this on arrival is from another clock
+BEHIND_MS: Final = 1000  #: a stamp that goes back by more than this may mean that the vehicle rebooted
+_WRAP: Final = 1 << 32  #: stamps in ms wrap around at this value, after 49 days
 
 
 class VehicleClock:
-    """Maps a vehicle's stamps to this host's clock: by ``TIMESYNC`` where plausible, else by the smallest delay."""
+    """Converts a vehicle's stamps to this host's clock, by ``TIMESYNC`` if plausible, else by the smallest delay."""
 
     def __init__(self) -> None:
-        self.round_trip_s: float | None = None  #: of the best recent answer
-        self._samples: deque[tuple[int, int, int]] = deque()  # time, round trip, their clock minus ours
-        self._offset_ns: int | None = None  # their clock minus ours, in the best sample
+        self.round_trip_s: float | None = None  #: round trip of the best recent reply
+        self._samples: deque[tuple[int, int, int]] = deque()  # time, round trip, and the vehicle's clock minus ours
+        self._offset_ns: int | None = None  # the vehicle's clock minus ours in the best sample
         self._asked_ns = 0
         self._asked = 0
         self._live = LiveClock()
@@ -284,14 +284,14 @@ class VehicleClock:
         self._captured_ns = 0
 
     def poll(self, now_ns: int) -> list[Message]:
-        """Return the ``TIMESYNC`` request if one is due, stamped on our clock."""
+        """Return the ``TIMESYNC`` request, stamped by our clock, if one is due."""
         if now_ns - self._asked_ns < (HURRY_NS if self._asked < FIRST else ASK_NS):
             return []
         self._asked_ns, self._asked = now_ns, self._asked + 1
         return [m.MAVLink_timesync_message(0, now_ns)]
 
     def on_timesync(self, message: Message, now_ns: int) -> list[Message]:
-        """Handle a ``TIMESYNC``; return the answer if it is a request."""
+        """Handle a ``TIMESYNC``; return the reply if it is a request."""
         if message.tc1 == 0:
             return [m.MAVLink_timesync_message(now_ns, message.ts1)]
         round_trip_ns = now_ns - message.ts1
@@ -304,22 +304,22 @@ class VehicleClock:
         return []
 
     def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
-        """Classify a message by its stamp: new, overtaken by others of its kind, or from a vehicle that rebooted."""
+        """Classify a message by its stamp as new, overtaken by others of its kind, or sent after a reboot."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 
     def captured_ns(self, boot_ms: int, now_ns: int) -> int:
-        """Return when the stamped state was captured: not after its arrival, nor before the previous one."""
+        """Return when the stamped state was captured, never later than it arrived nor earlier than the previous one."""
         live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
         if self._offset_ns is not None:
             synced_ns = boot_ms * 1_000_000 - self._offset_ns
-            # Stamps are truncated to milliseconds, so they may be up to that much too early.
+            # Stamps are truncated to milliseconds, so they may be up to 1 ms too early.
             if 0 <= now_ns - synced_ns <= PLAUSIBLE_NS:
                 live_ns = synced_ns
         self._captured_ns = max(self._captured_ns, min(now_ns, live_ns))
         return self._captured_ns
 
     def now(self, now_ns: int) -> int:
-        """Return the capture time of an unstamped state."""
+        """Return the capture time of a state that has no stamp."""
         self._captured_ns = max(self._captured_ns, now_ns)
         return self._captured_ns
 
@@ -330,10 +330,10 @@ _NAN: Final = math.nan
 
 
 def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
-    """Return an external pose as a message.
+    """Convert an external pose to a message.
 
-    The message holds north, east, down [m] and the angles of a body with axes forward, right, down [rad]. Its time is
-    in microseconds of our own clock, which the vehicle learns by ``TIMESYNC``.
+    The message has north, east, down [m] and the angles of a body with forward, right and down axes [rad]. Its time is
+    in microseconds on our own clock, to which ``TIMESYNC`` relates the vehicle's clock.
     """
     position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)
@@ -350,7 +350,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
 
 
 def _covariance(pose: ExternalPose) -> list[float]:
-    """Return the upper right triangle of x, y, z, roll, pitch, yaw; the first number is NaN if it is unknown."""
+    """Return the upper right triangle for x, y, z, roll, pitch, yaw; the first number is NaN if it is unknown."""
     if pose.position_std_m is None or pose.attitude_std_rad is None:
         return [_NAN] * 21
     variances = [pose.position_std_m**2] * 3 + [pose.attitude_std_rad**2] * 3

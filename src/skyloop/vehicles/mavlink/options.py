@@ -1,4 +1,4 @@
-"""Options of ``mavlink://`` addresses, including the camera's. Pure. ``docs/mavlink.md`` lists them."""
+"""Options in ``mavlink://`` addresses, including the camera's, listed in ``docs/mavlink.md``. Pure."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from skyloop.files import expand, read_bytes
 from skyloop.messages import CameraInfo
 from skyloop.messages.frame import H264
 
-Peer = tuple[str, int] | None  #: a UDP sender; None on a stream
+Peer = tuple[str, int] | None  #: host and port of a UDP sender; None for a stream
 
 TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
 ALTITUDE: Final = "limits.altitude"
@@ -47,8 +47,8 @@ USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
 
 KEY_BYTES: Final = 32
 DEFAULT_BAUD: Final = 57_600
-#: Rotations from a camera's optical axes (right, down, forward) to body axes, row by row. The top of the image is up,
-#: or forward for a camera that looks down.
+#: Rotations from a camera's optical axes (right, down, forward) to body axes, row by row. The top of the image points
+#: up or, for a camera that looks down, forward.
 FACINGS: Final = {
     "forward": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
     "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
@@ -66,9 +66,9 @@ KNOWN: Final = {
 
 
 class ConnectionKind(StrEnum):
-    """How the bytes travel."""
+    """Kinds of connection."""
 
-    UDP_IN = "udpin"  #: listens and answers each sender
+    UDP_IN = "udpin"  #: listens, and replies to the sender
     UDP_OUT = "udpout"  #: sends first
     TCP = "tcp"  #: connects
     SERIAL = "serial"
@@ -83,7 +83,7 @@ class PoseMessage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the vehicle is."""
+    """The address of the vehicle's connection."""
 
     kind: ConnectionKind
     place: str  #: host or device
@@ -96,7 +96,7 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class CameraOptions:
-    """A camera beside the autopilot. Size and rate are announced before the first frame arrives."""
+    """A camera separate from the autopilot. Its size and rate are announced before the first frame arrives."""
 
     source: str = field(repr=False)  # may contain credentials
     name: str
@@ -104,7 +104,7 @@ class CameraOptions:
     height: int
     fps: float
     facing: str  #: one of :data:`FACINGS`
-    stream: bool = True  #: whether to announce a network camera's H.264 as a stream that is passed on unchanged
+    stream: bool = True  #: whether to announce a network camera's H.264 as a stream that is relayed unchanged
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,16 +112,16 @@ class MavlinkOptions:
     """A parsed address."""
 
     address: Address
-    system: int | None = None  #: of the vehicle; None: the first one found
-    component: int = 1  #: of its autopilot: by default MAV_COMP_ID_AUTOPILOT1
-    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: the sender of its first packet
+    system: int | None = None  #: the vehicle's system id; None for the first one found
+    component: int = 1  #: the autopilot's component id, by default MAV_COMP_ID_AUTOPILOT1
+    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None for the sender of its first packet
     own_system: int = 255
     rate_hz: float = 50.0  #: rate of attitude, position and velocity
-    limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by parameter name
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: the driver's limits by parameter name
     parameters: bool = True  #: whether to read the autopilot's parameters
     key: bytes | None = field(default=None, repr=False)
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
-    world_origin: tuple[float, float, float] | None = None  #: the same units
+    world_origin: tuple[float, float, float] | None = None  #: in the same units
     pose: PoseMessage = PoseMessage.ODOMETRY
     camera: CameraOptions | None = None
 
@@ -158,7 +158,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
 
 
 def address_of(uri: VehicleUri) -> Address:
-    """Parse the place of an address."""
+    """Parse the part of an address that says where the vehicle is."""
     word, _, rest = uri.place.partition(":")
     if word not in [kind.value for kind in ConnectionKind]:
         raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
@@ -190,7 +190,7 @@ def _key(uri: VehicleUri) -> bytes | None:
     given = uri.reveal("signing_key")
     if given is None:
         return None
-    if not expand(given).exists():  # don't echo it: the value may be the key itself
+    if not expand(given).exists():  # don't repeat the value, which may be the key itself
         raise FileFormatError(f"{uri}: signing_key can't be read: it must be the path of a file that holds the key")
     held = read_bytes(given, f"{uri}: the signing key's file", 1024)
     if len(held) == KEY_BYTES:
@@ -252,7 +252,7 @@ def takeoff_height(values: Mapping[str, float]) -> float:
 
 
 def limits_text(values: Mapping[str, float]) -> str:
-    """Return a sentence for people about the limits in force."""
+    """Return a readable sentence that describes the limits in force."""
     speed, climb, altitude = (values[name] for name in ("limits.speed", "limits.climb", ALTITUDE))
     return (
         f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them with the parameters "
@@ -274,12 +274,12 @@ def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
 
 
 def source(uri: VehicleUri, options: CameraOptions) -> CameraSource:
-    """Return where the camera's video comes from: a stream or a device."""
+    """Return the source of the camera's video: a stream or a device."""
     return source_of(options.source, f"{uri}: camera")
 
 
 def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> LiveCamera:
-    """Return a receiver for the camera, not yet started."""
+    """Return a receiver for the camera, not started yet."""
     settings = LiveCameraSettings(
         source(uri, options),
         options.name,

@@ -1,4 +1,4 @@
-"""Ownership of the vehicle: this program, another operator, or the vehicle's own failsafe. Pure.
+"""Control of the vehicle by this program, another operator, or the vehicle's own failsafe. Pure.
 
 A remote control, a ground station or the autopilot itself may change the mode. Skyloop leaves the vehicle in a mode
 that it did not choose; only a new action from an application takes the vehicle back.
@@ -15,32 +15,32 @@ from skyloop.vehicles.mavlink.autopilots import AutopilotProfile
 from skyloop.vehicles.mavlink.manoeuvres import STRAYED_NS
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 
-LATE_NS: Final = nanoseconds(3.0)  #: how late a requested mode change may take effect
-PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a longer pause is a new decision, not a repeat
+LATE_NS: Final = nanoseconds(3.0)  #: longest delay with which a requested mode change may take effect
+PAUSE_NS: Final = nanoseconds(0.5)  #: the same action after a pause longer than this is a new decision, not a repeat
 _SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
-    """Ownership of the flight, judged by the reported modes and the modes requested here."""
+    """Decides who is flying, based on the modes that the vehicle reports and those requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
-        self.left_to = ""  #: a mode chosen elsewhere that flies the vehicle now; empty: ours, or without a pilot
+        self.left_to = ""  #: the mode, chosen elsewhere, that now flies the vehicle; empty if we do, or without a pilot
         self._autopilot = autopilot
-        self._by_itself = False  # its own failsafe chose the mode: the vehicle is still ours to hold and to land
-        self._steering = False  # this flight was started or taken over here
-        self._from = ""  # the mode at the last decision; empty once one of our modes has been reported
+        self._by_itself = False  # its own failsafe chose the mode, so we may still hold or land the vehicle
+        self._steering = False  # whether this program started or took over the flight
+        self._from = ""  # the mode at the time of the last decision; empty once one of our modes has been reported
         self._foreign_ns: int | None = None  # when the vehicle entered a mode that was not chosen here
-        self._applied: tuple[type[AnyAction] | None, int] = (None, 0)  # kind and time of the last action
-        self._repeated: type[AnyAction] | None = None  # the action whose repeats don't take the vehicle back
+        self._applied: tuple[type[AnyAction] | None, int] = (None, 0)  # type and time of the last action
+        self._repeated: type[AnyAction] | None = None  # the type of action whose repeats don't take the vehicle back
         self._asked: dict[str, int] = {}  # when each mode was last requested
 
     @property
     def others(self) -> str:
-        """The mode in which another operator flies the vehicle; empty if there is none."""
+        """The mode in which another operator is flying the vehicle; empty if there is none."""
         return "" if self._by_itself else self.left_to
 
     def is_foreign(self, vehicle: VehicleState) -> bool:
-        """Return whether the mode can't follow from any decision made here."""
+        """Return whether the mode can't be the result of any decision made here."""
         autopilot, mode = self._autopilot, vehicle.mode
         if mode in (autopilot.GUIDED, autopilot.HOLD, autopilot.ARMING, self._from) or mode in autopilot.TAKING_OFF:
             return False
@@ -49,7 +49,7 @@ class FlightOwnership:
         return not self._is_left_to_nobody(vehicle)
 
     def _is_left_to_nobody(self, vehicle: VehicleState) -> bool:
-        """Return whether its failsafe chose a mode that sinks without a pilot at the sticks."""
+        """Return whether its failsafe chose a mode in which it sinks unless a pilot is at the sticks."""
         return vehicle.failsafe and vehicle.mode in self._autopilot.NEEDS_STICKS and not vehicle.remote
 
     # Decisions ---------------------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ class FlightOwnership:
     def check(self, action: AnyAction, now_ns: int, *, new: bool) -> None:
         """Refuse an action that would take the vehicle from another operator without a new decision to do so.
 
-        A program that repeats the same action in a loop makes no new decision either.
+        Repeating the same action in a loop does not count as a new decision.
 
         Args:
             action: The requested action.
@@ -79,12 +79,12 @@ class FlightOwnership:
         self._repeated = None
 
     def take(self, action: AnyAction, vehicle: VehicleState | None, *, alone: bool, new: bool) -> None:
-        """Record that this action now flies the vehicle from here.
+        """Record that the vehicle is now under our control through this action.
 
         Args:
             action: The accepted action.
             vehicle: The vehicle's state; None while nothing is received.
-            alone: Whether a failsafe requested it, without a pilot in command.
+            alone: Whether a failsafe requested it while no pilot was in command.
             new: Whether an application newly requested it.
         """
         begins = not self._steering or not isinstance(action, _SET_POINTS)
@@ -93,22 +93,22 @@ class FlightOwnership:
         self._steering, self._by_itself, self.left_to = True, False, ""
 
     def on_mode_asked(self, mode: str, now_ns: int) -> None:
-        """Record a mode request made here."""
+        """Record that we requested a mode."""
         self._asked[mode] = now_ns
 
     def was_just_asked(self, mode: str, now_ns: int) -> bool:
-        """Return whether a mode may be the late effect of our own command."""
+        """Return whether a mode may be the delayed effect of our own command."""
         return now_ns - self._asked.get(mode, -LATE_NS) < LATE_NS
 
     # Reports of the vehicle --------------------------------------------------------------------------------------
 
     def on_mode(self, mode: str) -> None:
-        """Record that the vehicle left the mode of the last decision: a return to it is another operator's choice."""
+        """Record that the vehicle left the mode of the last decision; a return to it is another operator's choice."""
         if mode != self._from:
             self._from = ""
 
     def observe(self, vehicle: VehicleState, now_ns: int) -> bool:
-        """Return whether a vehicle flown from here is in a foreign mode, in which nothing is sent to it."""
+        """Return whether a vehicle that we were flying is in a foreign mode, in which nothing is sent to it."""
         if not self._steering or not self.is_foreign(vehicle):
             self._foreign_ns = None
             self.on_mode(vehicle.mode)
@@ -118,22 +118,22 @@ class FlightOwnership:
         return True
 
     def is_lost(self, now_ns: int) -> bool:
-        """Return whether the foreign mode has lasted long enough to leave the vehicle to it."""
+        """Return whether the foreign mode has lasted long enough for us to give up control."""
         return self._foreign_ns is not None and now_ns - self._foreign_ns >= STRAYED_NS
 
     def leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle in its present mode; return whether it is still ours to hold and to land."""
+        """Leave the vehicle in its present mode; return whether we may still hold or land it."""
         self.left_to, self._repeated = vehicle.mode, self._applied[0]
         self._asked.clear()
         self._by_itself = self._steering = self._is_left_to_nobody(vehicle)
         return self._by_itself
 
     def on_link_lost(self) -> None:
-        """Treat whatever mode the vehicle is found in again as foreign, unless it was chosen here."""
+        """When the vehicle is found again, treat its mode as foreign unless it was chosen here."""
         self._from = ""
 
     def on_flight_over(self) -> None:
-        """Forget the flight: the vehicle is on the ground, and its next pilot starts over."""
+        """Discard the state of the flight: the vehicle is on the ground, and its next pilot starts from scratch."""
         self._steering, self._by_itself, self.left_to, self._from = False, False, "", ""
         self._foreign_ns, self._repeated = None, None
         self._asked.clear()

@@ -1,4 +1,4 @@
-"""The autopilot's parameters over MAVLink, and their names and types under ``mavlink.``. Pure."""
+"""Access to the autopilot's parameters over MAVLink, and their names under ``mavlink.`` with their types. Pure."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from skyloop.vehicles.mavlink.options import OWN_LIMITS
 from skyloop.vehicles.mavlink.wire.codec import Message, bounds, from_field, is_integer, to_field
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-QUIET_NS: Final = nanoseconds(0.7)  #: after this much silence, request what is missing
-AT_ONCE: Final = 20  #: missing parameters requested at once
-LIST_NS: Final = nanoseconds(3.0)  #: between requests for the list while none of it arrives
+QUIET_NS: Final = nanoseconds(0.7)  #: silence after which missing parameters are requested
+AT_ONCE: Final = 20  #: number of missing parameters requested at once
+LIST_NS: Final = nanoseconds(3.0)  #: time between requests for the list while nothing arrives
 GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
-WRITE_NS: Final = nanoseconds(0.25)  #: between repeats of an unconfirmed write
+WRITE_NS: Final = nanoseconds(0.25)  #: time between repeats of an unconfirmed write
 NO_INDEX: Final = 0xFFFF
-MOST: Final = 8192  #: longest plausible list; ignore a count above it
+MOST: Final = 8192  #: longest plausible list; a greater count is ignored
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class _PendingWrite:
 
 
 class ParameterExchange:
-    """Reads and writes one vehicle's parameters. ``bytewise`` says how integers are encoded."""
+    """Reads and writes one vehicle's parameters. ``bytewise`` says whether integers are encoded bytewise."""
 
     def __init__(self) -> None:
         self.target = (1, 1)
@@ -61,24 +61,24 @@ class ParameterExchange:
         self._writes: list[_PendingWrite] = []
 
     def request_all(self, now_ns: int) -> None:
-        """Start reading all parameters again."""
+        """Start reading all parameters from the beginning."""
         self._wanted, self.complete, self.given_up = True, False, False
         self._indices.clear()
         self.count, self._asked_ns, self._progress_ns = None, None, now_ns
 
     def fail_writes(self, reason: str) -> None:
-        """Fail pending writes: the link was lost."""
+        """Fail all pending writes because the link was lost."""
         writes, self._writes = self._writes, []
         for write in writes:
             write.done(reason)
 
     def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
-        """Write a parameter in the autopilot's unit; by the deadline, ``done`` receives why it failed, or None."""
+        """Write a parameter in the autopilot's unit; by the deadline, ``done`` is called with the failure or None."""
         self._writes.append(_PendingWrite(name, value, deadline_ns, done))
 
     @property
     def values(self) -> dict[str, float]:
-        """The values by the autopilot's own names."""
+        """All values by the autopilot's own names."""
         return {name: held.value for name, held in self.reported.items()}
 
     @property
@@ -139,7 +139,7 @@ class ParameterExchange:
                 kind = self.reported[write.name].kind
                 try:
                     field = to_field(write.value, kind, bytewise=self.bytewise)
-                except struct.error as error:  # its type changed since the request
+                except struct.error as error:  # its type has changed since the request
                     self._writes.remove(write)
                     write.done(f"{write.value:g} does not fit: {error}")
                     continue
@@ -155,7 +155,7 @@ class ParameterExchange:
 
 
 def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
-    """Return whether the vehicle reports the written value; unless ``exact``, compare in single precision."""
+    """Return whether the vehicle reports the written value, compared in single precision unless ``exact``."""
     return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
@@ -214,30 +214,30 @@ PARAMETER_INFO: Final = {
 
 
 PREFIX: Final = "mavlink."
-EXACT: Final = 1 << 24  #: single precision holds every whole number up to here
+EXACT: Final = 1 << 24  #: single precision represents every whole number up to this one exactly
 _NAME: Final = re.compile(r"[A-Za-z0-9_]{1,16}\Z")
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameter:
-    """A parameter and the autopilot's name for it."""
+    """A parameter, with the autopilot's name for it."""
 
     parameter: Parameter
     native: str
 
     def to_native(self, value: Value) -> float:
-        """Return a value as the autopilot takes it; raise if it does not accept it."""
+        """Convert a value to the autopilot's representation; raise an error if the autopilot would not accept it."""
         value = checked_value(self.parameter, value)
         assert isinstance(value, int | float)
         return value
 
     def from_native(self, number: float) -> Value:
-        """Return a value reported by the autopilot."""
+        """Convert a value reported by the autopilot."""
         return int(number) if self.parameter.type is ParameterType.INT else rounded(number)
 
 
 def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, VehicleParameter]:
-    """Return all parameters that the vehicle reported, by our names."""
+    """Return all parameters reported by the vehicle, with our own names as keys."""
     found: dict[str, VehicleParameter] = {}
     for name, each in held.items():
         entry = _own(each) if _NAME.match(name) else None
@@ -247,7 +247,7 @@ def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, Vehic
 
 
 def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
-    """Return a writable parameter; raise if it is unknown or read-only."""
+    """Return a parameter to be written; raise an error if it is unknown or read-only."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
@@ -257,9 +257,9 @@ def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> Ve
 
 
 def check_exact(name: str, number: int, *, bytewise: bool) -> int:
-    """Return a whole number if the vehicle would receive exactly it; raise otherwise.
+    """Return a whole number if the vehicle would receive it exactly; raise an error otherwise.
 
-    ArduPilot encodes whole numbers as single-precision floats, which round some beyond 24 bits.
+    ArduPilot encodes whole numbers as single-precision floats, which round some numbers of more than 24 bits.
     """
     if bytewise:
         return number
@@ -299,7 +299,7 @@ def _own(held: ReportedParameter) -> VehicleParameter | None:
             kind,
             value,
             meaning.unit,
-            _bound(min(low, value)),  # a value outside shows that the vehicle's own range is wider
+            _bound(min(low, value)),  # a value outside the range shows that the vehicle's own is wider
             _bound(max(high, value)),
             description=meaning.text or f"the autopilot's {held.name}",
         ),
@@ -329,7 +329,7 @@ def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
 
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
-    """Return the driver's own limits with one changed; raise for a number that is not finite or out of range."""
+    """Return the driver's limits with one changed; raise an error if the number is not finite or out of range."""
     parameter = next(each for each in limit_parameters(values) if each.name == name)
     value = checked_value(parameter, value)
     assert isinstance(value, float)

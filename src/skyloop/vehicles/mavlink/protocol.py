@@ -1,4 +1,4 @@
-"""The protocol of one vehicle, from its first heartbeat on: bytes in, bytes and sink callbacks out. Pure."""
+"""The protocol with one vehicle from its first heartbeat onwards: bytes in, bytes and sink callbacks out. Pure."""
 
 from __future__ import annotations
 
@@ -40,26 +40,26 @@ from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
-REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session: silence, heartbeats, requests
+REST_NS: Final = nanoseconds(0.1)  #: poll interval of an idle session, for heartbeats, requests and silence checks
 HEARTBEAT_NS: Final = nanoseconds(1.0)
-SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: above the 5 to 10 s after which the autopilots' failsafes act
-QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points wait: the vehicle might follow them late
-OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose says where the vehicle was, not where it is
-DEGRADED_NS: Final = nanoseconds(1.2)  #: silence until the link is degraded
-LOST_NS: Final = nanoseconds(2.5)  #: silence until the link is lost
+SLOW_HEARTBEAT_NS: Final = nanoseconds(15.0)  #: longer than the 5 to 10 s after which the autopilots' failsafes act
+QUIET_NS: Final = nanoseconds(0.5)  #: silence after which set-points are withheld: the vehicle might follow them late
+OLD_POSE_NS: Final = nanoseconds(0.5)  #: an older pose no longer says where the vehicle is
+DEGRADED_NS: Final = nanoseconds(1.2)  #: silence after which the link is degraded
+LOST_NS: Final = nanoseconds(2.5)  #: silence after which the link is lost
 FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle that has sent no data by then is reported as lost
-PARAMETERS_NS: Final = nanoseconds(25.0)  #: time for the parameter list; after it, the link is up without the list
-WAKING_MS: Final = 60_000  #: on the vehicle's clock: if it can't be armed this soon after boot, it is still booting
-IDENTITY_NS: Final = nanoseconds(2.0)  #: time for a vehicle found again to prove that it is the same
-QUIET_ATTITUDE_S: Final = 0.5  #: without attitude for this long, other messages trigger feedback
-VERSION_PACE_S: Final = 1.0  #: between requests for the version
+PARAMETERS_NS: Final = nanoseconds(25.0)  #: time allowed for the parameter list, after which the link is up without it
+WAKING_MS: Final = 60_000  #: a vehicle that booted less than this ago and can't be armed is still starting up
+IDENTITY_NS: Final = nanoseconds(2.0)  #: time allowed for a vehicle found again to prove that it is the same
+QUIET_ATTITUDE_S: Final = 0.5  #: if no attitude arrives for this long, other messages trigger feedback
+VERSION_PACE_S: Final = 1.0  #: time between requests for the version
 _WAKING: Final = f"{WAKING_UP}: its pre-arm checks do not pass yet"
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 _STAMPED: Final = ("ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")  #: messages whose stamps show their order
 _MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that carry the mode
 
-#: Safety commands: sent before everything else.
+#: Safety commands, which are sent before everything else.
 _URGENT: Final = frozenset(
     {m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_NAV_TAKEOFF, m.MAV_CMD_NAV_LAND}
 )
@@ -71,12 +71,12 @@ class Packet(NamedTuple):
     """One frame to send."""
 
     data: bytes
-    peer: Peer  #: where to send a datagram; None: the address's own
+    peer: Peer  #: where to send a datagram; None for the configured address
     rank: Rank = Rank.SETPOINT
 
 
 def rank_of(message: Message) -> Rank:
-    """Return a message's priority on a slow link."""
+    """Return the priority of a message on a slow link."""
     kind = message.get_type()
     if kind == "COMMAND_LONG" and message.command in _URGENT:
         stops = (message.command, (message.param1, message.param2)) == (CUT.number, CUT.arguments)
@@ -90,7 +90,7 @@ _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK
 
 
 class MavlinkSession(VehicleSession):
-    """One opened driver's protocol with its vehicle. Not thread-safe."""
+    """The protocol between an open driver and its vehicle. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -104,11 +104,11 @@ class MavlinkSession(VehicleSession):
         self.parameters = ParameterExchange()
         self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
-        self.autopilot: AutopilotProfile | None = None  #: None until recognised, and for an unknown autopilot
-        self.setpoints: SetpointController | None = None  #: None until then, and for a vehicle that can't be flown
-        self.version: Message | None = None  #: its AUTOPILOT_VERSION
-        self.limits = options.limits  #: the driver's own
-        self.dropped = 0  #: packets that the connection dropped for lack of room
+        self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and if it is unknown
+        self.setpoints: SetpointController | None = None  #: None until then, and if the vehicle can't be flown
+        self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
+        self.limits = options.limits  #: the driver's own limits
+        self.dropped = 0  #: number of packets that the connection dropped because its buffer was full
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer, options.component)
@@ -117,30 +117,30 @@ class MavlinkSession(VehicleSession):
         self._out: list[Message] = []
         self._found_ns = 0
         self._heartbeat_ns = -HEARTBEAT_NS
-        self._peer = options.peer  # the chosen vehicle's; kept while the link is lost
-        self._slow_heartbeat = False  # lost while armed: our heartbeats would keep its own failsafe from acting
-        self._old = False  # it speaks MAVLink 1
+        self._peer = options.peer  # the chosen vehicle's address, kept while the link is lost
+        self._slow_heartbeat = False  # lost while armed: regular heartbeats would keep its own failsafe from acting
+        self._old = False  # whether the vehicle uses MAVLink 1
         self._signed = 0
-        self._unencodable: set[str] = set()  # message types already reported as impossible to encode
-        self._kind: tuple[int, int] | None = None  # autopilot and type, from its heartbeat
-        self._known_as: Message | None = None  # version from before the link was lost, until it arrives again
+        self._unencodable: set[str] = set()  # message types already reported as not encodable
+        self._kind: tuple[int, int] | None = None  # autopilot and vehicle type, from the heartbeat
+        self._known_as: Message | None = None  # version from before the link was lost, kept until it arrives again
         self._receives_us = True  # False until the vehicle shows that it receives us
-        self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed, MAV_STATE at the last check
-        self._waking = False  # it has just booted and can't be armed yet
-        self._prearm = ""  # the latest reason that it gave
+        self._last_report: tuple[int | None, bool, int] | None = None  # mode, armed and MAV_STATE when last checked
+        self._waking = False  # whether it has just booted and can't be armed yet
+        self._prearm = ""  # the latest reason that it gave for refusing to arm
         self._unsupported_reason = "no data from it"
-        #: Works on whatever answers: a pressed stop outlives the vehicle's state.
+        #: Acts on any vehicle that answers, because an emergency stop must outlive the vehicle's state.
         self._stop = MotorStop(lambda event: self._publish_event(event))
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
     @property
     def identity(self) -> VehicleIdentity | None:
-        """The chosen vehicle; None while none is found."""
+        """The chosen vehicle; None until one has been found."""
         return self._selector.chosen
 
     @property
     def description(self) -> str:
-        """Autopilot, version and system, for people."""
+        """A readable summary: autopilot, version and system."""
         if self.autopilot is None:
             return "an unknown autopilot"
         system = self._selector.system
@@ -152,15 +152,15 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Also raises for a vehicle that can't be flown."""
-        if isinstance(action, EmergencyStop) and self._kind is None:  # one in flight may be found in a moment
+        """Accept an action; see :meth:`SetpointController.apply`. Also raises if the vehicle can't be flown."""
+        if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
             return action
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
         if isinstance(action, Idle):
-            return action  # no effect, and pilots on the ground send it continuously
+            return action  # no effect, and on the ground pilots send it continuously
         vehicle = self.vehicle_state(now_ns)
         if isinstance(action, Takeoff) and self._wakes_up(vehicle, now_ns):
             raise DriverError(f"the vehicle is {_WAKING}" + (f" ({self._prearm})" if self._prearm else ""))
@@ -173,8 +173,8 @@ class MavlinkSession(VehicleSession):
     def pose_problem(self, captured_ns: int, now_ns: int) -> str:
         """Return why an external pose can't be sent now; empty if it can.
 
-        While the vehicle is silent, a pose might wait in a buffer and pass for a new one once the vehicle reads again:
-        an autopilot may date it by its arrival.
+        While the vehicle is silent, a pose might wait in a buffer and be taken for a new one when the vehicle resumes
+        reading, because an autopilot may date it by its arrival.
         """
         if self._received_ns is None:
             return "no data from the vehicle: an external pose can't be sent until the link is up"
@@ -184,7 +184,7 @@ class MavlinkSession(VehicleSession):
         return f"an external pose is {seconds(age_ns):.2g} s old, at most 0.5 s" if age_ns > OLD_POSE_NS else ""
 
     def send(self, message: Message) -> None:
-        """Send a message to the vehicle with the next tick."""
+        """Send a message to the vehicle in the next tick."""
         self._out.append(message)
         self.due_ns = 0
 
@@ -195,11 +195,11 @@ class MavlinkSession(VehicleSession):
         return self.setpoints is not None and self.setpoints.forget_landing()
 
     def close(self) -> None:
-        """End the session: pending parameter writes fail."""
+        """End the session and fail pending parameter writes."""
         self.parameters.fail_writes("the driver was closed")
 
     def vehicle_state(self, now_ns: int) -> VehicleState | None:
-        """Return the vehicle's state; None while nothing is received."""
+        """Return the vehicle's state; None while nothing is being received."""
         custom_mode = self.telemetry.custom_mode()
         if self._received_ns is None or self.autopilot is None or custom_mode is None:
             return None
@@ -209,7 +209,7 @@ class MavlinkSession(VehicleSession):
     # From the connection -----------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
-        """Handle bytes from a peer: a datagram if ``whole``. Never raises, whatever they contain."""
+        """Handle bytes from a peer, which are one datagram if ``whole``. Never raises, whatever the content."""
         for message in self.codec.decode(data, whole=whole, source=peer):
             self._on_message(message, peer, now_ns)
         if self.codec.signed > self._signed:
@@ -220,7 +220,7 @@ class MavlinkSession(VehicleSession):
                 self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
 
     def connected(self) -> None:
-        """Handle a new connection: the vehicle behind it is not known yet."""
+        """Handle a new connection, whose vehicle is not known yet."""
         self._unreachable = ""
 
     def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
@@ -242,7 +242,7 @@ class MavlinkSession(VehicleSession):
         if kind in _STAMPED:
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
             if arrival is Arrival.RESTARTED:
-                self.version = None  # another vehicle with other parameters may answer
+                self.version = None  # another vehicle, with other parameters, may answer
                 self.telemetry = Telemetry()
                 self._lose("the vehicle rebooted", now_ns)
             if arrival is not Arrival.NEW:
@@ -271,7 +271,7 @@ class MavlinkSession(VehicleSession):
             answers = self.clock.on_timesync(message, now_ns)
             if answers:
                 self._out += answers
-                self.due_ns = 0  # a late answer shifts the clock by which the vehicle dates external poses
+                self.due_ns = 0  # a late reply would shift the clock by which the vehicle dates external poses
         elif kind == "STATUSTEXT":
             for event in self._health.on_text(message, quiet=self._waking):
                 self._publish_event(event)
@@ -336,7 +336,7 @@ class MavlinkSession(VehicleSession):
         return packets
 
     def _next_ns(self, now_ns: int) -> int:
-        """Return when to poll next. An idle session polls rarely, which keeps a grounded fleet cheap."""
+        """Return when to poll next. An idle session polls rarely to save CPU time with a fleet on the ground."""
         tick_ns, next_ns = now_ns + TICK_NS, self._silence_seen_ns(now_ns + REST_NS)
         if self.parameters.busy:
             return min(tick_ns, next_ns)
@@ -353,17 +353,17 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None and vehicle is not None:
             messages = self.setpoints.messages(vehicle, now_ns, read=self._is_read(now_ns))
         if not self._receives_us:
-            messages = []  # nothing shows yet that it receives us
+            messages = []  # there is no sign yet that it receives us
         return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
 
     def _is_read(self, now_ns: int) -> bool:
-        """Return whether the vehicle seems to read promptly, judging by its messages."""
+        """Return whether the vehicle seems to read promptly, judging by the messages it sends."""
         return self._receives_us and now_ns - (self._received_ns or 0) < QUIET_NS
 
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
-        """Return the heartbeat when it is due.
+        """Return the heartbeat if it is due.
 
-        A vehicle that speaks MAVLink 1 gets both versions: some autopilots switch to MAVLink 2 once they receive it.
+        A vehicle that uses MAVLink 1 gets both versions, because some autopilots switch to MAVLink 2 on receiving it.
         """
         if now_ns - self._heartbeat_ns < (SLOW_HEARTBEAT_NS if self._slow_heartbeat else HEARTBEAT_NS):
             return []
@@ -372,7 +372,7 @@ class MavlinkSession(VehicleSession):
         return [Packet(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
     def _packet(self, message: Message, peer: Peer) -> Packet | None:
-        """Encode a message; return None if that fails, so that one bad message holds up no other, such as a stop."""
+        """Encode a message; return None if that fails, so that a bad message can't block others, such as a stop."""
         if not self._axes.sent(message):
             return None
         try:
@@ -393,7 +393,7 @@ class MavlinkSession(VehicleSession):
         if self._waking is not was_waking and self.link_state is LinkState.UP:
             self._report_link(LinkState.UP, _WAKING if self._waking else "")
         if self._known_as is not None and now_ns - self._found_ns > IDENTITY_NS:
-            self._read_again(now_ns)  # it does not identify itself
+            self._read_again(now_ns)  # the vehicle does not identify itself
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
             return
         if self._known_as is not None or not self._receives_us:
@@ -403,7 +403,7 @@ class MavlinkSession(VehicleSession):
             self._set_link_state(LinkState.UP, _WAKING if self._waking else "")
 
     def _wakes_up(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Return whether it has just booted and has not been ready since."""
+        """Return whether the vehicle has just booted and has not been ready since."""
         attitude = self.telemetry.newest("ATTITUDE", now_ns, QUIET_ATTITUDE_S)
         if vehicle is None or attitude is None:
             return self._waking
@@ -445,7 +445,7 @@ class MavlinkSession(VehicleSession):
         if self.setpoints is not None:
             self.setpoints.on_link_lost()
         self.clock = VehicleClock()
-        self._publish(self.clock.now(now_ns), now_ns)  # its present state is unknown
+        self._publish(self.clock.now(now_ns), now_ns)  # because its present state is unknown
         self._set_link_state(LinkState.LOST, reason)
 
     def _find(self, heartbeat: Message, now_ns: int) -> None:
@@ -471,7 +471,7 @@ class MavlinkSession(VehicleSession):
         self._set_link_state(LinkState.DEGRADED, text)
 
     def _identify(self, heartbeat: Message) -> None:
-        """Set up an unknown vehicle: drop everything known of any other."""
+        """Set up a new vehicle, discarding everything known about any other."""
         if self._kind is not None:
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             data: dict[str, Value] = {"reason": "another", "system": heartbeat.get_srcSystem()}
@@ -499,7 +499,7 @@ class MavlinkSession(VehicleSession):
             )
 
     def _on_version(self, version: Message, now_ns: int) -> None:
-        """Handle the vehicle's version. A vehicle found again counts as the same only if it can prove that."""
+        """Handle the vehicle's version. A vehicle found again counts as the same only if its version proves that."""
         before, self._known_as, self.version = self._known_as, None, version
         same = True if before is None else _is_same(before, version)
         heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)
@@ -512,13 +512,13 @@ class MavlinkSession(VehicleSession):
         self.parameters.bytewise = bool(version.capabilities & BYTEWISE)
 
     def _read_again(self, now_ns: int) -> None:
-        """Read the parameters of a vehicle that may not be the one from before."""
+        """Read the parameters again, because the vehicle may not be the same as before."""
         self._known_as = None
         if self.options.parameters:
             self.parameters.request_all(now_ns)
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle has answered something."""
+        """See :meth:`VehicleSession.broken`. The link is not up again until the vehicle has replied to something."""
         super().broken(error, now_ns)
         self._receives_us = False
 
@@ -530,14 +530,14 @@ class MavlinkSession(VehicleSession):
 
 
 def _is_same(one: Message, other: Message) -> bool | None:
-    """Return whether two ``AUTOPILOT_VERSION`` describe one vehicle; None if they share no serial number."""
-    if any(one.uid2) and any(other.uid2):  # MAVLink 1 does not carry it
+    """Return whether two ``AUTOPILOT_VERSION`` are from the same vehicle; None if no serial number can be compared."""
+    if any(one.uid2) and any(other.uid2):  # MAVLink 1 does not transmit it
         return list(one.uid2) == list(other.uid2)
     return bool(one.uid == other.uid) if one.uid and other.uid else None
 
 
 def observed_state(vehicle: VehicleState | None) -> FlightState:
-    """Return the flight state of a vehicle that can't be flown from here."""
+    """Return the flight state of a vehicle that Skyloop can't fly."""
     if vehicle is None or vehicle.airborne is None:
         return FlightState.UNKNOWN
     return FlightState.FLYING if vehicle.airborne else FlightState.LANDED

@@ -1,8 +1,8 @@
-"""Turn the last action into the messages due at each tick. Pure.
+"""Turning the last action into the messages due at each tick. Pure.
 
 Set-points are streamed while a pilot is at the controls, and only in the mode that follows them. A failsafe, a lost
-link or another operator's change of mode (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream: from then
-on only the vehicle's own safety nets fly it.
+link or another operator's mode change (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream, after which
+only the vehicle's own safety nets fly it.
 """
 
 from __future__ import annotations
@@ -50,35 +50,35 @@ from skyloop.vehicles.mavlink.wire.codec import Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import Landed
 
-FORCE: Final = 21196.0  #: parameter of the disarm command: "even in flight"
+FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
-SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off at its height counts as done by then, in any mode
-DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after arming was last seen
-IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground has disarmed itself by then
-STEP_NS: Final = nanoseconds(0.04)  #: between the steps of a take-off or landing that only wait for time
-HURRY_NS: Final = nanoseconds(0.008)  #: shortest time between a new set-point and the one before
+SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off at its height counts as complete by then, whatever the mode
+DISARM_NS: Final = nanoseconds(0.5)  #: how long to keep disarming after the vehicle was last seen armed
+IDLES_NS: Final = nanoseconds(12.0)  #: an autopilot left armed on the ground disarms itself within this time
+STEP_NS: Final = nanoseconds(0.04)  #: time between the steps of a take-off or landing that only wait for time to pass
+HURRY_NS: Final = nanoseconds(0.008)  #: minimum time between a new set-point and the previous one
 
 
 class Goal(Enum):
-    """What the vehicle should do."""
+    """The vehicle's task."""
 
-    NOTHING = auto()  #: nothing from us: it is left to itself and to other operators
+    NOTHING = auto()  #: none from us: the vehicle is left to itself and to other operators
     TAKE_OFF = auto()
-    FOLLOW = auto()  #: stream set-points, hovering included
-    HOLD = auto()  #: hold its position without a stream
+    FOLLOW = auto()  #: follow streamed set-points, including hovering
+    HOLD = auto()  #: hold position without a stream
     LAND = auto()
 
 
 class SetpointController:
-    """Remembers the last action and sends what it needs, tick by tick. Not thread-safe.
+    """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
     Args:
         autopilot: The autopilot's profile.
         commands: Sender of commands to the vehicle.
         takeoff_m: Height of a take-off above its start.
-        make_thrust: Creates the thrust model of a flight by attitude.
-        stop: A motor stop that may already be pressed; None: a new one.
+        make_thrust: Creates the thrust model for a flight by attitude.
+        stop: A motor stop that may already be active; None for a new one.
     """
 
     def __init__(
@@ -100,13 +100,13 @@ class SetpointController:
         self._setpoint: Setpoint | None = None
         self._lead_ns: int | None = None  # when the stream started
         self._sent_ns = 0
-        self._followed: Velocity | None = None  # the velocity sent last; None: something else was sent
-        self._entered = False  # the wanted mode has been seen
-        self._strayed_ns: int | None = None  # when the vehicle left the wanted mode again
+        self._followed: Velocity | None = None  # the velocity sent last; None if something else was sent
+        self._entered = False  # whether the required mode has been seen
+        self._strayed_ns: int | None = None  # when the vehicle left the required mode again
         self._settling_ns: int | None = None  # when a take-off reached its height and began to wait for the next mode
-        self._stepped_ns = 0  # time of the last step; 0: none yet
-        self._arms_until_ns: int | None = None  # a take-off aborted by a landing may arm the vehicle until then
-        self._disarms_until_ns = 0  # a failed or cut-off take-off may arm the vehicle until then
+        self._stepped_ns = 0  # time of the last step; 0 if there was none
+        self._arms_until_ns: int | None = None  # until then, a take-off aborted by a landing may arm the vehicle
+        self._disarms_until_ns = 0  # until then, a failed or interrupted take-off may arm the vehicle
         self._blind_until_ns = 0
         self._not_again = ""  # why repeats of a take-off are refused
         self._events: list[VehicleEvent] = []
@@ -119,20 +119,20 @@ class SetpointController:
         """Accept an action.
 
         While an emergency stop is in force (see :class:`~skyloop.drivers.motor_stop.MotorStop`), a take-off is refused
-        and every other action ignored.
+        and all other actions are ignored.
 
         Args:
             action: The requested action.
-            vehicle: The vehicle's state; None while nothing is received.
+            vehicle: The vehicle's state; None while nothing is being received.
             now_ns: The present time.
-            alone: Whether a failsafe requested it, without a pilot in command.
+            alone: Whether a failsafe requested it while no pilot was in command.
             new: Whether an application newly requested it; False for the library's repeats.
 
         Returns:
-            The action in force; idle where it is ignored.
+            The action in force; idle if it is ignored.
 
         Raises:
-            DriverError: It can't be done now, or another operator has the vehicle.
+            DriverError: The action is not possible now, or another operator has the vehicle.
         """
         if isinstance(action, Idle):
             return action
@@ -170,7 +170,7 @@ class SetpointController:
         return action
 
     def _others_fly(self, vehicle: VehicleState | None) -> bool:
-        """Return whether another operator flies the vehicle while no pilot is at our controls."""
+        """Return whether another operator is flying the vehicle while no pilot is at our controls."""
         if self.ownership.others:
             return True
         if vehicle is None or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
@@ -194,7 +194,7 @@ class SetpointController:
         elif not vehicle.airborne:
             takeoff = TakeoffSequence(self._autopilot, self.takeoff_m, now_ns, disarms=self.goal is Goal.LAND)
             self._end()
-            if now_ns < self._disarms_until_ns:  # the previous take-off armed it, or may still do so
+            if now_ns < self._disarms_until_ns:  # the previous take-off has armed it or may still do so
                 takeoff.arm_asked_ns = now_ns
             self.goal, self._takeoff, self._disarms_until_ns = Goal.TAKE_OFF, takeoff, 0
         elif self.goal is not Goal.FOLLOW:
@@ -211,10 +211,10 @@ class SetpointController:
     def _hover(self, vehicle: VehicleState | None, now_ns: int, *, alone: bool) -> None:
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None and (alone or not self._takeoff.rose):
             if not alone:
-                self._land(vehicle)  # the take-off is no longer wanted: stay on the ground
+                self._land(vehicle)  # the take-off has been cancelled: stay on the ground
             return  # a take-off ends in a hover
         if vehicle is not None and vehicle.airborne is False:
-            if self.goal is not Goal.LAND:  # a landing keeps disarming whatever is or may soon be armed
+            if self.goal is not Goal.LAND:  # a landing keeps disarming a vehicle that is armed or may soon be
                 self._end()
         elif alone or vehicle is None or (vehicle.airborne is None and self.goal is not Goal.FOLLOW):
             self._end()  # on the ground, a set-point would start some vehicles
@@ -237,7 +237,7 @@ class SetpointController:
         elif isinstance(action, Position):
             if isinstance(self._setpoint, PositionSetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.replace(action)
-                return action  # the sent position moves step by step, so there is no hurry
+                return action  # no hurry, because the position sent moves step by step
             self._follow(PositionSetpoint(action))
         else:
             if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
@@ -246,7 +246,7 @@ class SetpointController:
             action = self._setpoint.within(action)
             self._setpoint.action = action
         if now_ns - self._sent_ns >= HURRY_NS:
-            self._sent_ns = 0  # at once
+            self._sent_ns = 0  # send it at once
         return action
 
     def _follow(self, setpoint: Setpoint) -> None:
@@ -258,7 +258,7 @@ class SetpointController:
         self._sent_ns = 0
 
     def _end(self) -> None:
-        """Stop pursuing the goal, and end the stream."""
+        """Give up the goal and end the stream."""
         self.goal, self._takeoff, self._setpoint = Goal.NOTHING, None, None
         self._stepped_ns = 0
         self._arms_until_ns = None
@@ -275,25 +275,25 @@ class SetpointController:
             takeoff = self._takeoff
             self._end()
             self.goal = Goal.HOLD if takeoff.started else Goal.NOTHING
-            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # it may be armed on the ground
+            if takeoff.arm_asked_ns is not None and not takeoff.rose:  # the vehicle may be armed on the ground
                 self._disarms_until_ns = takeoff.arm_asked_ns + IDLES_NS
         self._entered, self._strayed_ns = False, None  # mode changes during the outage are the vehicle's own
         self.ownership.on_link_lost()
 
     def forget_landing(self) -> bool:
-        """Stop landing; return whether a landing was in progress."""
+        """Abort a landing; return whether one was in progress."""
         lands = self.goal is Goal.LAND
         if lands:
             self._end()
         return lands
 
     def on_prearm_reason(self, reason: str) -> None:
-        """Keep the vehicle's own reason why it can't be armed."""
+        """Store the vehicle's own reason for refusing to arm."""
         if self._takeoff is not None:
             self._takeoff.reason = reason
 
     def state(self, vehicle: VehicleState | None) -> FlightState:
-        """Return the flight state, as far as it is known."""
+        """Return the flight state as far as it is known."""
         if vehicle is None:
             return FlightState.UNKNOWN
         if self.stop.shown:
@@ -330,14 +330,14 @@ class SetpointController:
         return events
 
     def messages(self, vehicle: VehicleState, now_ns: int, *, read: bool = True) -> list[Message]:
-        """Return the set-points that are due; commands go to the command sender.
+        """Return the set-points that are due, and pass commands to the command sender.
 
         Args:
             vehicle: The newest state.
             now_ns: The present time.
             read: Whether the vehicle seems to read commands promptly, judging by its messages. If not, a set-point
-                might wait in a buffer and be followed late. Then only a stop, harmless when late, is sent in place of a
-                changed velocity.
+                might wait in a buffer and be followed late, so instead of a changed velocity only a stop is sent,
+                which is harmless even if late.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None
@@ -373,13 +373,13 @@ class SetpointController:
 
     @property
     def _holds(self) -> bool:
-        """Whether it should stay in the air where it is."""
+        """Return whether the vehicle should stay where it is in the air."""
         setpoint = self._setpoint
         stops = isinstance(setpoint, VelocitySetpoint) and setpoint.action == Velocity()
         return self.goal is Goal.HOLD or (self.goal is Goal.FOLLOW and (stops or isinstance(setpoint, PositionHold)))
 
     def step_stop(self, vehicle: VehicleState | None, now_ns: int) -> bool:
-        """Send a due emergency stop, whether or not the vehicle is received; return whether one is in force."""
+        """Send an emergency stop that is due, even if nothing is being received; return whether one is in force."""
         if not self.stop.active:
             return False
         shown = None
@@ -390,10 +390,10 @@ class SetpointController:
         return True
 
     def step_blind(self, now_ns: int) -> bool:
-        """Send a new hover or landing while nothing is received; return whether a command is in progress.
+        """Send a new hover or landing while nothing is being received; return whether a command is in progress.
 
-        The vehicle may receive it all the same. A failsafe's requests are not sent like this: another operator may fly
-        the vehicle by now, unseen.
+        The vehicle may still receive it. A failsafe's requests are not sent in this way, because by now another
+        operator may be flying the vehicle without our knowing.
         """
         modes = {Goal.HOLD: self._autopilot.HOLD, Goal.LAND: self._autopilot.LAND}
         if self.stop.active or now_ns >= self._blind_until_ns or self.goal not in modes:
@@ -402,7 +402,7 @@ class SetpointController:
         return True
 
     def due_ns(self, now_ns: int) -> int | None:
-        """Return when :meth:`messages` next has something to send; None: no time is set."""
+        """Return when :meth:`messages` will next have something to send; None if that is not determined."""
         if self.stop.active:
             return None if self.stop.shown else now_ns
         if self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
@@ -412,7 +412,7 @@ class SetpointController:
         return None
 
     def _flight_is_over(self) -> None:
-        """Forget the flight: the vehicle's next pilot starts over."""
+        """Discard the state of the flight, so that the vehicle's next pilot starts from scratch."""
         self._end()
         self.ownership.on_flight_over()
 
@@ -436,9 +436,9 @@ class SetpointController:
         return messages
 
     def _undo_arming(self, vehicle: VehicleState, now_ns: int) -> None:
-        """Disarm the vehicle after a failed take-off or one cut off by a lost link.
+        """Disarm the vehicle after a take-off that failed or was interrupted by a lost link.
 
-        A vehicle that rises, or is in another mode, was armed by others.
+        A vehicle that is rising or in another mode was armed by another operator.
         """
         if vehicle.airborne or vehicle.mode not in (self._autopilot.ARMING, self._autopilot.HOLD):
             self._disarms_until_ns = 0
@@ -470,9 +470,9 @@ class SetpointController:
         self._commands.request(self._autopilot.mode_command(mode), now_ns)
 
     def _strayed(self, mode: str, inside: bool, now_ns: int) -> bool:
-        """Return whether the vehicle left the wanted mode again for longer than :data:`STRAYED_NS`.
+        """Return whether the vehicle has been out of the required mode again for longer than :data:`STRAYED_NS`.
 
-        A mode that may be the late effect of our own command does not count.
+        A mode that may be the delayed effect of our own command does not count.
         """
         if inside:
             self._entered, self._strayed_ns = True, None
@@ -483,7 +483,7 @@ class SetpointController:
         return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
 
     def _leave(self, vehicle: VehicleState) -> bool:
-        """Leave the vehicle in a mode chosen elsewhere; return whether it is still ours to hold and to land."""
+        """Leave the vehicle in a mode chosen elsewhere; return whether we may still hold or land it."""
         why = "its own failsafe" if vehicle.failsafe else "not chosen here"
         self._notify(f"the vehicle changed to {vehicle.mode} ({why}): no more set-points are sent", reason="mode")
         self._end()
@@ -498,7 +498,7 @@ class SetpointController:
             return []
         self._ask_for(self._autopilot.HOLD, now_ns)
         if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
-            self._sent_ns = now_ns  # until the mode shows, or if it is refused
+            self._sent_ns = now_ns  # until the mode is reported, or in case it is refused
             return [velocity_message(Velocity(), self._commands.target)]
         return []
 
@@ -506,7 +506,7 @@ class SetpointController:
         inside = vehicle.mode in self._autopilot.LANDING
         arms_until_ns = self._arms_until_ns
         if vehicle.armed and arms_until_ns is not None:
-            self._arms_until_ns = 0  # a late arming has shown: once disarmed, it stays so
+            self._arms_until_ns = 0  # the late arming has happened: once disarmed, it stays disarmed
         if not vehicle.armed and (arms_until_ns is None or vehicle.heartbeat_ns >= arms_until_ns):
             self._flight_is_over()
         elif vehicle.airborne is False:

@@ -1,4 +1,4 @@
-"""The vehicle's newest messages, converted to feedback and health events. Pure."""
+"""Stores the vehicle's newest messages and converts them to feedback and health events. Pure."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message, Texts
 from skyloop.vehicles.mavlink.wire.modes import Landed, ModeFlag, SystemState
 
-FLOWING_S: Final = 1.0  #: older attitude, position and velocity count as unknown
-SLOW_S: Final = 6.0  #: the same for slow messages such as battery and GPS
-LANDED_S: Final = 3.0  #: the same for the landed state
+FLOWING_S: Final = 1.0  #: attitude, position and velocity older than this count as unknown
+SLOW_S: Final = 6.0  #: corresponding limit for slow messages such as battery and GPS
+LANDED_S: Final = 3.0  #: corresponding limit for the landed state
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-AIRBORNE_M: Final = 0.5  #: above this it counts as flying, where it does not report that
+AIRBORNE_M: Final = 0.5  #: a vehicle that does not report whether it is flying counts as flying above this height
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,24 +31,24 @@ class VehicleState:
 
     mode: str
     armed: bool
-    status: int  #: from the heartbeat
+    status: int  #: MAV_STATE from the heartbeat
     landed: Landed
-    ready: bool | None  #: whether it can be armed; None: unknown
-    position: Vector | None  #: [m], from its origin
+    ready: bool | None  #: whether it can be armed; None if unknown
+    position: Vector | None  #: position from its origin [m]
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
-    altitude_m: float | None  #: above its start, or the nearest to that which it reports
+    altitude_m: float | None  #: height above its start, or the closest equivalent that it reports
     amsl_m: float | None  #: altitude above mean sea level
-    remote: bool = False  #: it receives a remote control, as far as it reports that
-    heartbeat_ns: int = 0  #: arrival of its newest heartbeat, which says whether it is armed
-    reports_landed: bool = False  #: it has reported whether it is on the ground, if not recently
+    remote: bool = False  #: whether it reports that it receives a remote control
+    heartbeat_ns: int = 0  #: when its newest heartbeat, which says whether it is armed, arrived
+    reports_landed: bool = False  #: whether it has ever reported whether it is on the ground
 
     @property
     def airborne(self) -> bool | None:
-        """Whether it is off the ground under its own power; None while unknown.
+        """Whether it is off the ground under its own power; None if unknown.
 
-        An armed vehicle may be flying if it reports neither that nor its height, as when it was just found again, or if
-        it is low and its own report is late.
+        An armed vehicle may be flying if it reports neither that nor its height, for example when it has just been
+        found again, or if it is low and its own report is late.
         """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
@@ -64,17 +64,17 @@ class VehicleState:
 
 
 class Telemetry:
-    """The newest message of each kind, each with its age."""
+    """Stores the newest message of each kind, with its age."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered instance that is current
+        self._newest: dict[str, tuple[Message, int]] = {}  # from the lowest-numbered current instance
         self._instances: dict[str, dict[int, tuple[Message, int]]] = {}  # for messages with several instances
-        self._ground_down: float | None = None  # "down" of the ground, from the origin [m]
-        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; its place on earth
+        self._ground_down: float | None = None  # how far the ground is below the origin [m]
+        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same place on Earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
-        """Keep a message from the vehicle that is flown."""
+        """Store a message from the selected vehicle."""
         kind = message.get_type()
         self.counts[kind] += 1
         self._newest[kind] = message, now_ns
@@ -88,14 +88,14 @@ class Telemetry:
                 self._on_earth = _at_the_same_time(local, message) or self._on_earth
 
     def newest(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Message | None:
-        """Return the newest message of a kind; None if it is older than ``max_age_s``."""
+        """Return the newest message of a kind; None if there is none or it is older than ``max_age_s``."""
         found = self._newest.get(kind)
         if found is None or now_ns - found[1] > max_age_s * NS_PER_S:
             return None
         return found[0]
 
     def instances(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Iterator[Message]:
-        """Yield the newest message of each instance, such as each battery, lowest number first."""
+        """Yield the newest message of each instance (each battery, for example), lowest number first."""
         return (message for message, _ in self._by_number(kind, now_ns, max_age_s))
 
     def _by_number(self, kind: str, now_ns: int, max_age_s: float) -> Iterator[tuple[Message, int]]:
@@ -109,7 +109,7 @@ class Telemetry:
         return None if found is None else seconds(now_ns - found[1])
 
     def ages(self, now_ns: int) -> dict[str, Value]:
-        """Return the age [s] of each kind, for the feedback's ``native``."""
+        """Return the age of each kind of message [s] for the feedback's ``native``."""
         newest = self._newest
         return {name: round(seconds(now_ns - newest[kind][1]), 3) for kind, name in _AGED.items() if kind in newest}
 
@@ -125,7 +125,7 @@ class Telemetry:
         return int(heartbeat[0].custom_mode)
 
     def armed(self) -> bool:
-        """Return whether it is armed, by the newest heartbeat."""
+        """Return whether the vehicle is armed according to the newest heartbeat."""
         heartbeat = self._newest.get("HEARTBEAT")
         return heartbeat is not None and bool(heartbeat[0].base_mode & _ARMED)
 
@@ -135,7 +135,7 @@ class Telemetry:
         return 0 if heartbeat is None else int(heartbeat[0].system_status)
 
     def landed(self, now_ns: int, max_age_s: float = LANDED_S) -> Landed:
-        """Return whether it reports to be on the ground; unknown if the report is too old."""
+        """Return whether the vehicle reports that it is on the ground; unknown if the report is too old."""
         message = self.newest("EXTENDED_SYS_STATE", now_ns, max_age_s)
         return Landed.UNKNOWN if message is None else _LANDED.get(message.landed_state, Landed.UNKNOWN)
 
@@ -155,17 +155,17 @@ class Telemetry:
         )
 
     def attitude(self, now_ns: int) -> Vector | None:
-        """Return roll (right side down), pitch (nose up) and yaw (clockwise from north) [rad]."""
+        """Return roll (positive right side down), pitch (positive nose up) and yaw (clockwise from north) [rad]."""
         message = self.newest("ATTITUDE", now_ns, FLOWING_S)
         return None if message is None else finite(message.roll, message.pitch, message.yaw)
 
     def position(self, now_ns: int) -> Vector | None:
-        """Return north, east, down from the origin [m]."""
+        """Return the position north, east, down from the origin [m]."""
         message = self.newest("LOCAL_POSITION_NED", now_ns, FLOWING_S)
         return None if message is None else finite(message.x, message.y, message.z)
 
     def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
-        """Return the origin of its axes on the earth; None without a 3-D satellite fix or either position.
+        """Return where on Earth the origin of its axes is; None without a 3-D satellite fix or either position.
 
         Without a fix, an autopilot's origin may be arbitrary, as for motion capture.
         """
@@ -185,7 +185,7 @@ class Telemetry:
         return None if message is None else (message.vx / 100.0, message.vy / 100.0, message.vz / 100.0)
 
     def altitude_m(self, position: Vector | None, now_ns: int) -> float | None:
-        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin."""
+        """Return the height above the ground from a downward sensor or, failing that, above home or the origin [m]."""
         for sensor in self.instances("DISTANCE_SENSOR", now_ns, FLOWING_S):
             if sensor.orientation == _DOWN and _in_range(sensor):
                 return float(sensor.current_distance) / 100.0
@@ -200,7 +200,7 @@ class Telemetry:
         return None if message is None else message.alt / 1000.0
 
     def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
-        """Return the vehicle's state; ``ready``: whether it can be armed, None: unknown."""
+        """Return the vehicle's state; ``ready`` says whether it can be armed, None if unknown."""
         attitude, position = self.attitude(now_ns), self.position(now_ns)
         return VehicleState(
             mode=mode,
@@ -219,10 +219,10 @@ class Telemetry:
         )
 
 
-_ARMED: Final = int(ModeFlag.ARMED)  # a plain int: IntFlag operations cost too much many times a second
+_ARMED: Final = int(ModeFlag.ARMED)  # a plain int, because IntFlag operations are too expensive at this rate
 _LANDED: Final = {int(each): each for each in Landed}
 _DOWN: Final = 25  #: MAV_SENSOR_ROTATION_PITCH_270
-_APART_S: Final = 0.5  #: positions further apart in time are not paired
+_APART_S: Final = 0.5  #: positions further apart in time than this are not paired
 _AGED: Final = {
     kind: f"mavlink.age.{kind.lower()}"
     for kind in (
@@ -238,7 +238,7 @@ _AGED: Final = {
 
 
 def _at_the_same_time(local: Message, world: Message) -> tuple[Vector, Message] | None:
-    """Return a local position [m], moved along its velocity to the time of a place on earth, and that place."""
+    """Extrapolate a local position [m] to the time of a position on Earth; return both."""
     later_s = (world.time_boot_ms - local.time_boot_ms) / 1000.0
     if abs(later_s) > _APART_S:
         return None
@@ -251,19 +251,19 @@ def _in_range(sensor: Message) -> bool:
 
 
 def finite(x: float, y: float, z: float) -> Vector | None:
-    """Return the three numbers, or None if one is not finite."""
+    """Return the three numbers, or None if any of them is not finite."""
     return (x, y, z) if math.isfinite(x) and math.isfinite(y) and math.isfinite(z) else None
 
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 _UNKNOWN_16: Final = 0xFFFF
-_OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION: avionics and payload batteries
+_OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION of avionics and payload batteries
 
 
 def feedback_of(
     telemetry: Telemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state in our units and axes. Values that are not current or not finite are None."""
+    """Return the vehicle's state in our units and axes. Values that are outdated or not finite are None."""
     attitude = telemetry.attitude(now_ns)
     position = telemetry.position(now_ns)
     roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
@@ -285,7 +285,7 @@ def feedback_of(
 
 
 def _turned_over(attitude: Vector) -> Vector:
-    """Return roll (right side down), pitch (nose down) and yaw (counter-clockwise from east) [rad]."""
+    """Convert to roll (positive right side down), pitch (positive nose down) and yaw (counter-clockwise from east)."""
     roll, pitch, yaw = attitude
     return math.remainder(roll, math.tau), 0.0 - math.remainder(pitch, math.tau), yaw_between(yaw)
 
@@ -319,7 +319,7 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
 
 def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
     status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
-    # Of several batteries use the lowest-numbered, and no other while it is silent: their charges differ.
+    # Use the lowest-numbered battery, and no other even if it falls silent, because their charges differ.
     batteries = telemetry.instances("BATTERY_STATUS", now_ns)
     first = next((each for each in batteries if each.battery_function not in _OTHERS), None)
     if first not in telemetry.instances("BATTERY_STATUS", now_ns, SLOW_S):
@@ -351,7 +351,7 @@ def _native(telemetry: Telemetry, now_ns: int) -> dict[str, Value]:
 
 
 def _geodetic(message: Message) -> dict[str, Value]:
-    """Return degrees, and metres above mean sea level."""
+    """Return latitude and longitude in degrees, and altitude above mean sea level in metres."""
     return {
         "gps.latitude_deg": message.lat / 1e7,
         "gps.longitude_deg": message.lon / 1e7,
@@ -360,21 +360,21 @@ def _geodetic(message: Message) -> dict[str, Value]:
 
 
 DEBUG: Final = 7
-GOOD_FIX: Final = 3  #: a position in three dimensions
+GOOD_FIX: Final = 3  #: fix type of a three-dimensional position
 _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
 _PLACE: Final = 0x10 | 0x08
 _LOST: Final = 0x80
-_RISEN_NS: Final = nanoseconds(1.5)  #: after lift-off, time for a report from the air: a PX4 sends one a second
+_RISEN_NS: Final = nanoseconds(1.5)  #: time allowed after lift-off for a report from the air (PX4 sends one per second)
 
 
 class HealthMonitor:
-    """Reports each change of the vehicle's health once, and the vehicle's own texts."""
+    """Reports each change in the vehicle's health once, and the vehicle's own texts."""
 
     def __init__(self) -> None:
         self._texts = Texts()
         self._reported: dict[str, bool] = {}
-        self._reasons: set[str] = set()  # reasons why it can't be armed that were reported while it boots
+        self._reasons: set[str] = set()  # reasons for refusing to arm, already reported during this boot
         self._airborne_ns: int | None = None  # when it took off
 
     @property
@@ -383,9 +383,9 @@ class HealthMonitor:
         return "was_ready" in self._reported
 
     def on_text(self, message: Message, *, quiet: bool = False) -> list[VehicleEvent]:
-        """Handle a ``STATUSTEXT``; return complete texts, with reasons for not arming marked as such.
+        """Handle a ``STATUSTEXT``; return complete texts, with reasons for refusing to arm marked as such.
 
-        While the vehicle boots (``quiet``) it repeats such reasons; each is reported once.
+        While the vehicle boots (``quiet``), it repeats these reasons, but each is reported only once.
         """
         events = []
         for severity, text in self._texts.on_message(message):
@@ -419,7 +419,7 @@ class HealthMonitor:
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
-                # A PX4 on the ground reports that it assumes a constant position; in the air that means it is lost.
+                # PX4 reports a constant position while on the ground; in the air that means the position is lost.
                 counts = kind != "ESTIMATOR_STATUS" or risen
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
                 events += self._changed(

@@ -1,1 +1,1 @@
-"""``msp://tcp:HOST:PORT`` and ``msp:///dev/ttyACM0``: Betaflight and INAV, by the MultiWii serial protocol."""
+"""``msp://`` addresses: Betaflight and INAV, through the MultiWii serial protocol over TCP or a serial port."""

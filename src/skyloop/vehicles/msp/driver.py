@@ -1,4 +1,4 @@
-"""The driver for ``msp://`` addresses, and its connection to the flight controller, reopened after every loss."""
+"""The driver for ``msp://`` addresses, and its link to the flight controller, reopened whenever it is lost."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ ACTIONS: Final = frozenset({"idle", "attitude", "emergency_stop", "reset_emergen
 class MspDriver(Driver):
     """A flight controller with Betaflight or INAV. ``docs/msp.md`` lists its options, parameters, events and telemetry.
 
-    It accepts attitudes with a climb rate; take-off, landing, hovering and velocities come from the proxy's software
-    autopilot.
+    The driver accepts attitudes with a climb rate. Take-off, landing, hovering and velocities are provided by the
+    proxy's software autopilot.
     """
 
     def __init__(self, uri: VehicleUri) -> None:
@@ -47,10 +47,10 @@ class MspDriver(Driver):
     def _open(self, sink: Sink) -> None:
         if self.options.serial:
             try:
-                import serial  # noqa: F401  the link's thread imports it again whenever it opens the port
+                import serial  # noqa: F401  fails now if it is missing; the link's thread imports it to open the port
             except ImportError as error:
                 raise MissingExtraError(f"{self.uri}", EXTRA, cause=str(error)) from error
-        known = SetpointController(self.options.override)  # keeps settings and learnt values, nothing else
+        known = SetpointController(self.options.override)  # only to keep settings and learnt values
         known.limits, known.gains, known.given_aux = (
             self._setpoints.limits,
             self._setpoints.gains,
@@ -73,23 +73,23 @@ class MspDriver(Driver):
         return self._opened().command(action)
 
     def check(self, action: AnyAction) -> None:
-        """Refuse a take-off if the flight controller can't be armed, else let the next climb start it."""
+        """Refuse a take-off if the flight controller can't be armed; otherwise let the next climb start it."""
         if isinstance(action, Takeoff):
             why = self._opened().ask_takeoff()
             if why:
                 raise DriverError(why)
 
     def left_to(self) -> str:
-        """Return whether the pilot flies through the receiver."""
+        """Return ``RECEIVER`` while the pilot is flying with a receiver, otherwise an empty string."""
         link = self._link
         return "" if link is None else link.session.setpoints.left_to
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """Handle an external pose: velocity, height and climb come from it."""
+        """Handle an external pose, from which velocity, height and climb are taken."""
         self._opened().pose(pose)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return diagnostics of the flight controller's settings and state."""
+        """Return diagnostics about the flight controller's settings and state."""
         link = self._opened()
         with link.lock:
             return link.session.diagnose()
@@ -122,7 +122,7 @@ EXTRA: Final = "msp"
 
 
 class MspLink(ConnectionLink[MspSession, ByteStream]):
-    """The link's thread: keeps the connection open and serves the session."""
+    """The link to the flight controller: its thread keeps the connection open and serves the session."""
 
     RETRY_NS = nanoseconds(0.25)
 
@@ -136,12 +136,12 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def pose(self, pose: ExternalPose) -> None:
-        """Handle an external pose. Any thread. See :meth:`MspSession.on_pose`."""
+        """Handle an external pose; see :meth:`MspSession.on_pose`. May be called from any thread."""
         with self.lock:
             self.session.on_pose(pose, self._clock())
 
     def ask_takeoff(self) -> str:
-        """See :meth:`MspSession.ask_takeoff`. Any thread."""
+        """Request a take-off; see :meth:`MspSession.ask_takeoff`. May be called from any thread."""
         with self.lock:
             return self.session.ask_takeoff(self._clock())
 
@@ -166,7 +166,7 @@ class MspLink(ConnectionLink[MspSession, ByteStream]):
         if self._connection is None or self._broken or not data:
             return
         try:
-            for frame in whole_frames(data):  # a full port cuts at most one frame and delays none behind it
+            for frame in whole_frames(data):  # if the port is full, at most one frame is truncated and none is delayed
                 self._connection.write(frame, Rank.STOP if self.session.urgent else Rank.SETPOINT)
         except OSError as error:
             self._on_broken(error, now_ns)

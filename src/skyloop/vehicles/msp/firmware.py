@@ -1,6 +1,6 @@
-"""A flight controller's setup: its switches, its sticks, and whether MSP may fly it. Pure.
+"""A flight controller's setup: its switches, its sticks, and whether it may be flown over MSP. Pure.
 
-:class:`Identification` reads it question by question.
+:class:`Identification` reads the setup, request by request.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ from skyloop.vehicles.msp.wire.messages import (
 )
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
-LEAST_AUX: Final = 4  #: AUX channels that are always sent beside the sticks
-MOST_AUX: Final = 14  #: AUX channels of SET_RAW_RC
-USUAL_AUX_US: Final = 1000  #: an AUX channel that nothing needs
-_ARM_NUMBER: Final = 0  #: in both firmwares
-LONG_DELAY_S: Final = 2.0  #: a failsafe that begins later gets a warning
-CURVED_API: Final = (1, 46)  #: from Betaflight 4.5 on, a stick's lean follows the curve of its rates
+LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
+MOST_AUX: Final = 14  #: number of AUX channels that SET_RAW_RC can hold
+USUAL_AUX_US: Final = 1000  #: pulse width of an AUX channel that no mode needs
+_ARM_NUMBER: Final = 0  #: permanent number of the ARM mode in both firmwares
+LONG_DELAY_S: Final = 2.0  #: a failsafe that starts later than this causes a warning
+CURVED_API: Final = (1, 46)  #: since this version (Betaflight 4.5), the lean for a stick follows the curve of its rates
 _PROCEDURES: Final = {
     BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
     INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
@@ -60,23 +60,23 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """A flight controller's settings. None: not reported."""
+    """A flight controller's settings; None for those not reported."""
 
     identity: Identity = field(default_factory=Identity)
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
-    sticks_known: bool = False  #: whether that was reported; else it is a guess
+    sticks_known: bool = False  #: whether those positions were reported and are not a guess
     rx: RxConfig = field(default_factory=RxConfig)
     failsafe: FailsafeConfig | None = None
     on_loss: tuple[tuple[int, int], ...] = ()
     features: int | None = None
     rates: Rates | None = None
     inav_yaw_rate_deg_s: float | None = None
-    inav_expo: tuple[int, int] = (0, 0)  #: of roll and pitch, and of yaw
+    inav_expo: tuple[int, int] = (0, 0)  #: INAV's expo for roll and pitch, and for yaw
     angle_limit_deg: float | None = None
     cells: CellVoltages = field(default_factory=CellVoltages)
-    receiver_is_msp: bool | None = None  #: INAV only
+    receiver_is_msp: bool | None = None  #: whether MSP is the receiver; reported only by INAV
 
     # Modes -------------------------------------------------------------------------------------------------------
 
@@ -93,30 +93,30 @@ class Setup:
         return any(name in names for name in self.mode_names(active))
 
     def ranges_of(self, *names: str) -> list[ModeRange]:
-        """Return the ranges of modes."""
+        """Return the ranges that activate these modes."""
         numbers = {self.number(name) for name in names}
         return [each for each in self.ranges if each.mode in numbers]
 
     @property
     def arm_number(self) -> int | None:
-        """The permanent number of the mode that arms; without mode names, every version's usual number."""
+        """The permanent number of the arming mode; if mode names are unknown, the number used in every version."""
         return self.number(ARM) if any(name for _, name in self.boxes) else _ARM_NUMBER
 
     @property
     def arm_ranges(self) -> list[ModeRange]:
-        """The ranges of the arm switch."""
+        """The ranges that arm the vehicle."""
         return [each for each in self.ranges if each.mode == self.arm_number]
 
     @property
     def aux_channels(self) -> int:
-        """The number of AUX channels to send. The firmware would choose the value of any missing one itself."""
+        """The number of AUX channels to send; the firmware itself would choose the value of any missing one."""
         used = max((each.aux + 1 for each in self.ranges), default=0)
         return min(MOST_AUX, max(LEAST_AUX, used))
 
     def aux_us(self, *, arm: bool, given: Mapping[int, int]) -> list[int]:
-        """Return AUX channels [µs] that switch on the wanted modes and as few others as possible.
+        """Return AUX channels [µs] that activate the required modes and as few others as possible.
 
-        ``given``: channels set by a person, counted from 0, except the arm switch's.
+        ``given`` has the channels set by the user, counted from 0, except for the arm switch.
         """
         wanted = {self.number(ANGLE)}
         if arm:
@@ -140,7 +140,7 @@ class Setup:
         def cost(width: int) -> tuple[int, int, int, int]:
             on = {each.mode for each in ranges if each.low_us <= width < each.high_us}
             asked = {each.mode for each in ranges} & wanted
-            # The arm switch comes first, then wanted modes, then unwanted ones.
+            # Priorities: first the arm switch, then the required modes, then avoiding other modes.
             return (
                 int((arm in on) is not (arm in asked)),
                 len(asked - on),
@@ -154,11 +154,11 @@ class Setup:
 
     @property
     def full_tilt_rad(self) -> float | None:
-        """Return the lean of a full stick; None if unknown."""
+        """Return the lean at full stick; None if unknown."""
         return None if self.angle_limit_deg is None else math.radians(self.angle_limit_deg)
 
     def tilt_curves(self) -> tuple[Curve, Curve]:
-        """Return the share of the full tilt by roll and pitch stick."""
+        """Return the curves from the roll and pitch sticks to a fraction of the full tilt."""
         if self.identity.variant == INAV:
             curve = inav_curve(self.inav_expo[0], 1.0)
             return curve, curve
@@ -168,7 +168,7 @@ class Setup:
         return share_of(rate_curve(kind, self.rates.roll)), share_of(rate_curve(kind, self.rates.pitch))
 
     def yaw_curve(self) -> Curve:
-        """Return the yaw rate [rad/s] by stick."""
+        """Return the curve from the stick to the yaw rate [rad/s]."""
         if self.identity.variant == INAV:
             return inav_curve(self.inav_expo[1], math.radians(self.inav_yaw_rate_deg_s or 200.0))
         if self.rates is None:
@@ -179,7 +179,7 @@ class Setup:
     # Fitness for flight ------------------------------------------------------------------------------------------
 
     def diagnose(self, *, override: bool) -> list[Diagnostic]:
-        """Return the settings' consequences for a flight. Severe ones prevent arming."""
+        """Return diagnostics about what the settings mean for a flight. Severe ones prevent arming."""
         name = Diagnostic("firmware", True, str(self.identity))
         return [name, *self._modes(override), *self._receiver(override), *self._failsafe(override)]
 
@@ -240,7 +240,7 @@ class Setup:
         return found + self._held()
 
     def _held(self) -> list[Diagnostic]:
-        """Judge the stick values in force between the loss of the receiver and the failsafe."""
+        """Check the stick values that apply between the loss of the receiver and the failsafe."""
         if self.identity.variant == BETAFLIGHT and len(self.on_loss) < len(USUAL_MAP):
             unknown = "its reaction to missing sticks before the failsafe is unknown"
             return [Diagnostic("held sticks", False, unknown, _DOCS, severe=True)]
@@ -261,26 +261,26 @@ def _straight(stick: float) -> float:
 
 
 def hindrances(diagnostics: list[Diagnostic]) -> str:
-    """Return why it must not be armed, with advice; empty if nothing is severe."""
+    """Return why the vehicle must not be armed, with advice; empty if no diagnostic is severe."""
     bad = [each for each in diagnostics if each.severe and not each.good]
     return "; ".join(f"{each.detail} ({each.advice})" if each.advice else each.detail for each in bad)
 
 
-_INAV_TUNING: Final = 7  # bytes of RC_TUNING up to the yaw rate
-_MSP_RECEIVER: Final = 2  # INAV's receiver_type
+_INAV_TUNING: Final = 7  # number of bytes in RC_TUNING up to the yaw rate
+_MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
 class Identification:
-    """Requests everything in :class:`Setup`.
+    """Requests everything that :class:`Setup` contains.
 
     Args:
         questions: The queue of requests.
-        done: Called at the end; the setup's variant is empty if the flight controller did not identify itself.
+        done: Called at the end. The setup's variant is empty if the flight controller did not identify itself.
     """
 
     def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:
         self.setup = Setup()
-        self.missing: list[str] = []  #: settings needed to send any sticks that could not be read
+        self.missing: list[str] = []  #: unreadable settings that are needed before any sticks can be sent
         self._questions = questions
         self._done = done
         for function, handler in (
@@ -308,7 +308,7 @@ class Identification:
             self._identify(board=msp.board(payload))
 
     def ask_settings(self) -> None:
-        """Request the settings, once the firmware is known."""
+        """Request the settings after the firmware has been identified."""
         ask = self._questions.ask
         for what, function, handler in (
             ("numbers of its modes", Function.BOXIDS, self._on_box_numbers),
@@ -355,7 +355,7 @@ class Identification:
         if self.setup.identity.variant == BETAFLIGHT:
             self.setup = replace(self.setup, rates=betaflight_rates(payload))
         elif len(payload) >= _INAV_TUNING + 4:
-            # INAV: rate, expo of roll and pitch, rates of roll, pitch and yaw in 10 degrees/s, …, expo of yaw
+            # INAV: rate, expo for roll and pitch, rates of roll, pitch and yaw in 10 degrees/s, …, expo for yaw
             expo = payload[1], payload[10]
             self.setup = replace(self.setup, inav_yaw_rate_deg_s=payload[4] * 10.0, inav_expo=expo)
 
@@ -384,7 +384,7 @@ class Identification:
 def _reading(
     handler: Callable[[bytes], None], otherwise: Callable[[], None] = lambda: None
 ) -> Callable[[bytes | None], None]:
-    """Return a handler that calls ``otherwise`` for missing or unreadable replies."""
+    """Return a handler that calls ``otherwise`` if the reply is missing or unreadable."""
 
     def read(payload: bytes | None) -> None:
         if payload is not None:

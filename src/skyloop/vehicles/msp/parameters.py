@@ -1,6 +1,6 @@
-"""Options of an ``msp://`` address, and the driver's parameters (limits, scales, gains, AUX). Pure.
+"""Options in an ``msp://`` address, and the driver's parameters (limits, scales, gains, AUX). Pure.
 
-``docs/msp.md`` has both as tables.
+``docs/msp.md`` lists both.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ _EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200 or msp://tcp:12
 
 @dataclass(frozen=True, slots=True)
 class MspOptions:
-    """A parsed address. Either ``port`` is a TCP port of the host ``place``, or ``place`` is a serial port's path."""
+    """A parsed address. Either ``port`` is a TCP port on the host ``place``, or ``place`` is a serial port's path."""
 
     place: str
     port: int | None = None
     baud: int = DEFAULT_BAUD
-    rate_hz: float = DEFAULT_RATE_HZ  #: of the sticks
-    override: bool = False  #: a pilot keeps a real receiver, whose switch hands over the sticks
+    rate_hz: float = DEFAULT_RATE_HZ  #: rate at which sticks are sent
+    override: bool = False  #: whether a pilot keeps a real receiver, with a switch that hands over the sticks
 
     @property
     def serial(self) -> bool:
-        """Whether it is a serial port."""
+        """Whether the address is a serial port."""
         return self.port is None
 
     def __str__(self) -> str:
@@ -58,7 +58,7 @@ def options_of(uri: VehicleUri) -> MspOptions:
     return MspOptions(*found, rate_hz=rate, override=override)
 
 
-AUTOMATIC: Final = 0  #: value of an AUX channel: as the modes need it
+AUTOMATIC: Final = 0  #: value of an AUX channel that is to be set as the modes require
 _LIMITS: Final = (
     ("tilt", 0.02, 1.0, "rad", "maximum roll and pitch together, up to a full stick"),
     ("climb", 0.05, 10.0, "m/s", "maximum climb and descent"),
@@ -84,7 +84,7 @@ class DriverParameters:
     """The driver's own parameters.
 
     Args:
-        setpoints: The controller they belong to. The caller holds the lock that guards it.
+        setpoints: The controller that uses them. The caller must hold the lock that protects it.
     """
 
     def __init__(self, setpoints: SetpointController) -> None:
@@ -95,7 +95,7 @@ class DriverParameters:
         return [entry.parameter for entry in self._entries().values()]
 
     def write(self, name: str, value: Value) -> Value:
-        """Write a parameter and return the value in force; raise for an unknown name or an invalid value."""
+        """Write a parameter and return the value in force; raise an error for an unknown name or an invalid value."""
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)

@@ -1,4 +1,4 @@
-"""The protocol of one flight controller: replies in, requests and sticks out. No socket, no clock."""
+"""The protocol with one flight controller: replies in, requests and sticks out. No sockets, no clock."""
 
 from __future__ import annotations
 
@@ -30,31 +30,31 @@ from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
-DEGRADED_NS: Final = nanoseconds(0.4)  #: silence until the link is degraded
-LOST_NS: Final = nanoseconds(1.0)  #: silence until it is lost
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller without a reply by then is reported as lost
+DEGRADED_NS: Final = nanoseconds(0.4)  #: silence after which the link is degraded
+LOST_NS: Final = nanoseconds(1.0)  #: silence after which the link is lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a flight controller that has not replied by then is reported as lost
 IDLE_NS: Final = nanoseconds(0.05)  #: longest time between polls
-MOST_STICKS: Final = 4  #: stick frames that may be unacknowledged
-STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older unacknowledged frame counts as lost once a newer reply arrives
-LAST_STICKS: Final = 3  #: final stick frames, level or disarming, to a flight controller that has gone silent
+MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
+STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an unacknowledged frame older than this is lost once a newer reply arrives
+LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
-UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, the arm switch must be seen off before it arms
-LEAST_STICKS_HZ: Final = 25.0  #: a lower rate gets a warning
-BUNDLING_API: Final = (1, 42)  #: Betaflight's version that introduced MULTIPLE
-_MODES_AT: Final = 6  # offset in STATUS
-WAKING_NS: Final = nanoseconds(8.0)  #: temporary conditions keep it from arming for no longer after it is switched on
-AGAIN_NS: Final = nanoseconds(1.0)  #: between attempts to identify it
+UNTOLD_NS: Final = nanoseconds(0.5)  #: after this long without sticks, it arms only once the arm switch has been off
+LEAST_STICKS_HZ: Final = 25.0  #: a lower rate causes a warning
+BUNDLING_API: Final = (1, 42)  #: Betaflight's API version that introduced MULTIPLE
+_MODES_AT: Final = 6  # offset of the modes in STATUS
+WAKING_NS: Final = nanoseconds(8.0)  #: longest time after power-on in which temporary conditions prevent arming
+AGAIN_NS: Final = nanoseconds(1.0)  #: time between attempts to identify the flight controller
 
 ATTITUDE_HZ: Final = 50.0
 ALTITUDE_HZ: Final = 25.0
 STATUS_HZ: Final = 20.0
 GPS_HZ: Final = 10.0
 BATTERY_HZ: Final = 2.0
-PILOT_HZ: Final = 10.0  #: the pilot's sticks, with override
+PILOT_HZ: Final = 10.0  #: rate at which the pilot's sticks are read with ``override``
 
 
 class MspSession(VehicleSession):
-    """The protocol of one opened driver with its flight controller. Not thread-safe."""
+    """The protocol between an open driver and its flight controller. Not thread-safe."""
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
@@ -63,31 +63,31 @@ class MspSession(VehicleSession):
         self.options = options
         self.setpoints = setpoints or SetpointController(options.override)
         self.motion = MotionEstimate()
-        self.setup: Setup | None = None  #: None until read
+        self.setup: Setup | None = None  #: None until it has been read
         self.reported = Reported()
-        self.sticks_hz: float | None = None  #: acknowledged
-        self.unknown = 0  #: frames that answer nothing
-        self.urgent = False  #: the latest command is an emergency stop
+        self.sticks_hz: float | None = None  #: rate of acknowledged stick frames
+        self.unknown = 0  #: number of frames that do not answer any request
+        self.urgent = False  #: whether the latest command is an emergency stop
         self._parser = Parser()
         self._questions = Questions()
         self._identification: Identification | None = None
         self._telemetry: Telemetry | None = None
-        self._known = False  # it was asked to identify itself since it was found
+        self._known = False  # whether identification has been completed since it was found
         self._refused_variant = ""
-        self._unread = ""  # settings that it did not report
-        self._part = Setup()  # the settings read so far, for a stop
-        self._armed: bool | None = None  # as reported before the settings; None: not reported
-        self._stop_waits = False  # until it is known whether it is armed
+        self._unread = ""  # settings that were not reported
+        self._part = Setup()  # the settings read so far, which allow a stop
+        self._armed: bool | None = None  # as reported before the settings were read; None if not reported
+        self._stop_waits = False  # whether a stop waits until it is known whether it is armed
         self._asked_ns: int | None = None
         self._sticks_due_ns = now_ns
-        self._sticks: deque[int] = deque()  # send times of unacknowledged frames
-        self._last_sticks = 0  # final frames still to send to a silent one
+        self._sticks: deque[int] = deque()  # when each unacknowledged frame was sent
+        self._last_sticks = 0  # number of final frames still to be sent to a silent flight controller
         self._acknowledged = 0
         self._counted_ns = now_ns
         self._slow = False
-        self._wakes_until_ns: int | None = None  # None: its state is unknown; 0: it has been ready
-        self._woke = False  # it was still booting at the last check
-        self._may_steer = False  # its state is known: our sticks won't disarm it in flight
+        self._wakes_until_ns: int | None = None  # None if its state is unknown; 0 if it has been ready
+        self._woke = False  # whether it was still starting up at the last check
+        self._may_steer = False  # whether its state is known, so that our sticks won't disarm it in flight
         self._armed_throttle: float | None = None
         self._set_link_state(LinkState.CONNECTING, f"waiting for the flight controller on {options}")
 
@@ -101,7 +101,7 @@ class MspSession(VehicleSession):
         return applied
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start it; return why the take-off would fail, empty if it may succeed."""
+        """Let the next climb start a take-off; return why that would fail, empty if it may succeed."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         return self.setpoints.ask_takeoff(now_ns)
 
@@ -114,9 +114,9 @@ class MspSession(VehicleSession):
         self._questions.clear()
 
     def final_bytes(self, now_ns: int) -> bytes:
-        """Return the final bytes before the connection closes: they disarm a vehicle on the ground.
+        """Return the final bytes to send before the connection closes, which disarm a vehicle on the ground.
 
-        A flying one gets nothing: its failsafe is set up for the silence that follows.
+        A flying vehicle is sent nothing: its failsafe is configured to handle the silence that follows.
         """
         if not self._may_steer or self.options.override or self.setpoints.phase is Phase.FLYING:
             return b""
@@ -124,7 +124,7 @@ class MspSession(VehicleSession):
         return self._stick_frame(now_ns)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return diagnostics of its settings and state."""
+        """Return diagnostics about the flight controller's settings and state."""
         if self.setup is None:
             unread = "the flight controller's settings have not been read"
             return [Diagnostic("settings", False, unread, "wait until its link is up, then check again", severe=True)]
@@ -141,13 +141,13 @@ class MspSession(VehicleSession):
     # From the connection -------------------------------------------------------------------------------------------
 
     def connected(self) -> None:
-        """Handle a new connection: no reply from an older one follows."""
+        """Handle a new connection, on which no replies to older requests can arrive."""
         self._parser.reset()
         self._sticks.clear()
         self.due_ns = 0
 
     def receive(self, data: bytes, now_ns: int) -> None:
-        """Handle received bytes. Never raises, whatever they contain."""
+        """Handle received bytes. Never raises, whatever the content."""
         for frame in self._parser.feed(data):
             if frame.direction is not Direction.REQUEST:
                 self._on_frame(frame, now_ns)
@@ -173,7 +173,7 @@ class MspSession(VehicleSession):
                 assert self._telemetry is not None
                 self._telemetry.drop(function)
                 continue
-            with suppress(DecodeError):  # damaged despite a matching checksum
+            with suppress(DecodeError):  # damaged in spite of a matching checksum
                 self._on_state(function, payload, now_ns)
 
     def _on_state(self, function: int, payload: bytes, now_ns: int) -> None:
@@ -209,7 +209,7 @@ class MspSession(VehicleSession):
         overridden = self.setup.is_active(status.modes, *MSP_OVERRIDE)
         if not self._may_steer:
             if armed and not self.options.override and self._armed_throttle is None:
-                return  # send a flying vehicle nothing before its throttle is known
+                return  # a flying vehicle must not be sent anything until its throttle is known
             self._may_steer = True
             if armed and self._armed_throttle is not None and not self.options.override:
                 self.setpoints.report = Report(armed, names, overridden)
@@ -242,7 +242,7 @@ class MspSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def _wakes_up(self, now_ns: int) -> bool:
-        """Return whether it was found just now and only temporary conditions prevent arming."""
+        """Return whether it was found recently and only temporary conditions prevent arming."""
         report = self.setpoints.report
         if self._wakes_until_ns is None:
             self._wakes_until_ns = now_ns + WAKING_NS
@@ -285,7 +285,7 @@ class MspSession(VehicleSession):
     # Time ----------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> bytes:
-        """Return the bytes due now."""
+        """Return the bytes to send now."""
         self._check_silence(now_ns)
         made = self._due_sticks(now_ns)
         if self._telemetry is not None:
@@ -327,20 +327,20 @@ class MspSession(VehicleSession):
     def _may_stop_unread(self, now_ns: int) -> bool:
         """Return whether a stop can be sent before all settings are read without arming a vehicle on the ground.
 
-        If the arm switch is unknown, its channel is low, and a low channel arms some vehicles.
+        If the arm switch's range is unknown, its channel is sent low, and with some vehicles a low channel arms.
         """
         if self._refused_variant or self._part.ranges_of(ARM):
             return not self._refused_variant
-        if self._armed is not None or self.options.override:  # a pilot's receiver continues
+        if self._armed is not None or self.options.override:  # with override, the pilot's receiver stays in use
             return bool(self._armed)
         return now_ns - self._opened_ns >= UNTOLD_NS
 
     def _holds_back(self, now_ns: int) -> bool:
-        """Return whether new sticks might wait in a buffer and be obeyed late, or belong to another pilot.
+        """Return whether to withhold sticks, which might wait in a buffer and be obeyed late, or be another pilot's.
 
-        A paused flight controller resumes as if no time had passed and obeys everything that arrived meanwhile; only
-        its replies show that it reads. Until the link is lost, a few frames hold off the failsafe of one that is only
-        inaudible.
+        A paused flight controller resumes as if no time had passed and obeys everything that arrived during the pause;
+        only its replies show that it is reading. Until the link is lost, a few frames are sent anyway, to hold off the
+        failsafe if only its replies are lost.
         """
         heard_ns = self._received_ns
         while self._sticks and self._sticks[0] < (heard_ns or 0) and now_ns - self._sticks[0] >= STICKS_LOST_NS:
@@ -356,7 +356,7 @@ class MspSession(VehicleSession):
         setpoints = self.setpoints
         active, urgent = setpoints.stop.active, setpoints.step_stop(now_ns)
         if active and not setpoints.stop.active and not setpoints.receiving:
-            # Adopt a vehicle found flying again: don't disarm it by a stop from before.
+            # Adopt a vehicle that is found flying again, rather than disarm it by an old stop.
             self._may_steer, self._armed_throttle = False, None
             setpoints.report = Report()
         return urgent
@@ -365,7 +365,7 @@ class MspSession(VehicleSession):
         return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
 
     def _count(self, now_ns: int) -> None:
-        """Measure the rate of acknowledged sticks."""
+        """Measure the rate of acknowledged stick frames."""
         since_ns = now_ns - self._counted_ns
         if since_ns < COUNT_NS or self.setup is None:
             return
@@ -378,7 +378,7 @@ class MspSession(VehicleSession):
         self._slow = slow
 
     def _begin(self, now_ns: int) -> None:
-        """Start to identify it, unless requests are already pending."""
+        """Start identifying the flight controller, unless requests are already pending."""
         if not self._questions.idle or (self._asked_ns is not None and now_ns - self._asked_ns < AGAIN_NS):
             return
         self._asked_ns = now_ns
@@ -388,7 +388,7 @@ class MspSession(VehicleSession):
 
     def _on_armed(self, status: bytes | None) -> None:
         if status is not None and len(status) > _MODES_AT:
-            self._armed = bool(status[_MODES_AT] & 1)  # ARM is the first mode in both firmwares
+            self._armed = bool(status[_MODES_AT] & 1)  # ARM is the first mode in both firmwares' status bits
 
     def _on_identity(self, status: bytes | None) -> None:
         self._on_armed(status)
@@ -405,7 +405,7 @@ class MspSession(VehicleSession):
 
     def _on_setup(self, setup: Setup) -> None:
         assert self._identification is not None
-        if self._identification.missing:  # without them, throttle or arm switch would be guesses: ask again
+        if self._identification.missing:  # without them, the throttle or arm switch would be a guess, so ask again
             missing = ", ".join(self._identification.missing)
             if missing != self._unread:
                 text = f"the flight controller did not report the {missing}: asking again before steering it"
@@ -437,7 +437,7 @@ class MspSession(VehicleSession):
         self._telemetry = Telemetry(streams, bundle)
 
     def _keep_part(self) -> None:
-        """Keep the settings read so far, or in an earlier round: they allow at least a stop."""
+        """Keep the settings read so far or in an earlier attempt, which at least allow a stop."""
         if self.setup is not None or self._identification is None:
             return
         found, before = self._identification.setup, self._part
@@ -451,9 +451,9 @@ class MspSession(VehicleSession):
     # Loss ----------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Identify it again, and poll its state meanwhile, so that a flying vehicle is soon steered again.
+        """Start identifying it again while polling its state, so that control of a flying vehicle soon resumes.
 
-        It gets :data:`LAST_STICKS` final frames, then only requests and stops, so that its own failsafe acts.
+        It is sent :data:`LAST_STICKS` final frames, then only requests and stops, so that its own failsafe acts.
         """
         del now_ns
         self._keep_part()

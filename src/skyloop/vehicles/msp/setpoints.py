@@ -1,7 +1,7 @@
-"""Turn set-points into sticks: arming, holding a climb rate, touch-down and disarming. Pure.
+"""Turning set-points into sticks: arming, holding a climb rate, touch-down and disarming. Pure.
 
-The hover throttle is learnt: a take-off raises the throttle slowly until the vehicle lifts off, and a slow integral
-keeps the value right from then on.
+The hover throttle is learnt: during take-off the throttle rises slowly until the vehicle lifts off, and from then on a
+slow integral corrects the value.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, st
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()
 OFF_US: Final = 1000
-SPOOL_PER_S: Final = 0.15  #: rise of the throttle at take-off, share of full per second
-SPOOL_FROM: Final = 0.6  #: share of the hover throttle to start from, if known
-IDLE: Final = 0.05  #: throttle to start from otherwise
-ARM_NS: Final = nanoseconds(6.0)  #: an arming not confirmed by then has failed; Betaflight's BOOTGRACE is 5 s
-NAMED_NS: Final = nanoseconds(0.4)  #: how long an obstacle must last while arming to count as a refusal
+SPOOL_PER_S: Final = 0.15  #: rate at which the throttle rises during take-off, fraction of full throttle per second
+SPOOL_FROM: Final = 0.6  #: fraction of the hover throttle, if known, at which the rise begins
+IDLE: Final = 0.05  #: throttle at which the rise begins if the hover throttle is unknown
+ARM_NS: Final = nanoseconds(6.0)  #: arming has failed if not confirmed by then; Betaflight's BOOTGRACE is 5 s
+NAMED_NS: Final = nanoseconds(0.4)  #: how long a reported obstacle to arming must last to count as a refusal
 REFUSED_NS: Final = nanoseconds(1.0)  #: how long the arm switch stays off after a refusal
 ASKED_NS: Final = nanoseconds(1.0)  #: a requested take-off expires if it has not started by then
-ABORT_NS: Final = nanoseconds(1.0)  #: how long a take-off may be interrupted before it ends
-#: Temporary conditions after connecting or landing: arming waits for them with the arm switch off.
+ABORT_NS: Final = nanoseconds(1.0)  #: longest interruption of a take-off before it is aborted
+#: Temporary conditions after connecting or landing. Arming waits for them to clear, with the arm switch off.
 PASSING: Final = frozenset(
     {
         "RXLOSS",
@@ -47,55 +47,55 @@ PASSING: Final = frozenset(
         ARM_SWITCH,
     }
 )
-SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: beside them in its first words, before it knows how it stands
-LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] that shows it, precise or not
-LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from a sufficient throttle to a visible lift-off, by precise or not
-OTHER: Final = 0.15  #: share by which the learnt throttle may differ from the one at lift-off
-GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a stalled descent has met something by then
-HEADWAY: Final = 0.4  #: share of the requested descent
-STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means not on the ground, by precise or not
-#: Time constant of the climb and height behind lift-off and touch-down [s]. It reduces noise of 0.2 m/s (UWB) to
-#: 0.03 m/s; without it, such noise was never STILL for GROUND_NS. It still tells 0.15 m/s of sinking from the ground.
+SETTLING: Final = frozenset({"ANGLE", "LOAD"})  #: more of them, in its first reports before it has an attitude
+LIFTED: Final = {True: (0.06, 0.15), False: (0.4, 0.4)}  #: height [m] or climb [m/s] at a lift-off, by precision
+LATE_S: Final = {True: 0.35, False: 0.15}  #: delay from sufficient throttle to a visible lift-off, by precision
+OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from the one at lift-off
+GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: a descent stalled this long has met the ground
+HEADWAY: Final = 0.4  #: a descent slower than this fraction of the requested one is stalled
+STILL: Final = {True: 0.1, False: 0.4}  #: faster vertical motion [m/s] means in the air, by whether it is precise
+#: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
+#: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but still shows sinking at 0.15 m/s.
 SMOOTH_S: Final = 0.4
-SINK_PER_S: Final = 0.5  #: throttle reduction once it seems to be on the ground, share per second
+SINK_PER_S: Final = 0.5  #: throttle reduction while it seems to be on the ground, fraction per second
 OFF_BELOW: Final = 0.6  #: share of the hover throttle below which it is on the ground
 #: The same where it seems to stand far above the ground it left: what still falls at this throttle is in the air, even
 #: if its measured motion lags, as that of a simulated world which runs slower than the firmware's clock.
 OFF_HIGH_BELOW: Final = 0.15
 HIGH_M: Final = 0.5
 BLIND: Final = 0.93  #: share of the hover throttle while the climb is unknown: it sinks
-BLIND_NS: Final = nanoseconds(6.0)  #: without a measured climb for this long, it is disarmed
-MOST_LEARNT: Final = 0.9  #: limits of the learnt hover throttle
+BLIND_NS: Final = nanoseconds(6.0)  #: it is disarmed if the climb is unknown for this long
+MOST_LEARNT: Final = 0.9  #: greatest hover throttle that is learnt
 LEAST_LEARNT: Final = 0.05
 LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
-#: Why nothing restarts a vehicle that did not confirm a stop.
+#: Reason given for not restarting a vehicle that did not confirm a stop.
 UNSHOWN: Final = "the motors were stopped, and it is still armed: it can fly again once it reports that it is disarmed"
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of the set-points."""
+    """Limits for set-points."""
 
     tilt: float = 0.35  #: [rad]
     climb: float = 1.0  #: [m/s]
     yaw_rate: float = 1.75  #: [rad/s]
-    throttle: float = 0.85  #: share of full throttle
+    throttle: float = 0.85  #: fraction of full throttle
 
 
 @dataclass(frozen=True, slots=True)
 class Gains:
     """Gains of the climb loop."""
 
-    climb_p: float = 2.5  #: acceleration per climb error [1/s]
+    climb_p: float = 2.5  #: acceleration per unit of climb error [1/s]
     climb_i: float = 1.2  #: learning rate of the hover throttle [1/s²]
 
 
 class Phase(Enum):
-    """Progress of a flight."""
+    """Phases of a flight."""
 
-    STANDING = auto()  #: or flown by a pilot
+    STANDING = auto()  #: on the ground, or being flown by a pilot
     ARMING = auto()
-    SPOOLING = auto()  #: armed, with rising throttle
+    SPOOLING = auto()  #: armed, with the throttle rising
     FLYING = auto()
 
 
@@ -103,58 +103,58 @@ class Phase(Enum):
 class Report:
     """The flight controller's latest report."""
 
-    armed: bool | None = None  #: None: unknown
+    armed: bool | None = None  #: None if unknown
     hindrances: list[str] = field(default_factory=list)
-    overridden: bool = False  #: whether the pilot's switch lets our sticks through
+    overridden: bool = False  #: whether the pilot's switch is letting our sticks through
 
 
 class SetpointController:
-    """Remembers the last set-point and turns it into receiver channels.
+    """Stores the last set-point and turns it into receiver channels.
 
     Args:
-        override: Whether a pilot keeps a real receiver: then only the pilot arms.
+        override: Whether a pilot keeps a real receiver, in which case only the pilot arms.
     """
 
     def __init__(self, override: bool = False) -> None:
         self.limits = Limits()
         self.gains = Gains()
         self.given_aux: dict[int, int] = {}
-        self.full_tilt_rad: float | None = None  #: lean of a full stick, if a person set it
-        self.hover: float | None = None  #: hover throttle, 0 to 1; None: not learnt yet
+        self.full_tilt_rad: float | None = None  #: lean at full stick, if set by the user
+        self.hover: float | None = None  #: hover throttle, 0 to 1; None until it has been learnt
         self.report = Report()
         self.phase = Phase.STANDING
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
-        self._cut = False  # its motors were stopped but it has not confirmed that: it may still fly
+        self._cut = False  # whether its motors were stopped without confirmation, so that it may still be flying
         self._override = override
         self._setup = Setup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
         self._turn: Curve = self._setup.yaw_curve()
-        self._hindrance = "its settings have not been read"  # severe ones
+        self._hindrance = "its settings have not been read"  # why it must not be armed
         self._wanted = LEVEL
         self._motion = Motion()
         self._since_ns = 0  # start of the phase
         self._stepped_ns: int | None = None
-        self._switched = False  # the arm switch is on while arming
+        self._switched = False  # whether the arm switch is on, while arming
         self._named: tuple[list[str], int] | None = None
         self._refused: tuple[str, int] | None = None
         self._abort_ns: int | None = None
         self._still_ns: int | None = None
-        self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested, equally delayed
+        self._smooth_climb = self._smooth_wanted = 0.0  # the measured and the requested climb, with the same delay
         self._smooth_height = 0.0
         self._blind_ns: int | None = None
         self._sink = 1.0
-        self._asked_ns: int | None = None  # when a pending take-off was requested
+        self._asked_ns: int | None = None  # when the pending take-off was requested
         self._events: list[VehicleEvent] = []
 
     def set_up(self, setup: Setup, hindrance: str) -> None:
-        """Set the flight controller's setup and why it must not be armed."""
+        """Set the flight controller's setup, and the reason why it must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
 
     def flight_state(self) -> FlightState:
-        """Return the flight state for feedback."""
+        """Return the flight state to report in feedback."""
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self.report.armed is None or (self._cut and self.report.armed):
@@ -163,12 +163,12 @@ class SetpointController:
 
     @property
     def full_tilt(self) -> float:
-        """The lean of a full stick [rad]."""
+        """The lean at full stick [rad]."""
         return self.full_tilt_rad or self._setup.full_tilt_rad or math.radians(45.0)
 
     @property
     def left_to(self) -> str:
-        """The pilot, while the vehicle flies by the pilot's receiver."""
+        """``RECEIVER`` while the pilot is flying with a receiver, otherwise empty."""
         return "RECEIVER" if self._override and self.report.armed and not self.report.overridden else ""
 
     # Decisions -----------------------------------------------------------------------------------------------------
@@ -181,11 +181,11 @@ class SetpointController:
             now_ns: The present time.
 
         Returns:
-            The action in force, after the limits.
+            The action in force, within the limits.
 
         Raises:
-            DriverError: It is on the ground and can't be armed for this climb, or a reset came while the motors still
-                run.
+            DriverError: The vehicle is on the ground and can't be armed for this climb, or a reset was requested while
+                the motors were still running.
         """
         if isinstance(action, EmergencyStop):
             self.stop.press(now_ns)
@@ -216,13 +216,13 @@ class SetpointController:
             yaw_rate=clamped(action.yaw_rate, min(limits.yaw_rate, self._turn(1.0))),
         )
         if self.phase is Phase.ARMING and self._wanted.climb <= 0:
-            self._enter(Phase.STANDING, now_ns)  # no longer wanted: it must not arm once it can
+            self._enter(Phase.STANDING, now_ns)  # no longer requested, so it must not arm as soon as it can
         if self.phase is Phase.STANDING and self._wanted.climb > 0:
-            self._start(now_ns)  # only a requested take-off lifts a vehicle off the ground, no other set-point
+            self._start(now_ns)  # only a requested take-off, and no other set-point, lifts a vehicle off the ground
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if nothing known prevents it, or it is taking off already."""
+        """Return why it can't take off now; empty if nothing is known to prevent it, or if it is already taking off."""
         if self.phase is not Phase.STANDING:
             return ""
         if self.stop.active:
@@ -246,7 +246,7 @@ class SetpointController:
         return "" if self.report.armed or not names else f"the flight controller refuses to arm: {explained(names)}"
 
     def ask_takeoff(self, now_ns: int) -> str:
-        """Let the next climb start it, unless that is certain to fail; return why it would."""
+        """Let the next climb start a take-off; if that is certain to fail, don't, and return why."""
         why = self.why_not(now_ns)
         self._asked_ns = None if why or self.phase is not Phase.STANDING else now_ns
         return why
@@ -275,7 +275,7 @@ class SetpointController:
     # Reports -------------------------------------------------------------------------------------------------------
 
     def on_report(self, report: Report, now_ns: int) -> None:
-        """Handle the flight controller's report of its state."""
+        """Handle the flight controller's latest report."""
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         self._cut = self._cut and report.armed is not False
@@ -289,7 +289,7 @@ class SetpointController:
                 where = "in flight" if flew else "before it had taken off"
                 why = f": {explained(report.hindrances)}" if report.hindrances else ""
                 text = f"the flight controller disarmed {where}{why}"
-                if heard:  # a take-off in progress must not arm it again; a loss ended any
+                if heard:  # a take-off in progress must not arm it again; after a loss there is none
                     self._refused = text, now_ns
                 self._events.append(message(text, "disarmed", Severity.WARNING, flags=", ".join(report.hindrances)))
         elif self._override and before.overridden and not report.overridden:
@@ -302,13 +302,13 @@ class SetpointController:
                 self._enter(Phase.FLYING, now_ns)
 
     def adopt(self, throttle: float, now_ns: int) -> None:
-        """Continue a vehicle that was found armed, from the last throttle sent, 0 to 1."""
+        """Continue the flight of a vehicle found armed, starting with the last throttle sent, 0 to 1."""
         if throttle > IDLE and not self.stop.active:
             self.hover = self.throttle = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
             self._enter(Phase.FLYING, now_ns)
 
     def on_pilot_throttle(self, throttle: float) -> None:
-        """Learn from the pilot's flight, so that nothing jumps when the pilot hands over the sticks."""
+        """Learn the hover throttle from the pilot, so that the throttle does not jump when the pilot hands over."""
         self.throttle = throttle
         climb = self._motion.climb_m_s
         if throttle > IDLE and climb is not None and abs(climb) < 0.3:
@@ -319,7 +319,7 @@ class SetpointController:
         self._motion = motion
 
     def lost(self) -> None:
-        """Level the sticks: nothing is received any more."""
+        """Level the sticks, because nothing is being received any more."""
         self.receiving = False
         self._motion = Motion()
         self._wanted = LEVEL
@@ -360,7 +360,7 @@ class SetpointController:
         return events
 
     def step_stop(self, now_ns: int) -> bool:
-        """Continue an emergency stop; return whether its sticks are due, whatever the pace of others."""
+        """Continue an emergency stop; return whether its sticks are due, regardless of the rate of other sticks."""
         return self.stop.step(self._motors_are_off(), now_ns)
 
     def _motors_are_off(self) -> bool | None:
@@ -369,10 +369,10 @@ class SetpointController:
             return None
         if not (self._override and report.armed):
             return not report.armed
-        return True if report.overridden else None  # only the pilot disarms: our sticks just cut the throttle
+        return True if report.overridden else None  # only the pilot can disarm: our sticks just cut the throttle
 
     def channels(self, now_ns: int) -> list[int]:
-        """Return the receiver's channels [µs], in the flight controller's order. Call at a steady rate."""
+        """Return the receiver channels [µs] in the flight controller's order. Call this at a steady rate."""
         step_s = 0.0 if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self.phase is Phase.SPOOLING:
@@ -390,7 +390,7 @@ class SetpointController:
         for place, width in zip(self._setup.sticks, (*centred, throttle), strict=True):
             sticks[place] = width
         if self.stop.active and not self._setup.sticks_known:
-            sticks = [OFF_US] * len(sticks)  # throttle off, whichever channel it is
+            sticks = [OFF_US] * len(sticks)  # turns off the throttle, whichever channel it is on
         given: Mapping[int, int] = self.given_aux
         return [*sticks, *self._setup.aux_us(arm=on, given=given)]
 
@@ -412,7 +412,7 @@ class SetpointController:
             return
         if self._lifted(motion.climb_m_s, motion.height_m or 0.0, step_s):
             carried = max(SPOOL_FROM * self.throttle, self.throttle - SPOOL_PER_S * LATE_S[motion.precise])
-            if self.hover is not None:  # from an earlier flight
+            if self.hover is not None:  # learnt in an earlier flight
                 carried = max((1 - OTHER) * carried, min((1 + OTHER) * carried, self.hover))
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, carried))
             self._enter(Phase.FLYING, now_ns)
@@ -422,7 +422,7 @@ class SetpointController:
             self.throttle = min(self.limits.throttle, self.throttle + SPOOL_PER_S * step_s)
 
     def _lifted(self, climb: float, height: float, step_s: float) -> bool:
-        """Return whether it has left the ground. Smooth precise motion first: noise must not pass for a lift-off."""
+        """Return whether it has left the ground. Precise motion is smoothed so that noise can't pass for a lift-off."""
         if self._motion.precise:
             self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
             self._smooth_height = height = _smoothed(self._smooth_height, height, step_s)
@@ -459,7 +459,7 @@ class SetpointController:
             self._enter(Phase.STANDING, now_ns)
 
     def _stands(self, climb: float, step_s: float, now_ns: int) -> bool:
-        """Return whether a descent has met the ground; reduce the throttle while it seems so."""
+        """Return whether a descent has reached the ground; reduce the throttle while it seems to have."""
         still = STILL[self._motion.precise]
         self._smooth_climb = climb = _smoothed(self._smooth_climb, climb, step_s)
         self._smooth_wanted = _smoothed(self._smooth_wanted, self._wanted.climb, step_s)

@@ -1,6 +1,6 @@
 """Requests to the flight controller, its state in SI units and our axes, and its motion. Pure.
 
-It is first asked to identify itself, then for its state as fast as it answers. MSP reports no velocity except the
+After identifying the flight controller, we request its state as fast as it replies. The only velocity in MSP is the
 barometer's climb, so external poses are differentiated.
 """
 
@@ -29,10 +29,10 @@ from skyloop.vehicles.msp.wire.messages import (
     multiple,
 )
 
-PATIENCE_NS: Final = nanoseconds(0.5)  #: an answer that has not arrived by then is lost
-TRIES: Final = 3  #: per question
+PATIENCE_NS: Final = nanoseconds(0.5)  #: a reply that has not arrived by then counts as lost
+TRIES: Final = 3  #: maximum number of requests per question
 
-#: Receives the answer's payload; None: the function is unknown, or there was no answer.
+#: Called with the reply's payload; None if the function is unknown or there was no reply.
 Handler = Callable[[bytes | None], None]
 
 
@@ -45,7 +45,7 @@ class Asked:
 
 
 class Questions:
-    """Asks one question at a time, each until it is answered, up to :data:`TRIES` times."""
+    """Asks one question at a time, repeating each until it is answered, up to :data:`TRIES` times in total."""
 
     def __init__(self) -> None:
         self._queue: deque[tuple[Frame, Handler]] = deque()
@@ -54,15 +54,15 @@ class Questions:
 
     @property
     def idle(self) -> bool:
-        """Whether no question is left."""
+        """Whether there are no more questions."""
         return not self._queue
 
     def ask(self, function: int, handler: Handler, payload: bytes = b"") -> None:
-        """Append a question."""
+        """Queue a question."""
         self._queue.append((Frame(function, payload), handler))
 
     def clear(self) -> None:
-        """Drop all questions without calling their handlers."""
+        """Discard all questions without calling their handlers."""
         self._queue.clear()
         self._sent_ns = None
 
@@ -78,7 +78,7 @@ class Questions:
         return self._queue[0][0]
 
     def on_frame(self, frame: Frame) -> bool:
-        """Handle a frame; return whether it is the expected answer."""
+        """Handle a frame; return whether it is the reply to the current question."""
         if not self._queue or self._sent_ns is None or frame.function != self._queue[0][0].function:
             return False
         self._answer(None if frame.direction is Direction.ERROR else frame.payload)
@@ -92,7 +92,7 @@ class Questions:
 
 @dataclass(slots=True)
 class Stream:
-    """States requested repeatedly, in one frame."""
+    """States that are requested repeatedly in one frame."""
 
     functions: tuple[int, ...]
     period_ns: int
@@ -100,23 +100,23 @@ class Stream:
 
     @property
     def frame(self) -> Frame:
-        """The request."""
+        """The request frame."""
         if len(self.functions) > 1:
             return Frame(Function.MULTIPLE, bytes(self.functions))
         return Frame(self.functions[0])
 
 
 class Telemetry:
-    """Requests states at their rates, few at a time.
+    """Requests states at their rates, a few at a time.
 
-    A flight controller answers some tens of requests a second, however fast the line. More would wait in its buffers,
-    and so would the sticks behind them. An answer to ``MULTIPLE`` does not say what it holds, so there is only one
-    bundle: after a lost answer, the next can't be mistaken for it.
+    A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
+    in its buffers, and so would the sticks behind them. A reply to ``MULTIPLE`` does not say what it contains, so there
+    is only one bundle: if a reply is lost, the next one can't be mistaken for it.
 
     Args:
-        streams: Rates in hertz, by function.
-        bundle: Functions requested together from firmware that knows ``MULTIPLE``, at the rate of the first.
-        most: Requests that may be unanswered.
+        streams: Rates in hertz by function.
+        bundle: Functions requested together, at the rate of the first one, from firmware that supports ``MULTIPLE``.
+        most: Maximum number of unanswered requests.
     """
 
     def __init__(self, streams: dict[int, float], bundle: tuple[int, ...] = (), *, most: int = 2) -> None:
@@ -132,19 +132,19 @@ class Telemetry:
         self.unanswered = 0
 
     def drop(self, function: int) -> None:
-        """Stop requesting a state that the firmware does not know."""
+        """Stop requesting a state that the firmware does not support."""
         self._streams = [stream for stream in self._streams if stream.functions != (function,)]
 
     def forget(self) -> None:
-        """Expect no pending answers: they were lost with the connection."""
+        """Stop waiting for pending replies, which were lost with the connection."""
         self._asked.clear()
 
     def due_ns(self) -> int | None:
-        """Return when the next request is due; None: never."""
+        """Return when the next request is due; None if none ever is."""
         return min((stream.due_ns for stream in self._streams), default=None)
 
     def requests(self, now_ns: int) -> list[Frame]:
-        """Return the requests to send now, longest overdue first."""
+        """Return the requests to send now, the most overdue first."""
         while self._asked and now_ns - self._asked[0].sent_ns >= PATIENCE_NS:
             self._asked.popleft()
             self.unanswered += 1
@@ -159,7 +159,7 @@ class Telemetry:
         return made
 
     def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
-        """Handle a frame; return the states that it answers, with None for an unknown one."""
+        """Handle a frame; return the states that it contains, with None for one that the firmware does not support."""
         for number, asked in enumerate(self._asked):
             if frame.function != asked.function:
                 continue
@@ -174,21 +174,21 @@ class Telemetry:
 
 Vector = tuple[float, float, float]
 
-POSE_NS: Final = nanoseconds(0.25)  #: an older pose no longer counts
-ALTITUDE_NS: Final = nanoseconds(0.5)  #: an older barometer altitude no longer counts
-GPS_NS: Final = nanoseconds(1.0)  #: an older fix no longer counts
-GAP_NS: Final = nanoseconds(0.4)  #: a longer gap restarts the velocity
-SMOOTH_S: Final = 0.05  #: time constant of the velocity from poses
-LEAST_SATELLITES: Final = 5  #: fewer make no usable fix
-GROUND_SAMPLES: Final = 10  #: samples over which the ground's height is averaged, roughly
+POSE_NS: Final = nanoseconds(0.25)  #: a pose older than this is not used
+ALTITUDE_NS: Final = nanoseconds(0.5)  #: a barometer altitude older than this is not used
+GPS_NS: Final = nanoseconds(1.0)  #: a fix older than this is not used
+GAP_NS: Final = nanoseconds(0.4)  #: a gap between poses longer than this restarts the velocity filter
+SMOOTH_S: Final = 0.05  #: time constant of the velocity computed from poses
+LEAST_SATELLITES: Final = 5  #: a fix with fewer satellites is not used
+GROUND_SAMPLES: Final = 10  #: approximate number of samples over which the ground's height is averaged
 EARTH_RADIUS_M: Final = 6_371_000.0
 
 
 class VelocityFilter:
-    """Velocity from positions: a critically damped g-h filter (E. Brookner, "Tracking and Kalman Filtering", 1998)."""
+    """A critically damped g-h filter for velocity (E. Brookner, "Tracking and Kalman Filtering", 1998)."""
 
     def __init__(self) -> None:
-        self.velocity: Vector | None = None  #: None before the second position
+        self.velocity: Vector | None = None  #: None until the second position
         self._place: Vector = (0.0, 0.0, 0.0)
         self._at_ns: int | None = None
 
@@ -212,18 +212,18 @@ class VelocityFilter:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The present motion; None for unknown values. World axes east, north, up."""
+    """The present motion, with None for unknown values. World axes are east, north, up."""
 
     climb_m_s: float | None = None
-    height_m: float | None = None  #: above its last place on the ground
-    velocity_m_s: Vector | None = None  #: in world axes
+    height_m: float | None = None  #: height above the place where it was last on the ground
+    velocity_m_s: Vector | None = None  #: velocity in world axes
     position_m: Vector | None = None
     yaw_rad: float | None = None
     precise: bool = False  #: whether height and climb come from poses rather than a barometer
 
 
 class MotionEstimate:
-    """Keeps the newest value of each source. External poses take precedence over GPS and barometer."""
+    """Stores the newest value from each source. External poses take precedence over GPS and barometer."""
 
     def __init__(self) -> None:
         self._pose: ExternalPose | None = None
@@ -231,15 +231,15 @@ class MotionEstimate:
         self._altitude: tuple[Altitude, int] | None = None
         self._gps: tuple[Gps, int] | None = None
         self._origin: Gps | None = None
-        self._heading_rad: float | None = None  # as yaw, counter-clockwise from east
-        self._turned_rad: float | None = None  # difference of the poses' yaw from it
-        self._ground: dict[str, float] = {}  # height of each source at the last place on the ground
-        self._stood = 0  # samples of the ground's height
+        self._heading_rad: float | None = None  # heading as a yaw angle, counter-clockwise from east
+        self._turned_rad: float | None = None  # difference between the poses' yaw and this heading
+        self._ground: dict[str, float] = {}  # height from each source where it was last on the ground
+        self._stood = 0  # number of samples of the ground's height
         self.satellites: int | None = None
 
     @property
     def origin(self) -> EarthOrigin | None:
-        """The origin of the world axes on the earth; None without GPS, or where poses define the axes."""
+        """The position on Earth of the world axes' origin; None without GPS, or if poses define the axes."""
         if self._origin is None or self._pose is not None:
             return None
         first = self._origin
@@ -262,7 +262,7 @@ class MotionEstimate:
         self._altitude = altitude, now_ns
 
     def on_gps(self, gps: Gps, now_ns: int) -> None:
-        """Handle a GPS fix, or its absence."""
+        """Handle a GPS report, with or without a fix."""
         self.satellites = gps.satellites
         if gps.fix and gps.satellites >= LEAST_SATELLITES:
             self._gps = gps, now_ns
@@ -270,11 +270,11 @@ class MotionEstimate:
                 self._origin = gps
 
     def lost(self) -> None:
-        """Forget the flight controller's reports: the link is lost."""
+        """Discard the flight controller's reports because the link is lost."""
         self._altitude = self._gps = None
 
     def stands(self, *, does: bool) -> None:
-        """Learn the ground's height while at rest: a single sample may be wrong by more than a lift-off."""
+        """Learn the ground's height while at rest; a single sample may be off by more than the height of a lift-off."""
         self._stood = min(GROUND_SAMPLES, self._stood + 1) if does else 0
         if does and self._pose is not None:
             self._learn("pose", self._pose.position_m[2])
@@ -338,7 +338,7 @@ def _scaled(vector: Vector, by: float) -> Vector:
 
 @dataclass(slots=True)
 class Reported:
-    """The newest reply of each kind; None: not received."""
+    """The newest reply of each kind; None if not received yet."""
 
     attitude: Attitude | None = None
     altitude: Altitude | None = None
@@ -349,7 +349,7 @@ class Reported:
 
 
 def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
-    """Return the remaining charge, 0 to 1, as reported or by cell voltage; None: unknown."""
+    """Return the remaining charge, 0 to 1, as reported or estimated from the cell voltage; None if unknown."""
     if battery.left is not None:
         return battery.left
     if battery.cells <= 0 or battery.voltage_v <= 0 or cells.full_v <= cells.empty_v:
@@ -361,7 +361,7 @@ def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
 def feedback_of(
     reported: Reported, motion: Motion, flight: FlightState, captured_ns: int, native: dict[str, Value]
 ) -> Feedback:
-    """Return the vehicle's state. Unknown values are None."""
+    """Return the vehicle's state as feedback. Unknown values are None."""
     attitude, battery = reported.attitude, reported.battery
     velocity = None
     if motion.velocity_m_s is not None and motion.yaw_rad is not None:

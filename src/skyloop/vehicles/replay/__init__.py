@@ -1,1 +1,1 @@
-"""``replay://FLIGHT.mcap``: a vehicle that replays a recording."""
+"""``replay://`` addresses: a vehicle that replays a recording."""

@@ -1,4 +1,4 @@
-"""The driver for ``replay://FLIGHT.mcap``: life cycle, the playing thread, and options (``docs/replay.md``)."""
+"""The driver for ``replay://`` addresses: life cycle, the playing thread, and options (``docs/replay.md``)."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ from skyloop.vehicles.replay.player import PREFIX, Player, ReplayPublisher, Step
 from skyloop.vehicles.replay.source import ReplaySource, capabilities_of
 
 _log = logging.getLogger(__name__)
-_CLOSE_S: Final = 2.0  #: time for the thread to end
+_CLOSE_S: Final = 2.0  #: time allowed for the thread to end
 
 
 class ReplayDriver(Driver):
-    """A vehicle that repeats a recording: it accepts every command and follows none.
+    """A vehicle that replays a recording: it accepts every command but follows none.
 
-    With ``speed=max`` nothing plays automatically. The consumer sets :attr:`clock` before :meth:`open`, then moves the
-    replay by :attr:`steps`.
+    With ``speed=max`` nothing plays automatically. The consumer sets :attr:`clock` before :meth:`open`, then advances
+    the replay through :attr:`steps`.
     """
 
     shared = False
-    parameters_without_authority = NAMES  # they move the replay, nothing that flies
+    parameters_without_authority = NAMES  # they control only the replay, not a flight
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -56,7 +56,7 @@ class ReplayDriver(Driver):
         self._publisher: ReplayPublisher | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the recording's cameras, reading the file once. :meth:`open` refuses an unreadable file."""
+        """Return the recording's cameras. The file is read once; :meth:`open` refuses an unreadable one."""
         if self._capabilities is None:
             try:
                 recording, drone = self._read()
@@ -66,7 +66,7 @@ class ReplayDriver(Driver):
         return self._capabilities
 
     def parameters(self) -> list[Parameter]:
-        """Return the replay's own parameters and, read-only with the prefix ``recorded.``, the recorded ones so far."""
+        """Return the replay's own parameters, and those recorded so far (read-only, with the prefix ``recorded.``)."""
         playback, publisher = self._playback, self._publisher
         if playback is None or publisher is None:
             return []
@@ -80,11 +80,11 @@ class ReplayDriver(Driver):
         return self._playback.set(name, value)
 
     def failsafe(self, action: Hover | Land) -> bool:  # noqa: ARG002
-        """Return True: nothing flies."""
+        """Return True because nothing is flying."""
         return True
 
     def source(self) -> ReplaySource:
-        """Open the recording; raise if it is missing, unreadable, or ends before ``start``."""
+        """Open the recording; raise an error if it is missing or unreadable, or ends before ``start``."""
         recording, drone = self._read()
         source = ReplaySource(recording, drone, self.options.start_s)
         if source.empty:
@@ -129,13 +129,13 @@ class ReplayDriver(Driver):
         self._thread = None
 
     def _apply(self, action: AnyAction) -> AnyAction:
-        """Accept the action, without effect on the replay."""
+        """Accept the action, which has no effect on the replay."""
         return action
 
     def _run(self, player: Player, sink: Sink, cameras: tuple[str, ...]) -> None:
         try:
             player.run(cameras)
-        except Exception as error:  # noqa: BLE001  a damaged file's surprise must not end in silence
+        except Exception as error:  # noqa: BLE001  an unexpected error in a damaged file must be reported
             _log.exception("%s can't be played further", self.uri)
             why = str(error) if isinstance(error, SkyloopError) else "an error in Skyloop (see the proxy's output)"
             at_s = self._playback.position_s if self._playback is not None else 0.0
@@ -157,12 +157,12 @@ class ReplayOptions:
     """A parsed address."""
 
     path: Path
-    drone: str | None  #: name in the recording; None: the first drone
-    start_s: float  #: start, after the recording's own
+    drone: str | None  #: the drone's name in the recording; None for the first drone
+    start_s: float  #: start of the replay, counted from the start of the recording
     speed: float  #: recorded seconds per second
-    stepped: bool  #: ``speed=max``: in step with one application, see :mod:`skyloop.stepping.replay`
-    loop: bool  #: start over at the end
-    wait: bool  #: start once a client wants a camera's frames
+    stepped: bool  #: whether it runs in step with one application (``speed=max``; see :mod:`skyloop.stepping.replay`)
+    loop: bool  #: whether to start over at the end
+    wait: bool  #: whether to start only once a client requests a camera's frames
 
 
 def options_of(uri: VehicleUri) -> ReplayOptions:

@@ -1,4 +1,4 @@
-"""A replay's position, speed and pause: set by its viewers through parameters, followed by its player."""
+"""A replay's position, speed and pause, which viewers set through parameters and the player follows."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ _IN_STEP: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the player should do next."""
+    """The player's next task."""
 
     paused: bool
     speed: float
-    position_s: float | None = None  #: where to seek; None: continue from the present position
+    position_s: float | None = None  #: where to seek to; None to continue from the present position
 
 
 class Playback:
-    """Position, speed and pause of a replay. Thread-safe.
+    """A replay's position, speed and pause. Thread-safe.
 
     Args:
         duration_s: Length of the recording.
         speed: Recorded seconds per second.
-        in_step: Whether its application moves it (``speed=max``): then nothing can be written.
+        in_step: Whether its application advances it (``speed=max``), in which case no parameter can be written.
     """
 
     def __init__(self, duration_s: float, speed: float = 1.0, *, in_step: bool = False) -> None:
         self.duration_s = duration_s
-        self.position_s = 0.0  #: in the recording; set by the player
-        self.over = False  #: it has reached the end; set by the player
-        self.jumps = 0  #: number of position changes other than by playing; set by the player
+        self.position_s = 0.0  #: position in the recording, set by the player
+        self.over = False  #: whether the end has been reached, set by the player
+        self.jumps = 0  #: number of changes in position other than by playing, set by the player
         self.stopped = False
         self._default_speed = speed
         self._in_step = in_step
@@ -53,7 +53,7 @@ class Playback:
 
     @property
     def paused(self) -> bool:
-        """Whether it should pause."""
+        """Whether the replay should be paused."""
         return self._wanted.paused
 
     @property
@@ -92,9 +92,9 @@ class Playback:
         ]
 
     def set(self, name: str, value: Value) -> Value:
-        """Write a parameter, which the player follows at once; return the value in force.
+        """Write a parameter, which takes effect at once; return the value in force.
 
-        Resuming at the end starts over.
+        Resuming at the end starts the replay over.
         """
         if name not in NAMES:
             raise UnknownNameError("parameter of a replay", name, NAMES)
@@ -124,18 +124,18 @@ class Playback:
 
     @property
     def changed(self) -> bool:
-        """Whether something was written since :meth:`take`, or the player should end."""
+        """Whether a parameter has been written since :meth:`take`, or the player should end."""
         return self._changed.is_set()
 
     def wait(self, timeout_s: float | None) -> None:
-        """Wait for this long [s], or until something is written."""
+        """Wait for this long [s], or until a parameter is written."""
         self._changed.wait(timeout_s)
 
     def take(self) -> Wanted:
-        """Return what the player should do now; a position is returned once."""
+        """Return what the player should do now; each position is returned only once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
-            if wanted.position_s is not None:  # the writer reads it back even before its moment is shown
+            if wanted.position_s is not None:  # the writer may read it back before that moment is shown
                 self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()

@@ -1,6 +1,6 @@
-"""Play a recording: on a thread by the clock, or sample by sample for a caller that moves the time.
+"""Players for recordings: on a thread in real time, or sample by sample for a caller that advances the time.
 
-The vehicle's samples are published unchanged, those of the recorded proxy as messages about the past.
+The vehicle's samples are published unchanged; those of the recorded proxy become messages about the past.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from skyloop.recording.pictures import Picture
 from skyloop.vehicles.replay.playback import PAUSED, POSITION, SPEED, Playback, Wanted
 from skyloop.vehicles.replay.source import Moment, ReplaySource, TimedSample, Timeline
 
-#: Events of the vehicle itself. All others came from the recorded proxy or an application: a client must not take
-#: them for events about its own authority or commands.
+#: Events from the vehicle itself. All others came from the recorded proxy or an application, and a client must not
+#: mistake them for events about its own authority or commands.
 _VEHICLES_OWN: Final = frozenset({EventKind.COLLISION, EventKind.VEHICLE_MESSAGE, EventKind.DRIVER_ERROR})
-#: Events that the replay's own proxy emits.
+#: Events that the replay's own proxy emits itself.
 _PROXYS_OWN: Final = frozenset({EventKind.STATE_CHANGED, EventKind.VEHICLE_LINK})
 _LINKS: Final = frozenset({LinkState.UP, LinkState.DEGRADED, LinkState.LOST})
-PREFIX: Final = "recorded."  #: of recorded parameters' names
+PREFIX: Final = "recorded."  #: prefix of recorded parameters' names
 
 
 def _nothing(_: int) -> None:
-    """Publish nothing: no client wants this camera's frames."""
+    """Publish nothing, because no client wants this camera's frames."""
 
 
 class ReplayPublisher:
     """Publishes samples to a sink, stamped on the replay's clock."""
 
     def __init__(self, sink: Sink, clock: Clock, playback: Playback, first_ns: int) -> None:
-        self.frames = 0  #: published so far, including those without a subscriber
+        self.frames = 0  #: number of frames published so far, including those without a subscriber
         self.damaged = 0
         self.loops = 0
         self.parameters: dict[str, Parameter] = {}
@@ -55,17 +55,17 @@ class ReplayPublisher:
         self._playback = playback
         self._first_ns = first_ns
         self._link = LinkState.CONNECTING
-        self._newest_ns: dict[str, int] = {}  # capture times never go backwards, not even between passes
+        self._newest_ns: dict[str, int] = {}  # by camera: capture times never go backwards, not even between passes
         self._command: dict[str, Value] = {}
 
     def link(self, state: LinkState, reason: str = "") -> None:
-        """Publish the state of the vehicle link if it changed."""
+        """Publish the state of the vehicle link if it has changed."""
         if state is not self._link:
             self._link = state
             self._sink.link(state, reason)
 
     def prepare(self, sample: TimedSample, timeline: Timeline) -> Callable[[], None]:
-        """Do the slow part now and return a function that publishes the sample when due."""
+        """Do the slow work now; return a function that publishes the sample, to be called when it is due."""
         value = sample.value
         if isinstance(value, Feedback):
             return lambda: self.feedback(value, timeline, sample.at_ns)
@@ -79,15 +79,15 @@ class ReplayPublisher:
         return lambda: self.parameter(value)
 
     def parameter(self, parameter: Parameter) -> None:
-        """Set a value that :attr:`parameters` returns from now on."""
+        """Store a value, to be returned by :attr:`parameters` from now on."""
         name = PREFIX + parameter.name
         self.parameters[name] = msgspec.structs.replace(parameter, name=name, read_only=True)
 
     def still(self, moment: Moment) -> Callable[[], None]:
-        """Return a function that publishes a moment: its state and its images, with one capture time.
+        """Return a function that publishes a moment's state and images with a common capture time.
 
-        It may be called repeatedly while the replay is paused; each image is decoded once. The moment's command and
-        parameters are in force from now on.
+        It may be called repeatedly while the replay is paused; each image is decoded only once. The moment's command
+        and parameters are in force from now on.
         """
         self._command = {} if moment.command is None else described(moment.command)
         for parameter in moment.parameters:
@@ -108,7 +108,7 @@ class ReplayPublisher:
         return publish
 
     def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
-        """Publish the vehicle's part at this position unchanged, and the recorded proxy's as native telemetry."""
+        """Publish the vehicle's part unchanged with this position, and the recorded proxy's as native telemetry."""
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
         playback = self._playback
@@ -148,7 +148,7 @@ class ReplayPublisher:
         show(self._captured(picture.camera, picture.header.captured_ns, timeline))
 
     def _decoded(self, picture: Picture) -> Callable[[int], None]:
-        """Decode an image and return a function that publishes it with a capture time; damage becomes an event."""
+        """Decode an image; return a function that publishes it with a given capture time. Damage becomes an event."""
         try:
             pixels, encoding = picture.as_recorded()
         except SkyloopError as error:
@@ -183,7 +183,7 @@ class ReplayPublisher:
 
 
 def described(applied: Applied) -> dict[str, Value]:
-    """Return a recorded command as native telemetry: requested and applied."""
+    """Return a recorded command, both as requested and as applied, as native telemetry."""
     return {
         "replay.asked": applied.asked.name,
         "replay.asked.values": numbers(applied.asked),
@@ -193,20 +193,20 @@ def described(applied: Applied) -> dict[str, Value]:
 
 
 def numbers(action: AnyAction) -> tuple[float, ...]:
-    """Return an action's numbers in the order of its fields; NaN for a missing one, such as a position's yaw."""
+    """Return an action's numbers in field order, with NaN for a missing one such as a position's yaw."""
     given = (getattr(action, name) for name in action.__struct_fields__)
     return tuple(math.nan if number is None else float(number) for number in given)
 
 
-HEARTBEAT_NS: Final = 50_000_000  #: between repeats of the first state while waiting for a viewer
-PAUSE_NS: Final = 50_000_000  #: between two passes, on the replay's clock
-STILL_NS: Final = 200_000_000  #: between repeats of the paused moment
-IDLE_S: Final = 3600.0  #: a wait that only a change ends
-LATE_NS: Final = 250_000_000  #: when further behind, postpone the schedule instead of rushing through it
+HEARTBEAT_NS: Final = 50_000_000  #: time between repeats of the first state while waiting for a viewer
+PAUSE_NS: Final = 50_000_000  #: pause between two passes, on the replay's clock
+STILL_NS: Final = 200_000_000  #: time between repeats of the moment shown while paused
+IDLE_S: Final = 3600.0  #: time-out of a wait that normally ends only with a change
+LATE_NS: Final = 250_000_000  #: if further behind than this, postpone the schedule instead of rushing through it
 
 
 class Player:
-    """Plays by the clock, on the thread that calls :meth:`run`, under the control of its playback.
+    """Plays in real time on the thread that calls :meth:`run`, controlled by its playback.
 
     Args:
         source: The recording.
@@ -214,7 +214,7 @@ class Player:
         playback: Position, speed and pause.
         loop: Whether to start over at the end.
         clock: The monotonic clock [ns].
-        wait: Waits for some seconds, or until the playback has changed; None: in real time.
+        wait: Waits for a number of seconds or until the playback changes; None to wait in real time.
     """
 
     def __init__(
@@ -236,14 +236,14 @@ class Player:
         self._wait = wait or playback.wait
         self._timeline = Timeline(playback.speed, source.begin_ns, clock())
         self._samples = source.samples()
-        self._due: TimedSample | None = None  # the next sample when a write interrupted
+        self._due: TimedSample | None = None  # the next sample, if a written parameter interrupted playing
         self._still: Callable[[], None] | None = None  # publishes the moment shown while paused
-        self._damaged = 0  # frames, in earlier passes
+        self._damaged = 0  # number of damaged frames in earlier passes
 
     def run(self, wait_for: tuple[str, ...]) -> None:
-        """Play until stopped; start once a client wants one of these cameras, or at once without cameras.
+        """Play until stopped, starting once a client wants one of these cameras, or at once if none are given.
 
-        At the end the link closes; it is up again if a viewer seeks back.
+        At the end the link goes down; it comes up again if a viewer seeks back.
         """
         playback = self._playback
         for parameter in self._source.parameters():
@@ -261,7 +261,7 @@ class Player:
                 self._play()
 
     def _follow(self, wanted: Wanted) -> None:
-        """Follow a written parameter."""
+        """Apply a written parameter."""
         self._timeline.set_speed(wanted.speed, self._clock())
         if wanted.position_s is not None:
             self._playback.jumps += 1
@@ -290,12 +290,12 @@ class Player:
         return self._source.first_ns + nanoseconds(self._playback.position_s)
 
     def _hold(self) -> None:
-        """Repeat the moment, so that late subscribers see it and the silence does not pass for a lost link."""
+        """Repeat the moment, so that late subscribers see it and the link does not appear to be lost."""
         if self._sleep_until(self._clock() + STILL_NS) and self._still is not None:
             self._still()
 
     def _play(self) -> None:
-        """Publish samples until something is written or the recording is over."""
+        """Publish samples until a parameter is written or the recording ends."""
         while (sample := self._next()) is not None:
             publish = self.publisher.prepare(sample, self._timeline)
             late_ns = self._clock() - self._timeline.at(sample.at_ns)
@@ -326,7 +326,7 @@ class Player:
         self._timeline.restart(self._source.begin_ns, self._clock())
 
     def _wait_for_viewer(self, cameras: tuple[str, ...]) -> None:
-        """Repeat the first state until a client wants a camera's frames, or moves the replay."""
+        """Repeat the first state until a client wants a camera's frames or seeks in the replay."""
         first = self._source.first_feedback() or Feedback(captured_ns=self._source.begin_ns)
         while cameras and not any(map(self._sink.wants, cameras)):
             timeline = Timeline(1.0, first.captured_ns, self._clock())
@@ -335,7 +335,7 @@ class Player:
                 return
 
     def _sleep_until(self, due_ns: int) -> bool:
-        """Wait until a time. Return False, at once, if something was written or the driver is closing."""
+        """Wait until a given time. Return False at once if a parameter was written or the driver is closing."""
         while not self._playback.changed:
             left_ns = due_ns - self._clock()
             if left_ns <= 0:
@@ -351,13 +351,13 @@ class Player:
 
 
 class StepPlayer:
-    """Plays sample by sample on the recording's own clock, one per :meth:`step`: nothing is skipped."""
+    """Plays on the recording's own clock, one sample per :meth:`step`, without skipping any."""
 
     def __init__(self, source: ReplaySource, sink: Sink, clock: Clock, playback: Playback) -> None:
         self._source = source
         self._sink = sink
         self.publisher = ReplayPublisher(sink, clock, playback, source.first_ns)
-        self._timeline = Timeline(1.0, 0, 0)  # the replay's clock is the recording's
+        self._timeline = Timeline(1.0, 0, 0)  # the replay uses the recording's clock
         self._samples: Iterator[TimedSample] = iter(())
         self._next: TimedSample | None = None
 
@@ -367,7 +367,7 @@ class StepPlayer:
         return None if self._next is None else self._next.at_ns
 
     def begin(self) -> None:
-        """Publish the link and the first state, before the first sample."""
+        """Publish the link state and the first state, before the first sample."""
         for parameter in self._source.parameters():
             self.publisher.parameter(parameter)
         self.publisher.link(LinkState.UP)
@@ -378,7 +378,7 @@ class StepPlayer:
         self._next = next(self._samples, None)
 
     def step(self) -> None:
-        """Publish the next sample; its time is now. After the last one, close the link."""
+        """Publish the next sample, whose time has come. After the last one, close the link."""
         sample = self._next
         if sample is None:
             raise UsageError("the recording is over")

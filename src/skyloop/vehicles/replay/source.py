@@ -1,4 +1,4 @@
-"""A recording's samples of one drone, in order, and their times in a replay."""
+"""One drone's samples in a recording, in order, and their times in a replay."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from skyloop.recording.pictures import Picture
 from skyloop.recording.plain import Course, shifted
 from skyloop.recording.reader import Item, Recording
 
-#: Replayed channels. Annotations and logs belong to applications, which make new ones.
+#: Channels that are replayed. Annotations and logs are not: applications create new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
-_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance alike within this were not reset
+_SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: clocks that advance equally within this tolerance were not reset
 Sample = Feedback | Picture | Event | Applied | Parameter
 
 
 @dataclass(frozen=True, slots=True)
 class TimedSample:
-    """A sample, and when the recorded proxy received it, on that proxy's clock [ns]."""
+    """A sample, and the time at which the recorded proxy received it, on that proxy's clock [ns]."""
 
     at_ns: int
     value: Sample
@@ -34,35 +34,35 @@ class TimedSample:
 
 @dataclass(slots=True)
 class Moment:
-    """A drone's state at one time of its recording, and the samples after it."""
+    """A drone's state at a given time in its recording, and the samples that follow."""
 
     at_ns: int
-    state: Feedback | None = None  #: at the capture of the images, or else the newest
-    pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest of each camera
+    state: Feedback | None = None  #: the state at the capture of the images; the newest one if there are no images
+    pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
-    parameters: list[Parameter] = field(default_factory=list)  #: received shortly before
+    parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before
     following: Iterator[TimedSample] = field(default_factory=lambda: iter(()))
 
     def shows(self, cameras: list[str]) -> bool:
-        """Return whether there is a state, and a decodable image of each camera."""
+        """Return whether there is a state, and a decodable image from each camera."""
         found = {name for name, picture in self.pictures.items() if picture.can_be_decoded}
         return self.state is not None and found.issuperset(cameras)
 
 
-#: Parts of the file (about half a second each) to read before the time sought, until each camera has an image. A
-#: camera that was silent for longer shows nothing.
+#: How many parts of the file (about half a second each) to read before the time sought, tried in turn until each camera
+#: has an image. A camera that was silent for longer shows nothing.
 _PARTS_BEFORE: Final = (1, 4, 16)
-_KEPT_STATES: Final = 500  #: states kept before the time sought, to find the one of the images
+_KEPT_STATES: Final = 500  #: number of states kept before the time sought, to find the one that matches the images
 
 
 class ReplaySource:
-    """A drone's recording, starting ``start_s`` after its beginning."""
+    """A drone's recording, replayed from ``start_s`` after its beginning."""
 
     def __init__(self, recording: Recording, drone: DroneRecord, start_s: float = 0.0) -> None:
         self._recording = recording
         self._drone = drone
         self._cameras = recording.cameras(drone.name)
-        self._known_ns: dict[int, int] = {}  # time of the first sample in each part of the file
+        self._known_ns: dict[int, int] = {}  # time of the first sample in each part of the file known so far
         self.begin_ns = 0  #: start of the replay, on the recorded proxy's clock
         timed = (sample.at_ns for sample in self.samples() if not isinstance(sample.value, Parameter))
         self.first_ns = next(timed, 0)  #: start of the recording itself
@@ -71,7 +71,7 @@ class ReplaySource:
 
     @property
     def seconds(self) -> float:
-        """Length of the recording, from this drone's first sample to its last."""
+        """Duration of the recording from this drone's first sample to its last [s]."""
         return seconds(max(0, self.end_ns - self.first_ns))
 
     @cached_property
@@ -85,7 +85,7 @@ class ReplaySource:
         return self.first_ns
 
     def moment(self, at_ns: int) -> Moment:
-        """Return the moment at a time of the recorded proxy's clock, reading only what is near it."""
+        """Return the moment at a time on the recorded proxy's clock, reading only the nearby parts of the file."""
         parts = range(len(self._recording.found.pieces))
         part = bisect_right(parts, at_ns, key=self._first_known_ns) - 1
         moment = Moment(at_ns)
@@ -97,12 +97,12 @@ class ReplaySource:
 
     @property
     def empty(self) -> bool:
-        """Whether it has no sample after :attr:`begin_ns`."""
+        """Whether there are no samples after :attr:`begin_ns`."""
         return not any(sample.at_ns > self.begin_ns for sample in self.samples())
 
     @property
     def damaged(self) -> list[str]:
-        """Unreadable parts, for people."""
+        """Readable descriptions of the unreadable parts."""
         cut = self._recording.cut
         return [*([f"the file was cut off: {cut}"] if cut else []), *self._recording.damaged]
 
@@ -116,7 +116,7 @@ class ReplaySource:
         return [sample.value for sample in early if isinstance(sample.value, Parameter)]
 
     def samples(self) -> Iterator[TimedSample]:
-        """Yield everything in the order of arrival; times never go backwards."""
+        """Yield all samples in order of arrival; their times never go backwards."""
         for sample in self._timed(0):
             if isinstance(sample.value, Parameter):  # earlier parameters are still in force
                 yield TimedSample(max(sample.at_ns, self.begin_ns), sample.value)
@@ -126,8 +126,8 @@ class ReplaySource:
     # Internals -------------------------------------------------------------------------------------------------
 
     def _timed(self, log_ns: int) -> Iterator[TimedSample]:
-        """Yield the samples received at a log time or later."""
-        resets = self._resets if log_ns else []  # reading from the beginning finds them on the way
+        """Yield the samples received at the given log time or later."""
+        resets = self._resets if log_ns else []  # when reading from the beginning, they are found on the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
         course = Course(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
@@ -137,7 +137,7 @@ class ReplaySource:
 
     @cached_property
     def _resets(self) -> list[tuple[int, int]]:
-        """Log times at which the proxy's clock restarted, each with the offset of its times from there on."""
+        """Log times at which the proxy's clock restarted, each with the clock's offset from then on."""
         last_part = self._log_ns(len(self._recording.found.pieces) - 1)
         first, last = (
             next(self._recording.items(self._drone.name, (Channel.FEEDBACK,), from_ns=at_ns), None)
@@ -147,7 +147,7 @@ class ReplaySource:
             return []
         passed_ns = last.value.published_ns - first.value.published_ns
         if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
-            return []  # without reading the whole file
+            return []  # to avoid reading the whole file
         found, course = [], Course()
         for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
             before_ns = course.shift_ns
@@ -161,14 +161,14 @@ class ReplaySource:
         return self._recording.found.pieces[part].start_ns if part > 0 else 0
 
     def _first_known_ns(self, part: int) -> int:
-        """Return the time of the first timed sample in a part of the file or after it."""
+        """Return the time of the first timed sample in or after a part of the file."""
         if part not in self._known_ns:
             timed = (sample.at_ns for sample in self._timed(self._log_ns(part)) if sample.at_ns)
             self._known_ns[part] = next(timed, _NEVER_NS)
         return self._known_ns[part]
 
     def _moment(self, at_ns: int, log_ns: int) -> Moment:
-        """Collect the moment at a time from the samples received since ``log_ns``."""
+        """Build the moment at a given time from the samples received since ``log_ns``."""
         moment = Moment(at_ns)
         states: deque[Feedback] = deque(maxlen=_KEPT_STATES)
         samples = self._timed(log_ns)
@@ -193,7 +193,7 @@ _NEVER_NS: Final = 1 << 63
 
 
 def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
-    """Return the state at the capture of the newest image, so that image and state match."""
+    """Return the state at the capture of the newest image, so that the two match."""
     if not states:
         return None
     newest_ns = max(state.captured_ns for state in states)
@@ -202,9 +202,9 @@ def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> 
 
 
 def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
-    """Describe a replay as a vehicle.
+    """Return the capabilities of a replay.
 
-    It has the cameras whose frames were recorded, and accepts every command if the recorded vehicle accepted any,
+    It has the cameras whose frames were recorded. It accepts every command if the recorded vehicle accepted any,
     natively or through the software autopilot.
     """
     was = drone.described
@@ -243,10 +243,10 @@ def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | Non
 
 
 class Timeline:
-    """Maps the recording's clock to the replay's, and back. Pure."""
+    """Converts between the recording's clock and the replay's. Pure."""
 
     def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
-        """Map ``begin_ns`` on the recording's clock to ``origin_ns`` on the replay's."""
+        """Make ``begin_ns`` on the recording's clock correspond to ``origin_ns`` on the replay's."""
         self._speed = speed
         self._begin_ns = begin_ns
         self._origin_ns = origin_ns
@@ -257,12 +257,12 @@ class Timeline:
         return self._origin_ns + (passed_ns if self._speed == 1.0 else round(passed_ns / self._speed))
 
     def recorded(self, now_ns: int) -> int:
-        """Return the time on the recording's clock [ns]; the inverse of :meth:`at`."""
+        """Return the time on the recording's clock [ns]; this is the inverse of :meth:`at`."""
         passed_ns = now_ns - self._origin_ns
         return self._begin_ns + (passed_ns if self._speed == 1.0 else round(passed_ns * self._speed))
 
     def put_off(self, ns: int) -> None:
-        """Delay everything that follows [ns]."""
+        """Delay everything that follows by ``ns``."""
         self._origin_ns += ns
 
     def set_speed(self, speed: float, now_ns: int) -> None:
@@ -271,5 +271,5 @@ class Timeline:
         self._speed = speed
 
     def restart(self, begin_ns: int, origin_ns: int) -> None:
-        """Continue from another time of the recording, at the same speed."""
+        """Continue from another time in the recording at the same speed."""
         self._begin_ns, self._origin_ns = begin_ns, origin_ns

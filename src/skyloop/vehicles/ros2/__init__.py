@@ -1,1 +1,1 @@
-"""Driver of ``ros2://``: any ROS 2 robot with images and ``cmd_vel`` as a vehicle. ``docs/ros.md``."""
+"""``ros2://`` addresses: any ROS 2 robot with images and ``cmd_vel`` as a vehicle. See ``docs/ros.md``."""

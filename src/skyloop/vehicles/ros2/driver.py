@@ -1,4 +1,4 @@
-"""The driver of ``ros2://`` and, through rclpy, the robot's topics and services."""
+"""The driver for ``ros2://`` addresses and, through rclpy, the robot's topics and services."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _MESSAGES = ("geometry_msgs.msg", "nav_msgs.msg", "sensor_msgs.msg", "std_srvs.s
 
 
 class Ros2Driver(Driver):
-    """Any ROS 2 robot with an image and ``cmd_vel``. See ``docs/ros.md`` for its options.
+    """Any ROS 2 robot with images and ``cmd_vel``. See ``docs/ros.md`` for its options.
 
-    It supports velocities, and take-off and landing only if the address names the robot's services for them. The proxy
-    builds the missing actions from velocities if the robot's odometry reports its height.
+    It supports velocities, and also take-off and landing if the address names the robot's services for them. If the
+    robot's odometry reports its height, the proxy builds the missing actions from velocities.
     """
 
     def __init__(self, uri: VehicleUri) -> None:
@@ -32,7 +32,7 @@ class Ros2Driver(Driver):
         self._link: RobotLink | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the robot's capabilities for the topics and services named in the address."""
+        """Return the capabilities that follow from the topics and services named in the address."""
         return self.options.capabilities()
 
     def _open(self, sink: Sink) -> None:
@@ -62,9 +62,9 @@ PURPOSE: Final = "a robot of ROS 2"
 
 
 class RobotLink:
-    """A node that subscribes to a robot's topics and publishes its ``cmd_vel``.
+    """A node that subscribes to a robot's topics and publishes ``cmd_vel`` for it.
 
-    It subscribes to images only while an application wants them, or if no other topic shows that the robot is there.
+    It subscribes to images only while an application wants them, or if no other topic shows that the robot is present.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:
@@ -106,7 +106,7 @@ class RobotLink:
         self._context.spin([node], "ros2-robot")
 
     def close(self) -> None:
-        """Stop the robot's motion, then end the threads and the node."""
+        """Stop the robot, then end the threads and the node."""
         self.session.close()
         self._context.close()
 
@@ -128,11 +128,11 @@ class RobotLink:
         self._twists.publish(message)
 
     def missing(self) -> str:
-        """Return a service that is named in the address and not offered by any node; empty if there is none."""
+        """Return a service that is named in the address but not offered by any node; empty if there is none."""
         return next((name for name, client in self._clients.items() if not client.service_is_ready()), "")
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
-        """Call a ``std_srvs/Trigger`` without waiting for the answer; raises DriverError if no node offers it."""
+        """Call a ``std_srvs/Trigger`` without waiting for the response; raise DriverError if no node offers it."""
         from std_srvs.srv import Trigger
 
         client = self._clients[service]

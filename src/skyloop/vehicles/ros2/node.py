@@ -1,6 +1,6 @@
-"""Make nodes of ROS 2 in one place: rclpy is optional, and imported with the first node.
+"""The only place that creates ROS 2 nodes. rclpy is optional and is imported with the first node.
 
-Nodes are visible on this machine only, unless the environment configures discovery: ROS 2 has no access control.
+Because ROS 2 has no access control, nodes are visible only on this machine unless the environment configures discovery.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from skyloop.errors import MissingExtraError, UsageError
 
-#: Environment variables that configure discovery; if one of them is set, we leave it alone.
+#: Environment variables that configure discovery; if one of them is set, discovery is left as configured.
 DISCOVERY_VARIABLES: Final = (
     "FASTDDS_DEFAULT_PROFILES_FILE",
     "FASTRTPS_DEFAULT_PROFILES_FILE",
@@ -26,14 +26,14 @@ DISCOVERY_VARIABLES: Final = (
     "ROS_LOCALHOST_ONLY",
     "ROS_DISCOVERY_SERVER",
 )
-#: Variables with a profile's path for Fast DDS 3, and for Fast DDS 2 (Jazzy and before).
+#: Variables with a profile's path, for Fast DDS 3 and for Fast DDS 2 (Jazzy and earlier).
 PROFILES_VARIABLE, OLD_PROFILES_VARIABLE = DISCOVERY_VARIABLES[:2]
 _OLD_DISTRIBUTIONS: Final = ("humble", "iron", "jazzy")
-_FIRST_WITH_FAST_DDS_3: Final = 8  #: major version of rclpy
-MOST_DOMAIN: Final = 101  #: above it, the ports of DDS may be taken by outgoing connections on Linux
-SHARED_BYTES: Final = 16 * 2**20  #: shared memory of a participant: several pictures; the usual 512 KiB hold none
+_FIRST_WITH_FAST_DDS_3: Final = 8  #: first major version of rclpy with Fast DDS 3
+MOST_DOMAIN: Final = 101  #: for higher domains, DDS's ports may be taken by outgoing connections on Linux
+SHARED_BYTES: Final = 16 * 2**20  #: a participant's shared memory, for several images; the default 512 KiB holds none
 
-#: A profile for Fast DDS: sockets on loopback only, and shared memory with room for pictures.
+#: A profile for Fast DDS: sockets only on loopback, and shared memory with room for images.
 LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com">
   <profiles>
@@ -64,7 +64,7 @@ LOOPBACK_PROFILE: Final = f"""<?xml version="1.0" encoding="UTF-8"?>
 
 
 def require_rclpy(purpose: str, *packages: str) -> Any:
-    """Import rclpy and packages of messages; return rclpy. The error for a missing one names the purpose."""
+    """Import rclpy and message packages; return rclpy. If one is missing, the error states the purpose."""
     from importlib import import_module
 
     try:
@@ -76,15 +76,15 @@ def require_rclpy(purpose: str, *packages: str) -> Any:
 
 
 def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
-    """Make nodes of this process visible on this machine only, unless the environment configures discovery.
+    """Make this process's nodes visible only on this machine, unless the environment configures discovery.
 
-    Call it before making the first node. Returns whether it changed the environment. The profile is a file in a
-    temporary directory, removed at the end.
+    Call this before creating the first node. Returns whether it changed the environment. The profile is a file in a
+    temporary directory that is removed at exit.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
         return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])
     if environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp") != "rmw_fastrtps_cpp":
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # respected by other DDS implementations
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"  # for other DDS implementations
         return True
     folder = tempfile.TemporaryDirectory(prefix="skyloop-ros-")
     atexit.register(folder.cleanup)
@@ -95,18 +95,18 @@ def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
     return True
 
 
-_profile: dict[str, str] = {}  # the path of the written profile
+_profile: dict[str, str] = {}  # path of the profile that was written
 
 
 def _has_fast_dds_2(environment: Mapping[str, str]) -> bool:
     try:
         return int(version("ros-rclpy").partition(".")[0]) < _FIRST_WITH_FAST_DDS_3
-    except (PackageNotFoundError, ValueError):  # installed by a distribution of ROS 2
+    except (PackageNotFoundError, ValueError):  # installed by a ROS 2 distribution
         return environment.get("ROS_DISTRO", "") in _OLD_DISTRIBUTIONS
 
 
 def domain_of(text: str | None) -> int | None:
-    """Return the domain in a text; None without one: ROS 2 then reads ``ROS_DOMAIN_ID``."""
+    """Parse a domain; None if there is no text, in which case ROS 2 uses ``ROS_DOMAIN_ID``."""
     if text is None:
         return None
     if not (text.isascii() and text.isdigit() and int(text) <= MOST_DOMAIN):
@@ -115,28 +115,28 @@ def domain_of(text: str | None) -> int | None:
 
 
 def ros_name(name: str) -> str:
-    """Return a valid ROS 2 name for a namespace or frame: letters, digits and ``_``, no digit first."""
+    """Return a valid ROS 2 name for a namespace or frame: letters, digits and ``_``, not starting with a digit."""
     word = re.sub(r"[^A-Za-z0-9_]", "_", name)
     return f"drone_{word}" if not word or word[0].isdigit() else word
 
 
 class RosContext:
-    """A context of rclpy, its nodes, and the threads that run their callbacks.
+    """An rclpy context, its nodes, and the threads that run their callbacks.
 
     Args:
-        purpose: Named by an error when rclpy is missing.
-        domain: DDS domain; None: from ``ROS_DOMAIN_ID``.
-        arguments: For ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
+        purpose: The purpose of rclpy, stated in the error if it is missing.
+        domain: DDS domain; None to use ``ROS_DOMAIN_ID``.
+        arguments: Arguments for ROS 2, such as ``-r cmd_vel:=/cmd_vel``, without ``--ros-args``.
 
     Raises:
         MissingExtraError: rclpy is not installed.
-        UsageError: rclpy does not understand the arguments.
+        UsageError: rclpy rejects the arguments.
     """
 
     def __init__(self, purpose: str, domain: int | None = None, arguments: Iterable[str] = ()) -> None:
         self._rclpy = require_rclpy(purpose)
         self._context = self._rclpy.Context()
-        # Logs go to standard error and /rosout. rclpy would also write a file per run into the user's home.
+        # Logs go to standard error and /rosout. By default, rclpy also writes a file per run to the home directory.
         words = ["--ros-args", "--disable-external-lib-logs", *arguments]
         try:
             self._rclpy.init(args=words, context=self._context, domain_id=domain, signal_handler_options=_no_signals())
@@ -146,7 +146,7 @@ class RosContext:
         self._executors: list[tuple[Any, threading.Thread]] = []
 
     def node(self, name: str, namespace: str = "", parameters: Mapping[str, bool | int | float | str] = {}) -> Any:
-        """Return a new node with these initial parameter values."""
+        """Create a node with these initial parameter values."""
         overrides = [self._rclpy.Parameter(key, value=value) for key, value in parameters.items()]
         node = self._rclpy.create_node(
             name, namespace=namespace, context=self._context, parameter_overrides=overrides, enable_logger_service=False
@@ -155,7 +155,7 @@ class RosContext:
         return node
 
     def spin(self, nodes: Iterable[Any], name: str, threads: int = 1) -> None:
-        """Run the nodes' callbacks on this many threads until :meth:`close`."""
+        """Run the nodes' callbacks on the given number of threads until :meth:`close`."""
         from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 
         executor: Any = (
@@ -170,7 +170,7 @@ class RosContext:
             try:
                 executor.spin()
             except ExternalShutdownException:
-                return  # the normal end
+                return  # the context was shut down normally
 
         thread = threading.Thread(target=run, name=name, daemon=True)
         self._executors.append((executor, thread))

@@ -1,4 +1,4 @@
-"""Options of ``ros2://`` addresses, parsed and checked. Pure."""
+"""Parsing and checking of the options in ``ros2://`` addresses. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding
 from skyloop.vehicles.ros2.node import MOST_DOMAIN
 
-#: Topics and services by the option that names them; names without a leading slash are below the namespace.
+#: Default topics by the option that names them; names without a leading slash are relative to the namespace.
 TOPICS: Final = {"image": "image_raw", "cmd_vel": "cmd_vel", "odom": "odom", "battery": "battery_state"}
 SERVICES: Final = ("takeoff", "land")
 _OTHERS: Final = (
@@ -31,7 +31,7 @@ _OTHERS: Final = (
 KNOWN: Final = {*TOPICS, *SERVICES, *_OTHERS}
 _NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)
 Rotation = tuple[float, float, float, float, float, float, float, float, float]
-#: Possible camera mounts: the camera's optical axes (x right, y down, z forward) in body axes, row by row.
+#: Camera mounts: the camera's optical axes (x right, y down, z forward) in body axes, row by row.
 MOUNTS: Final[dict[str, Rotation | None]] = {
     "ahead": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
     "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
@@ -41,7 +41,7 @@ MOUNTS: Final[dict[str, Rotation | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Full names of a robot's topics and services; empty: it lacks them."""
+    """Full names of a robot's topics and services, empty for those that it lacks, and the other options."""
 
     namespace: str  #: with a leading slash
     image: str  #: ``sensor_msgs/Image``, or ``CompressedImage`` if ``compressed``
@@ -56,14 +56,14 @@ class Options:
     width: int  #: image width [px]
     height: int  #: [px]
     fps: float  #: frame rate [1/s]
-    compressed: bool  #: whether its images are JPEG
+    compressed: bool  #: whether images are JPEG
     stamped: bool  #: whether velocities have a stamp
-    ground: bool  #: whether it is a ground vehicle: take-off and landing then begin and end the drive
+    ground: bool  #: whether it is a ground vehicle, for which take-off and landing start and end the drive
     timeout_s: float  #: silence after which the link is lost [s]
-    domain: int | None  #: DDS domain; None: from ``ROS_DOMAIN_ID``
+    domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
-        """Return the robot's capabilities for its topics and services."""
+        """Return the capabilities that follow from the robot's topics and services."""
         actions: set[str] = set()
         if self.cmd_vel:
             actions = {"idle", "velocity"}
@@ -88,7 +88,7 @@ class Options:
 
 
 def options_of(uri: VehicleUri) -> Options:
-    """Return the options of an address."""
+    """Return the options in an address."""
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):

@@ -1,6 +1,6 @@
 """A robot as a vehicle: messages become samples for the proxy's sink, actions become velocities and service calls.
 
-This module does not need rclpy: messages are any objects with their fields, and services are called by a function.
+This module does not need rclpy: a message is any object with the right fields, and a function calls services.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from skyloop.vehicles.ros2.wire import (
     skew_of,
 )
 
-PERIOD_S: Final = 0.05  #: between repeats of a velocity, as robots stop without one
-AIRBORNE_M: Final = 0.1  #: height of the odometry above which a robot counts as flying
-SERVICES_S: Final = 5.0  #: limit for the discovery of the robot's services
-ANSWER_S: Final = 30.0  #: limit for a service's answer
-BLIND_NS: Final = nanoseconds(0.2)  #: how long a velocity is repeated while odometry is missing
+PERIOD_S: Final = 0.05  #: time between repeats of a velocity, because robots stop if they receive none
+AIRBORNE_M: Final = 0.1  #: height in the odometry above which a robot counts as flying
+SERVICES_S: Final = 5.0  #: time allowed for discovering the robot's services
+ANSWER_S: Final = 30.0  #: time allowed for a service's response
+BLIND_NS: Final = nanoseconds(0.2)  #: how long a velocity is repeated if odometry stops arriving
 _FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
 
 
@@ -54,10 +54,10 @@ class Robot(Protocol):
         """Publish a velocity."""
 
     def missing(self) -> str:
-        """Return a service that is named in the address and not offered by any node; empty if there is none."""
+        """Return a service that is named in the address but not offered by any node; empty if there is none."""
 
     def call(self, service: str, answered: Callable[[bool, str], None]) -> None:
-        """Call a ``std_srvs/Trigger``; ``answered`` gets success and message, on any thread.
+        """Call a ``std_srvs/Trigger``; ``answered`` is called with its success and message, on any thread.
 
         Raises:
             DriverError: No node offers it.
@@ -73,9 +73,9 @@ class _Pending:
 
 
 class RobotSession:
-    """One opened driver's session: actions from any thread, everything else on the node's own thread.
+    """An open driver's session. Actions may come from any thread; everything else runs on the node's own thread.
 
-    The sink is called without the lock, as the proxy may hold its own lock while it commands.
+    The sink is called without holding the lock, because the proxy may hold its own lock while it sends commands.
     """
 
     def __init__(self, options: Options, sink: Sink, robot: Robot, clock: Clock, system_clock: Clock) -> None:
@@ -86,27 +86,27 @@ class RobotSession:
         self._system_clock = system_clock
         self._lock = threading.RLock()
         self._clocks = {topic: CaptureClock() for topic in ("odom", "image")}
-        self._fields: dict[str, Any] = {}  # fields of the newest odometry
+        self._fields: dict[str, Any] = {}  # feedback fields from the newest odometry
         self._battery: dict[str, Any] = {}
         self._intrinsics: Intrinsics | None = None
         self._captured_ns = 0  # capture time of the newest feedback
         self._received_ns: int | None = None
         self._odometry_ns: int | None = None
-        self._measures_height = False  # its odometry was above the ground once, which a planar one never is
+        self._measures_height = False  # whether odometry has ever been above the ground, which planar odometry never is
         self._fed_ns = 0
         self._opened_ns = clock()
         self._link: LinkState | None = None
-        self._velocity: Velocity | None = None  # in force
-        self._commanded_ns = 0  # time of the velocity's command
+        self._velocity: Velocity | None = None  # velocity in force
+        self._commanded_ns = 0  # when the velocity was commanded
         self._pending: _Pending | None = None
-        self._up: bool | None = False if options.ground else None  # by the services; on the ground: driving
-        self._refused = ""  # the reason for a refused take-off
+        self._up: bool | None = False if options.ground else None  # whether it flies or drives, by the services
+        self._refused = ""  # why a take-off was refused
         self._warned: set[str] = set()
 
     # From the robot --------------------------------------------------------------------------------------------------
 
     def on_odometry(self, message: Any) -> None:
-        """Publish a feedback."""
+        """Publish feedback."""
         self._odometry_ns = self._clock()
         now_ns = self._received()
         with self._lock:
@@ -116,11 +116,11 @@ class RobotSession:
         self._publish(self._clocks["odom"].captured_ns(stamp_ns, now_ns, self._system_clock()), now_ns)
 
     def on_battery(self, message: Any) -> None:
-        """Keep the battery's state for the next feedback."""
+        """Store the battery's state for the next feedback."""
         self._battery = battery_of(message)
 
     def on_info(self, message: Any) -> None:
-        """Keep the camera's intrinsics for the next frame."""
+        """Store the camera's intrinsics for the next frame."""
         try:
             self._intrinsics = intrinsics_of(message)
         except DecodeError as error:
@@ -158,16 +158,16 @@ class RobotSession:
     # To the robot ----------------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
-        """Accept an action from the capabilities.
+        """Accept an action that is among the capabilities.
 
         Args:
             action: The action.
-            new: Whether an application just requested it; a repeated take-off or landing does not call the service
+            new: Whether an application has just requested it. A repeated take-off or landing does not call the service
                 again.
 
         Raises:
-            DriverError: The robot does not offer the service, sends no data for a take-off, or refused this take-off
-                before.
+            DriverError: The robot does not offer the service, is silent when asked to take off, or has already refused
+                this take-off.
         """
         with self._lock:
             if isinstance(action, Velocity):
@@ -185,7 +185,7 @@ class RobotSession:
         return action
 
     def tick(self) -> None:
-        """Repeat the velocity in force and check the link; call it every :data:`PERIOD_S`."""
+        """Repeat the velocity in force and check the link. Call this every :data:`PERIOD_S`."""
         now_ns = self._clock()
         blind = self._is_blind(now_ns)
         silent_s = self._silent_s(now_ns)
@@ -194,7 +194,7 @@ class RobotSession:
             if blind:
                 self._fields = {}
             if (blind or lost) and self._velocity is not None and now_ns - self._commanded_ns > BLIND_NS:
-                self._velocity = Velocity()  # without odometry its motion is unknown
+                self._velocity = Velocity()  # its motion is unknown without odometry
             if self._velocity is not None:
                 self._robot.send(self._velocity)
             if self._pending is not None and now_ns - self._pending.since_ns > nanoseconds(ANSWER_S):
@@ -205,10 +205,10 @@ class RobotSession:
         if blind and self._odometry_ns is not None:
             self._lose(LinkState.DEGRADED, seconds(now_ns - self._odometry_ns), self._options.odom)
         if not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
-            self._publish(self._received_ns, now_ns)  # without odometry, images at least show that the robot is there
+            self._publish(self._received_ns, now_ns)  # without odometry, images at least show that the robot is present
 
     def close(self) -> None:
-        """Stop the motion: a robot must not continue with an old velocity."""
+        """Stop the robot, which must not continue with an old velocity."""
         with self._lock:
             if self._velocity is not None:
                 self._velocity = None
@@ -224,7 +224,7 @@ class RobotSession:
         if self._pending is not None:
             return self._pending.state
         altitude_m = self._fields.get("altitude_m")
-        told = self._up is not None and not self._measures_height  # by its services, if the odometry may be planar
+        told = self._up is not None and not self._measures_height  # rely on the services if odometry may be planar
         up = self._up if self._options.ground or altitude_m is None or told else altitude_m > AIRBORNE_M
         if up is None:
             return FlightState.UNKNOWN
@@ -239,7 +239,7 @@ class RobotSession:
             self._up = up
             self._robot.send(Velocity())
             return
-        if up and not new:  # call a requested take-off only once, whatever its outcome
+        if up and not new:  # call the take-off service only once per request, whatever the outcome
             if self._refused:
                 raise DriverError(self._refused)
             return
@@ -248,7 +248,7 @@ class RobotSession:
         under_way = self._pending is not None and self._pending.state is state
         there = (self._state is FlightState.LANDED) is not up and self._state is not FlightState.UNKNOWN
         if self._up:
-            there = up  # by the services; a successful take-off may not show yet
+            there = up  # according to the services, because odometry may not show a take-off yet
         if (under_way or there) and not new:
             return
         if not (up or self._up) and self._state is FlightState.LANDED and (self._measures_height or self._up is False):
@@ -271,7 +271,7 @@ class RobotSession:
 
         self._refused = ""
         if not up:
-            self._velocity = Velocity()  # stops it if no node offers the service
+            self._velocity = Velocity()  # stops the robot if no node offers the service
         self._robot.call(service, answered)
         self._velocity, self._pending = None, pending
 
@@ -289,11 +289,11 @@ class RobotSession:
         return now_ns
 
     def _is_blind(self, now_ns: int) -> bool:
-        """Return whether the odometry has stopped, even if other messages still arrive."""
+        """Return whether odometry has stopped arriving, even if other messages still do."""
         return self._odometry_ns is not None and seconds(now_ns - self._odometry_ns) > self._options.timeout_s
 
     def _find(self, now_ns: int) -> None:
-        """Report that the robot is there, once its services are also found or missing for too long."""
+        """Report the robot as found, once its services have been found too or have been missing for too long."""
         missing = self._robot.missing()
         if not missing:
             self._link = LinkState.UP
@@ -322,14 +322,14 @@ class RobotSession:
         self._sink.feedback(feedback)
 
     def _warn_once(self, text: str) -> None:
-        """Emit a warning, once for each text."""
+        """Emit a warning, but only once for each text."""
         if text not in self._warned and len(self._warned) < 8:
             self._warned.add(text)
             self._sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="image")
 
 
 def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
-    """Return the bytes of a ``sensor_msgs/CompressedImage`` as uint8, shape (bytes,), with its width and height."""
+    """Return a ``sensor_msgs/CompressedImage``'s bytes as uint8, shape (bytes,), with the image's width and height."""
     import numpy as np
 
     from skyloop.messages.frame import image_size
@@ -343,14 +343,14 @@ def jpeg_of(message: Any) -> tuple[Any, tuple[int, int]]:
     return data, size
 
 
-PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: an older stamp, or one in the future, is from another clock
+PLAUSIBLE_AGE_NS: Final = 2_000_000_000  #: a stamp that is older than this or in the future is from another clock
 
 
 class CaptureClock:
-    """Maps the stamps of one topic to this host's monotonic clock.
+    """Converts one topic's stamps to this host's monotonic clock.
 
-    A stamp slightly older than the system's clock belongs to that clock. Other stamps come from a simulation or from a
-    clock that is not set; for these the smallest recent delay counts as zero. Times never run backwards.
+    A stamp slightly older than the system clock's time belongs to that clock. Other stamps come from a simulation or
+    an unset clock; for them the smallest recent delay counts as zero. Times never go backwards.
     """
 
     def __init__(self) -> None:
@@ -358,7 +358,7 @@ class CaptureClock:
         self._newest_ns = 0
 
     def captured_ns(self, stamp_ns: int, arrived_ns: int, system_ns: int) -> int:
-        """Return a message's capture time, from its stamp (0: none) and its arrival on both of this host's clocks."""
+        """Return a message's capture time from its stamp (0 for none) and its arrival on both of this host's clocks."""
         age_ns = system_ns - stamp_ns
         if stamp_ns == 0:
             captured_ns = arrived_ns
@@ -371,9 +371,9 @@ class CaptureClock:
 
 
 def state_of(odometry: Any, *, ground: bool) -> dict[str, Any]:
-    """Return the feedback fields in a ``nav_msgs/Odometry``, without values that are not finite.
+    """Return the feedback fields in a ``nav_msgs/Odometry``, leaving out values that are not finite.
 
-    Its pose is in world axes, its twist in body axes; a ground vehicle has no height.
+    The pose is in world axes, the twist in body axes. A ground vehicle has no height.
     """
     found: dict[str, Any] = {}
     turn, place = odometry.pose.pose.orientation, odometry.pose.pose.position
@@ -399,7 +399,7 @@ def battery_of(message: Any) -> dict[str, float | None]:
     """Return the feedback fields in a ``sensor_msgs/BatteryState``."""
     charge, voltage = _finite(message.percentage), _finite(message.voltage)
     if charge is not None and not 0.0 <= charge <= 1.0:
-        charge = charge / 100.0 if 1.0 < charge <= 100.0 else None  # some report per cent
+        charge = charge / 100.0 if 1.0 < charge <= 100.0 else None  # some robots report a percentage
     return {"battery": charge, "battery_v": voltage}
 
 

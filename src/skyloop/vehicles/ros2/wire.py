@@ -1,13 +1,13 @@
-"""Convert numbers of ROS 2's messages from those of Skyloop, and back. Pure.
+"""Conversions between the values in ROS 2 messages and Skyloop's. Pure.
 
-Axes are the same on both sides (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical
-axes x right, y down, z forward. The differences: Skyloop's velocity is in the body's *levelled* axes, a twist's in body
-axes; angles are quaternions; and unknown values are a covariance of -1, or NaN.
+Both use the same axes (REP 103): body x forward, y left, z up; world x east, y north, z up; a camera's optical axes x
+right, y down, z forward. They differ in this: Skyloop's velocity is in the body's *levelled* axes, a twist is in body
+axes; ROS 2 uses quaternions for angles, and a covariance of -1 or NaN for unknown values.
 
-A ``tf2_msgs/msg/TFMessage`` is built as bytes, as its package can only be installed with a distribution of ROS 2. The
-bytes are OMG's Common Data Representation, version 1, little-endian, as in DDS: a header of four bytes, then the fields
-in order, each number aligned to its size, counted from the end of the header. A text is its length with the closing
-zero, the text, and the zero.
+A ``tf2_msgs/msg/TFMessage`` is built as bytes, because its package can be installed only with a ROS 2 distribution. The
+format is OMG's Common Data Representation, version 1, little-endian, as in DDS: a four-byte header, then the fields in
+order, each number aligned to its size, counted from the end of the header. A string is its length, including the
+terminating zero, followed by the text and the zero.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler
 
 Quaternion = tuple[float, float, float, float]  #: x, y, z, w
 
-NOT_KNOWN: Final = -1.0  #: first number of a covariance without measurement (sensor_msgs/Imu)
-#: Variance reported for values without a measured one: "about right", not "exact" [m², (m/s)², rad² …].
+NOT_KNOWN: Final = -1.0  #: first number of the covariance of something not measured (sensor_msgs/Imu)
+#: Variance reported where none was measured, meaning "about right" rather than "exact" [m², (m/s)², rad² …].
 VARIANCE: Final = 0.01
 
-#: Pixel formats, as in ``sensor_msgs/image_encodings.hpp``: bytes per pixel and their order.
+#: Bytes per pixel and their order for each pixel format in ``sensor_msgs/image_encodings.hpp``.
 _PIXELS: Final[dict[str, tuple[int, tuple[int, ...] | None, Encoding]]] = {
     "bgr8": (3, None, Encoding.BGR8),
     "8UC3": (3, None, Encoding.BGR8),
@@ -48,7 +48,7 @@ _PIXELS: Final[dict[str, tuple[int, tuple[int, ...] | None, Encoding]]] = {
 
 
 def stamp_of(ns: int) -> tuple[int, int]:
-    """Return seconds and nanoseconds of a ``builtin_interfaces/Time``."""
+    """Return the seconds and nanoseconds for a ``builtin_interfaces/Time``."""
     return divmod(ns, NS_PER_S)
 
 
@@ -58,13 +58,13 @@ def nanoseconds_of(stamp: Any) -> int:
 
 
 class ClockMap:
-    """Maps times of a proxy's monotonic clock to ROS time.
+    """Converts times on a proxy's monotonic clock to ROS time.
 
-    The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that stamps have the
-    intervals of the captures. A larger error means that a clock was set, or that ROS time is a simulation's.
+    The offset between the clocks is kept until it is wrong by more than ``tolerance_s``, so that the intervals between
+    stamps equal those between captures. A larger error means that a clock was set, or that ROS time is simulated.
 
     Args:
-        tolerance_s: [s]
+        tolerance_s: Greatest error with which the offset is kept [s].
     """
 
     def __init__(self, tolerance_s: float = 1e-3) -> None:
@@ -72,7 +72,7 @@ class ClockMap:
         self._offset_ns: int | None = None
 
     def to_ros(self, captured_ns: int, now_ns: int, ros_now_ns: int) -> int | None:
-        """Return the time of a capture as ROS time [ns]; None if unknown or before zero."""
+        """Convert a capture time to ROS time [ns]; None if it is unknown or before zero."""
         if ros_now_ns <= 0:
             return None
         offset_ns = ros_now_ns - now_ns
@@ -107,7 +107,7 @@ def euler_of(quaternion: Quaternion) -> tuple[float, float, float] | None:
 
 
 def quaternion_of(rotation: tuple[float, ...]) -> Quaternion:
-    """Return the unit quaternion of a rotation matrix, given row by row (9 numbers).
+    """Return the unit quaternion for a rotation matrix given row by row (9 numbers).
 
     Source: S. W. Shepperd, "Quaternion from Rotation Matrix", Journal of Guidance and Control 1(3), 1978.
     """
@@ -130,24 +130,24 @@ def quaternion_of(rotation: tuple[float, ...]) -> Quaternion:
 
 
 def body_velocity(levelled: Vector, roll: float, pitch: float) -> Vector:
-    """Return a velocity in body axes, from one in the body's levelled axes [m/s]."""
+    """Convert a velocity [m/s] from the body's levelled axes to body axes."""
     x, y, z = rotation_from_euler(roll, pitch, 0.0).T @ np.array(levelled)
     return float(x), float(y), float(z)
 
 
 def levelled_velocity(body: Vector, roll: float, pitch: float) -> Vector:
-    """Return a velocity in the body's levelled axes, from one in body axes [m/s]."""
+    """Convert a velocity [m/s] from body axes to the body's levelled axes."""
     x, y, z = rotation_from_euler(roll, pitch, 0.0) @ np.array(body)
     return float(x), float(y), float(z)
 
 
 def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> list[float]:
-    """Return a covariance matrix, row by row: ``variance`` on its diagonal, or :data:`NOT_KNOWN` as its first number.
+    """Return a covariance matrix row by row, with ``variance`` on its diagonal or :data:`NOT_KNOWN` as first number.
 
     Args:
         size: Number of rows.
-        known: Whether its quantity was measured.
-        variance: [square of the unit]
+        known: Whether the quantity was measured.
+        variance: The variance, in the square of the quantity's unit.
     """
     found = [0.0] * (size * size)
     if not known:
@@ -161,7 +161,7 @@ def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> 
 
 
 class CameraModel(NamedTuple):
-    """Content of a ``sensor_msgs/CameraInfo``, row by row; without intrinsics all zero, as usual in ROS."""
+    """Content of a ``sensor_msgs/CameraInfo``, row by row; all zero if there are no intrinsics, as usual in ROS."""
 
     model: str
     d: list[float]
@@ -191,14 +191,14 @@ def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
     )
 
 
-#: Possible numbers of coefficients in OpenCV's pinhole distortions; missing ones are zero.
+#: Possible numbers of coefficients in OpenCV's distortion models for pinhole cameras; missing ones are zero.
 _LENGTHS: Final = (0, 4, 5, 8, 12, 14)
 _FISHEYES: Final = ("equidistant", "fisheye")
 _PINHOLES: Final = ("", "plumb_bob", "rational_polynomial", "thin_prism", "pinhole")
 
 
 def intrinsics_of(info: Any) -> Intrinsics | None:
-    """Return the intrinsics of a ``sensor_msgs/CameraInfo``; None for an uncalibrated camera."""
+    """Return the intrinsics in a ``sensor_msgs/CameraInfo``; None for an uncalibrated camera."""
     k = [float(each) for each in info.k]
     d = [float(each) for each in info.d]
     if not (all(map(math.isfinite, (*k, *d))) and k[0] > 0.0 and k[4] > 0.0):
@@ -218,13 +218,13 @@ def intrinsics_of(info: Any) -> Intrinsics | None:
 
 
 def skew_of(info: Any) -> float:
-    """Return the skew of a ``sensor_msgs/CameraInfo`` [px], which :class:`Intrinsics` does not have."""
+    """Return the skew in a ``sensor_msgs/CameraInfo`` [px], which :class:`Intrinsics` can't represent."""
     skew = float(info.k[1])
     return skew if math.isfinite(skew) else 0.0
 
 
-#: Encodings that OpenCV converts to BGR: rows and bytes per row for a height and width in pixels, and OpenCV's name.
-#: ROS names a Bayer pattern by the first two pixels of a row, OpenCV by the second and third of the second row.
+#: Encodings that OpenCV converts to BGR: rows per pixel of height, bytes per pixel of width, and OpenCV's name. ROS
+#: names a Bayer pattern after the first two pixels of a row, OpenCV after the second and third of the second row.
 _CONVERTED: Final[dict[str, tuple[float, int, str]]] = {
     "yuv422": (1, 2, "YUV2BGR_UYVY"),
     "uyvy": (1, 2, "YUV2BGR_UYVY"),
@@ -245,10 +245,10 @@ ENCODINGS: Final = (*_PIXELS, _WIDE, *_CONVERTED)
 def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
     """Return the pixels of a ``sensor_msgs/Image`` as C-contiguous uint8 without padding, and their encoding.
 
-    16-bit values lose their lower eight bits.
+    16-bit values are reduced to their upper eight bits.
 
     Raises:
-        DecodeError: Unknown encoding, a size that does not fit the data, or OpenCV is missing.
+        DecodeError: The encoding is unknown, the size does not fit the data, or OpenCV is missing.
     """
     given = image.encoding if image.encoding in _PIXELS else str(image.encoding).lower()
     if given in _PIXELS:
@@ -276,13 +276,13 @@ def pixels_of(image: Any) -> tuple[NDArray[np.uint8], Encoding]:
         ) from error
     try:
         found = cv2.cvtColor(np.ascontiguousarray(rows), getattr(cv2, f"COLOR_{name}"))
-    except cv2.error as error:  # an odd width or height, which this encoding cannot halve
+    except cv2.error as error:  # an odd width or height, which this encoding does not allow
         raise DecodeError(f"an image of {image.width}×{image.height} {image.encoding} can't be converted") from error
     return np.ascontiguousarray(found, dtype=np.uint8), Encoding.BGR8
 
 
 def _rows(image: Any, high: float, wide: int) -> NDArray[np.uint8]:
-    """Return the rows of an image without padding: ``high`` rows per row of pixels, ``wide`` bytes per pixel."""
+    """Return an image's rows without padding: ``high`` rows per row of pixels and ``wide`` bytes per pixel."""
     height, width, step = int(image.height), int(image.width), int(image.step)
     data = np.frombuffer(image.data, np.uint8)
     rows, row = math.ceil(height * high), width * wide
@@ -294,18 +294,18 @@ def _rows(image: Any, high: float, wide: int) -> NDArray[np.uint8]:
 
 
 def _upper(rows: NDArray[np.uint8], image: Any) -> NDArray[np.uint8]:
-    """Return the upper bytes of rows of 16-bit numbers."""
+    """Return the upper bytes in rows of 16-bit numbers."""
     return rows[:, 0 if getattr(image, "is_bigendian", 0) else 1 :: 2]
 
 
 TYPE_NAME: Final = "tf2_msgs/msg/TFMessage"
-#: Hash of its definition, by REP 2011; ``tests/integration/third_party/ros2_bag.py`` compares it with rosbags' hash.
+#: Hash of TFMessage's definition (REP 2011); ``tests/integration/third_party/ros2_bag.py`` compares it with rosbags'.
 TYPE_HASH: Final = bytes.fromhex("e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087")
 _LITTLE_ENDIAN_CDR: Final = b"\x00\x01\x00\x00"
 
 
 class Transform(NamedTuple):
-    """One ``geometry_msgs/TransformStamped``: the pose of ``child`` in the axes of ``parent``."""
+    """A ``geometry_msgs/TransformStamped``: the pose of ``child`` in the axes of ``parent``."""
 
     stamp_ns: int  #: ROS time
     parent: str

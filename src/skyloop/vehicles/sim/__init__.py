@@ -1,1 +1,1 @@
-"""``sim://``: a simulated drone in a simulated world, alone or with others on the same host."""
+"""``sim://`` addresses: simulated drones, each in a separate world or sharing one on a host."""

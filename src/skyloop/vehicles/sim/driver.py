@@ -1,4 +1,4 @@
-"""The driver of ``sim://``: one simulated drone, in its own world or in a shared one."""
+"""The driver for ``sim://`` addresses: one simulated drone, in its own world or in a shared one."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class SimDriver(Driver):
     axes. ``sim.time_s`` is the simulation's own time.
 
     With ``autopilot`` in the address, real firmware flies the drone. Capabilities, feedback and most parameters are
-    then those of the firmware's driver (``mavlink://``, ``msp://``), the rest as for any simulated drone; see
-    ``docs/autopilots.md``.
+    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else is as for any simulated drone.
+    See ``docs/autopilots.md``.
 
     Args:
-        uri: The vehicle's address. With a host, only its options for firmware count; the host determines the rest.
-        host: A shared world; None: :meth:`open` makes one.
-        drone: Its number in the host.
+        uri: The vehicle's address. If a host is given, it determines everything except the options for firmware.
+        host: A shared world; None to let :meth:`open` create one.
+        drone: Number of the drone on the host.
     """
 
     def __init__(self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0) -> None:
@@ -76,18 +76,18 @@ class SimDriver(Driver):
         if host is not None:
             self.options = replace(host.options, autopilot=own.autopilot, autopilot_folder=own.autopilot_folder)
         self.drone = drone
-        self.host = host  #: the world; None until a driver with its own world is opened
+        self.host = host  #: the world; None until :meth:`open` unless a shared one was given
         self._shared = host is not None
         self._changing = threading.Lock()
         self._limits = Limits()
         self._models = self.options.cameras
-        self._wind: Wind | None = None  # as written before opening
+        self._wind: Wind | None = None  # the value written before opening
         self._battery = self.options.battery
         self._link = True
         self._setpoints: SetpointController | None = None
         self._cameras: tuple[Camera, ...] = ()
         self._world: World | None = None
-        self._firmware: FirmwareFlight | None = None  # None: the built-in autopilot flies
+        self._firmware: FirmwareFlight | None = None  # None if the built-in autopilot flies the drone
         if self.options.autopilot is not None:
             from skyloop.vehicles.sim.firmware_flight import FirmwareFlight
 
@@ -95,11 +95,11 @@ class SimDriver(Driver):
 
     @property
     def firmware(self) -> FirmwareFlight | None:
-        """The real firmware that flies the drone; None with the built-in autopilot."""
+        """The real firmware that flies the drone; None if the built-in autopilot does."""
         return self._firmware
 
     def capabilities(self) -> Capabilities:
-        """Return the actions and cameras in the address."""
+        """Return the actions and cameras that the address selects."""
         if self._firmware is not None:
             return self._firmware.capabilities(self.options)
         return Capabilities(
@@ -138,7 +138,7 @@ class SimDriver(Driver):
         self._battery = self.options.battery
 
     def _in_force(self, limits: Limits) -> Limits:
-        """Return the limits in force. With set-points alone, the drone's own take-off only lifts it off."""
+        """Return the limits in force. If only set-points are native, the drone's own take-off just lifts it off."""
         if self._setpoints is None:
             return limits
         return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
@@ -152,7 +152,7 @@ class SimDriver(Driver):
             return super()._apply(action)
         host = self.host
         if host is None or self._sink is None or not self._link:
-            return action  # lost, as the drone receives nothing
+            return action  # lost, because the drone receives nothing
         return self._command(host, action)
 
     def _repeat(self, action: AnyAction) -> AnyAction:
@@ -164,11 +164,11 @@ class SimDriver(Driver):
             self._firmware.driver.check(action)
 
     def left_to(self) -> str:
-        """Return the firmware mode that others selected; empty for the built-in autopilot."""
+        """Return the firmware's mode if another operator selected it; empty for the built-in autopilot."""
         return "" if self._firmware is None else self._firmware.driver.left_to()
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action of the failsafe, as the firmware's driver does."""
+        """Apply an action requested by the failsafe, in the same way as the firmware's driver."""
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:
@@ -179,7 +179,7 @@ class SimDriver(Driver):
             self._firmware.external_pose(pose)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return preflight findings about the firmware."""
+        """Return the firmware's preflight findings."""
         return [] if self._firmware is None else self._firmware.driver.checkup()
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
@@ -200,8 +200,8 @@ class SimDriver(Driver):
         """Write a parameter. The wind is shared by the whole world.
 
         Raises:
-            UnknownNameError: No such parameter.
-            ParameterError: A wrong value.
+            UnknownNameError: There is no parameter with this name.
+            ParameterError: The value is invalid.
         """
         if self._firmware is not None and name not in table.names(self._present()):
             return self._firmware.driver.set_parameter(name, value)
@@ -253,7 +253,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio. A drone without reception holds its position, as real ones do."""
+        """Switch the simulated radio on or off. Like real drones, one without reception holds its position."""
         sink = self._sink
         if sink is None:
             return
@@ -271,7 +271,7 @@ class SimDriver(Driver):
     # Called by the host on its threads -------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Publish the drone's estimated and true state. Runs on a thread of the host."""
+        """Publish the drone's estimated and true state. Runs on one of the host's threads."""
         believed, sink = report.believed, self._sink
         self._battery = believed.battery
         if self._firmware is not None:
@@ -286,7 +286,7 @@ class SimDriver(Driver):
         sink.feedback(feedback_of(report, state, self.options))
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Emit a collision, an emergency or a low battery. Runs on a thread of the host."""
+        """Emit an event for a collision, an emergency or a low battery. Runs on one of the host's threads."""
         sink = self._sink
         if sink is None or not self._link:
             return
@@ -298,12 +298,12 @@ class SimDriver(Driver):
             sink.event(kind, occurrence.text, severity, reason=reason)
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many images per second of this camera have a recipient."""
+        """Return the rate at which images from this camera are needed [1/s]."""
         sink = self._sink
         return sink.wanted_fps(camera) if sink is not None and self._link else 0.0
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """Publish a due image: BGR, uint8, shape (height, width, 3)."""
+        """Publish an image: BGR, uint8, shape (height, width, 3)."""
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
@@ -316,20 +316,20 @@ class SimDriver(Driver):
             )
 
     def failed(self, error: Exception) -> None:
-        """Emit an event for an error of the simulation or the renderer."""
+        """Emit an event for an error in the simulation or the renderer."""
         sink = self._sink
         if sink is not None:
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
 
 
-LIFT_M_S: Final = 0.05  #: a climb of more than this starts the motors
+LIFT_M_S: Final = 0.05  #: a set-point that climbs faster than this starts the motors
 DOWN_M: Final = 0.08  #: below this height, a descending drone counts as landed
 
 
 class SetpointController:
-    """Starts the motors when a set-point climbs, and stops them on the ground when one descends.
+    """Starts the motors for a set-point that climbs, and stops them on the ground for one that descends.
 
-    The simulated firmware accepts set-points only in the air, so its own take-off to the least height comes first.
+    The simulated firmware accepts set-points only in the air, so its own take-off to the lowest height comes first.
     """
 
     def __init__(self, simulation: Simulation, drone: int) -> None:
@@ -339,7 +339,7 @@ class SetpointController:
         self._setpoint: Attitude | Velocity | None = None
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Command the drone like :meth:`Simulation.command`, but accept set-points in every state."""
+        """Command the drone as :meth:`Simulation.command` does, but accept set-points in every state."""
         with self._lock:
             if not isinstance(action, Attitude | Velocity):
                 self._setpoint = None
@@ -349,13 +349,13 @@ class SetpointController:
         return action if applied is None else applied
 
     def on_feedback(self, believed: VehicleFeedback) -> None:
-        """Apply the set-point in force to the newest reported state."""
+        """Start or stop the motors as the set-point in force requires in the newest reported state."""
         with self._lock:
             if self._setpoint is not None:
                 self._follow(believed.state, believed)
 
     def reported_state(self, state: FlightState) -> FlightState:
-        """Return the state that such a vehicle reports: it does not distinguish hovering, taking off and landing."""
+        """Return the state as reported by a vehicle that does not distinguish hovering, taking off and landing."""
         return FlightState.FLYING if state.airborne else state
 
     def _follow(self, state: FlightState, believed: VehicleFeedback) -> AnyAction | None:

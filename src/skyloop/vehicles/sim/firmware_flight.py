@@ -1,4 +1,4 @@
-"""A simulated drone flown by real firmware: its process, and the driver that treats it like a real vehicle."""
+"""A simulated drone flown by real firmware: the process, and the driver that treats it as a real vehicle."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKi
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
-#: Unopened drivers' addresses: a vehicle's capabilities do not depend on its address.
+#: Addresses for drivers that are not opened, because capabilities do not depend on the address.
 _SOMEWHERE: Final = {
     AutopilotKind.ARDUPILOT: "mavlink://udpin:127.0.0.1:14550",
     AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
@@ -58,30 +58,30 @@ _SEVERITIES: Final = {
     FirmwareEventKind.FAILED: Severity.ERROR,
     FirmwareEventKind.DEAF: Severity.INFO,
 }
-_KEPT_REPORTS: Final = 64  # for the truth at the time of delayed feedback
-_POSE_STD_M: Final = 0.001  # stated accuracy of the true position
-#: Largest age of the firmware's reported state, as it arrives over loopback. In a simulation slower than real time the
-#: firmware's clock is slow as well; its driver trusts that clock and would report a larger age.
+_KEPT_REPORTS: Final = 64  # number of reports kept, to find the truth at the time of delayed feedback
+_POSE_STD_M: Final = 0.001  # standard deviation that is stated for the true position
+#: Greatest age of the firmware's reported state, which arrives over loopback. If the simulation is slower than real
+#: time, so is the firmware's clock; its driver trusts that clock and would report a greater age.
 _OLDEST_NS: Final = nanoseconds(0.05)
 _LINK_OFF: Final = "the simulated radio is switched off (parameter sim.link)"
 
 
 class FirmwareFlight:
-    """Starts one drone's firmware and relays its driver's reports together with the simulation's truth."""
+    """Starts one drone's firmware and relays its driver's reports, adding the simulation's truth."""
 
     def __init__(self, options: SimOptions, inner_options: str) -> None:
         assert options.autopilot is not None
         self.kind = AutopilotKind(options.autopilot)
         self._options = options
         self._inner_options = inner_options
-        self._pattern = make_driver(self._address(_SOMEWHERE[self.kind]))  # raises for an unknown option
-        self._lock = threading.Lock()  # for opening and closing the inner driver
+        self._pattern = make_driver(self._address(_SOMEWHERE[self.kind]))  # raises an error for an unknown option
+        self._lock = threading.Lock()  # held while opening or closing the inner driver
         self._sink: Sink | None = None
         self._host: SimHost | None = None
         self._drone = 0
         self._firmware: CoupledFirmware | None = None
         self._inner: Driver | None = None
-        self._found = False  # its driver has received data since its start
+        self._found = False  # whether its driver has received data since the start
         self._linked = False  # whether the firmware's driver should be open
         self._reports: deque[Report] = deque(maxlen=_KEPT_REPORTS)
 
@@ -92,16 +92,16 @@ class FirmwareFlight:
 
     @property
     def firmware(self) -> CoupledFirmware | None:
-        """The firmware, while the driver is open."""
+        """The firmware; None unless the driver is open."""
         return self._firmware
 
     @property
     def driver(self) -> Driver:
-        """The firmware's driver; before opening, an unopened one of its kind."""
+        """The firmware's driver; before :meth:`open`, an unopened driver of the same kind."""
         return self._inner or self._pattern
 
     def capabilities(self, options: SimOptions) -> Capabilities:
-        """Return the capabilities of the firmware's driver, with the simulated cameras."""
+        """Return the capabilities of the firmware's driver, but with the simulated cameras."""
         inner = self._pattern.capabilities()
         return Capabilities(
             vehicle="sim",
@@ -113,11 +113,11 @@ class FirmwareFlight:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, host: SimHost, drone: int, sink: Sink) -> None:
-        """Start the firmware and let it fly the drone; its driver opens once the process runs."""
+        """Start the firmware and let it fly the drone; its driver is opened once the process is running."""
         self._host, self._drone, self._sink = host, drone, sink
         folder = Path(self._options.autopilot_folder) if self._options.autopilot_folder else None
         if folder is not None and host.drones > 1:
-            folder /= f"drone{drone + 1}"  # each has its own settings
+            folder /= f"drone{drone + 1}"  # each drone has its own settings
         instruments = rotors_of(host.simulation.parameters[drone]).instruments
         self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
         self._linked, self._found = True, False
@@ -141,7 +141,7 @@ class FirmwareFlight:
         self._reports.clear()
 
     def switch_link(self, *, on: bool) -> None:
-        """Open or close the firmware's driver: without it the vehicle is out of radio range."""
+        """Open or close the firmware's driver; while it is closed, the vehicle is out of radio range."""
         if on:
             self._linked = True
             self._open_driver()
@@ -176,9 +176,9 @@ class FirmwareFlight:
             sink.link(LinkState.LOST, event.text, "fix the named problem; the start is retried")
 
     def link(self, state: LinkState, reason: str) -> tuple[LinkState, str, str]:
-        """Translate a link state of the firmware's driver, with a reason and remedy for this drone.
+        """Translate a link state reported by the firmware's driver, with a reason and remedy that fit this drone.
 
-        The driver believes that it talks to a vehicle that someone else starts, at an address given by a person.
+        The driver assumes a vehicle that is started separately, at an address that a user has given.
         """
         self._found = self._found or state in (LinkState.UP, LinkState.DEGRADED)
         if not self._found:
@@ -190,7 +190,7 @@ class FirmwareFlight:
     # Flying ----------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, *, new: bool) -> AnyAction:
-        """Pass an action to the firmware's driver; without a link it is lost."""
+        """Pass an action to the firmware's driver; it is lost if there is no link."""
         inner = self._inner
         return action if inner is None else inner.apply(action, new=new)
 
@@ -204,19 +204,19 @@ class FirmwareFlight:
     # Called by the host and by the inner driver ----------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """Keep the truth for later feedback; pass it to a vehicle that needs an external position."""
+        """Store the truth for later feedback, and pass it to a vehicle that needs an external position."""
         self._reports.append(report)
         inner = self._inner
         if self.kind is AutopilotKind.BETAFLIGHT and self._options.position and inner is not None:
             truth = report.truth
-            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # its clock is the computer's clock
+            captured_ns = max(report.captured_ns, monotonic_ns() - _OLDEST_NS)  # the firmware uses the computer's clock
             with suppress(DriverError, UnsupportedError):
                 inner.external_pose(
                     ExternalPose(truth.position_m, truth.quaternion, captured_ns, position_std_m=_POSE_STD_M)
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback with the true state at its time, as far as known yet."""
+        """Return the firmware's feedback with the true state at the same time, as far as it is known yet."""
         reports = tuple(self._reports)
         if not reports:
             return feedback
@@ -226,7 +226,7 @@ class FirmwareFlight:
 
 
 class _InnerSink:
-    """Relays the reports of the firmware's driver."""
+    """Relays reports from the firmware's driver."""
 
     def __init__(self, flight: FirmwareFlight, sink: Sink) -> None:
         self._flight = flight
@@ -246,7 +246,7 @@ class _InnerSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        raise NotImplementedError  # the simulated cameras' pictures take another path
+        raise NotImplementedError  # the simulated cameras' images take another path
 
     def wants(self, camera: str) -> bool:  # noqa: ARG002
         return False
@@ -284,7 +284,7 @@ def make_firmware(
     instruments: InstrumentParameters,
     folder: Path | None = None,
 ) -> CoupledFirmware:
-    """Return a firmware that is not started yet."""
+    """Return the firmware, not started yet."""
     if kind is AutopilotKind.ARDUPILOT:
         from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 

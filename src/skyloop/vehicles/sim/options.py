@@ -1,18 +1,18 @@
-"""Options of a ``sim://`` address. Pure.
+"""Options in a ``sim://`` address. Pure.
 
-Options: ``world``, its name or file (``room``); ``seed`` (0); ``speed``, seconds of simulation per second (1);
-``cameras`` (``front,bottom``; ``fpv`` is a racer's, wide and tilted up; or ``none``); ``width``, ``height``, ``fps`` of
-all cameras; ``latency`` of all cameras [s]; ``noise``, a factor on the noise of all sensors and cameras (1); ``wind``,
-a factor on the world's wind (1); ``battery``, charge at the start, 0 to 1 (1); ``quality`` of the cameras' images,
-``fast``, ``smooth`` or ``best`` (``smooth``); ``native``, the vehicle's own actions, while the proxy provides the
-others (all); ``position``, whether the vehicle knows its position, as with an indoor positioning system (1; ``none``
-for one without); ``velocity``, whether it reports its velocity (1; ``none`` for one that does not); ``truth``, whether
-feedback also contains the true state (1); ``rate`` of feedback [1/s] (40); ``vehicle``, either with an identified
-response, ``quadrotor`` or ``ardrone``, or modelled down to its rotors, ``racer``, ``iris`` or ``crazyflie``
-(``quadrotor``); ``autopilot``, the real firmware that flies it, ``ardupilot``, ``betaflight`` or ``px4`` (none), by
-default on an ``iris``, or a ``racer`` for Betaflight; ``autopilot_folder``, the folder for its settings (by default
-they last as long as the drone). With ``autopilot``, all other options and ``rate`` are those of the firmware's driver,
-``mavlink://`` or ``msp://``.
+The options, with defaults in parentheses: ``world``, a name or file (``room``); ``seed`` (0); ``speed``, simulated
+seconds per second (1); ``cameras``, which can also be ``fpv`` (a racer's, wide and tilted up) or ``none``
+(``front,bottom``); ``width``, ``height`` and ``fps`` of all cameras; ``latency`` of all cameras [s]; ``noise``, a
+factor for the noise of all sensors and cameras (1); ``wind``, a factor for the world's wind (1); ``battery``, the
+initial charge, 0 to 1 (1); ``quality`` of the cameras' images, ``fast``, ``smooth`` or ``best`` (``smooth``);
+``native``, the actions that the vehicle provides itself, leaving the others to the proxy (all); ``position``, whether
+the vehicle knows its position, as with an indoor positioning system, or ``none`` (1); ``velocity``, whether it reports
+its velocity, or ``none`` (1); ``truth``, whether feedback also contains the true state (1); ``rate`` of feedback [1/s]
+(40); ``vehicle``, with an identified response, ``quadrotor`` or ``ardrone``, or modelled down to its rotors, ``racer``,
+``iris`` or ``crazyflie`` (``quadrotor``); ``autopilot``, the real firmware that flies it, ``ardupilot``,
+``betaflight`` or ``px4`` (none), by default on an ``iris``, or on a ``racer`` for Betaflight; ``autopilot_folder``, the
+folder for its settings (by default they last as long as the drone). With ``autopilot``, ``rate`` and all options not
+listed here are those of the firmware's driver, ``mavlink://`` or ``msp://``.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.BETAFLIGHT: "racer",
     AutopilotKind.PX4: "iris",
 }
-#: Firmware that uses the computer's clock never catches up: world time would fall behind, and images would look old.
+#: Firmware on the computer's clock can't catch up: world time would fall behind, and images would appear old.
 REAL_TIME_LAG_S: Final = 0.02  #: lag beyond which steps are skipped with such firmware
-TRUTH_HZ: Final = 100.0  #: how often to store the truth that goes with the firmware's state
+TRUTH_HZ: Final = 100.0  #: rate at which the truth that accompanies the firmware's state is stored
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
@@ -89,7 +89,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
 
 
 def firmware_options(uri: VehicleUri) -> str:
-    """Return the options for the firmware's driver, as a query."""
+    """Return the options for the firmware's driver as a query string."""
     own = KNOWN - {"rate"}
     return urlencode({name: uri.reveal(name) for name in uri.options if name not in own}, safe="/,:")
 
@@ -120,7 +120,7 @@ def _models(text: str) -> list[CameraModel]:
 
 
 def _camera(uri: VehicleUri, standard: CameraModel, noise: float) -> CameraModel:
-    """Return the standard camera with another size: the horizontal field of view stays, rows are cut or added."""
+    """Return the standard camera with another size, cutting or adding rows but keeping the horizontal field of view."""
     width = uri.whole("width", 0, minimum=16, maximum=4096)
     height = uri.whole("height", 0, minimum=16, maximum=4096)
     width = width or (round(height * standard.width / standard.height) if height else standard.width)

@@ -1,4 +1,4 @@
-"""The parameters of a simulated drone: its limits, its cameras, its battery, the wind and its radio link."""
+"""A simulated drone's parameters: limits, cameras, battery, wind and radio link."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from skyloop.sim.parameters import LIMIT_RANGES, Limits
 from skyloop.sim.world import Room, Wind, World
 from skyloop.zones import ROOM, Box
 
-#: Parameter, field of :class:`Limits`, unit, description.
+#: Each limit's parameter, field in :class:`Limits`, unit and description.
 _LIMITS: Final = (
     ("limits.tilt", "tilt_rad", "rad", "greatest roll and pitch"),
     ("limits.climb", "climb_m_s", "m/s", "greatest climb and descent"),
@@ -25,7 +25,7 @@ _LIMITS: Final = (
     ("limits.speed", "speed_m_s", "m/s", "greatest horizontal speed of a velocity set-point"),
     ("limits.takeoff_altitude", "takeoff_altitude_m", "m", "where a take-off ends"),
 )
-#: Last part of the name, field of :class:`CameraModel`, unit, range, description.
+#: Each camera parameter's last part of the name, field in :class:`CameraModel`, unit, range and description.
 _CAMERA: Final = (
     ("fps", "fps", "1/s", (0.1, 240.0), "pictures a second of simulated time"),
     ("latency", "latency_s", "s", (0.0, 5.0), "from exposure to delivery"),
@@ -36,7 +36,7 @@ _CAMERA: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ParameterValues:
-    """The values of all parameters of one drone. Limits are None if its firmware has its own."""
+    """The values of one drone's parameters. Limits are None if its firmware has its own."""
 
     limits: Limits | None
     cameras: tuple[CameraModel, ...]
@@ -51,7 +51,7 @@ class _Settable(NamedTuple):
 
 
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
-    """Return all parameters with their present values; ``standard`` contains the defaults."""
+    """Return all parameters with their present values; ``standard`` provides the defaults."""
     return [entry.parameter for entries in _GROUPS.values() for entry in entries(state, standard)]
 
 
@@ -61,7 +61,7 @@ def names(state: ParameterValues) -> frozenset[str]:
 
 
 def room(room: Room) -> Parameter:
-    """Return the parameter with the room's walls, which the proxy uses to refuse positions beyond them."""
+    """Return the parameter that describes the room's walls, beyond which the proxy refuses positions."""
     x, y, z = room.size_m
     walls = str(Box((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)))
     text = "walls of the simulated room, as a box"
@@ -69,17 +69,17 @@ def room(room: Room) -> Parameter:
 
 
 def geometry(world: World) -> Parameter:
-    """Return the parameter with the objects in the world, for maps."""
+    """Return the parameter that describes the objects in the world, for maps."""
     text = encode_world(geometry_of(world))
     return Parameter(WORLD, ParameterType.TEXT, text, read_only=True, description="objects in the world, as JSON")
 
 
 def with_value(state: ParameterValues, name: str, value: Value) -> tuple[ParameterValues, Value]:
-    """Return the values after writing one, and that value as written.
+    """Return the values after writing one of them, and that value as written.
 
     Raises:
-        UnknownNameError: No such parameter.
-        ParameterError: A wrong value.
+        UnknownNameError: There is no parameter with this name.
+        ParameterError: The value is invalid.
     """
     group = _GROUPS.get(name.partition(".")[0])
     for entry in group(state, state) if group is not None else ():
@@ -184,12 +184,12 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
     ]
 
 
-#: The source of each group's parameters, by the first part of their names.
+#: Function that lists each group's parameters, by the first part of their names.
 _GROUPS: Final = {"limits": _limit_entries, "camera": _camera_entries, "sim": _world_entries}
 
 
 def _checked(parameter: Parameter, value: Value) -> Value:
-    """Return a value in written form: a bool, a float, or a tuple of three."""
+    """Return a value as it is written: a bool, a float, or a tuple of three."""
     kind, name = parameter.type, parameter.name
     if kind is ParameterType.BOOL:
         if not isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Convert the simulator's report of a drone to feedback. Pure."""
+"""Converts the simulator's reports about a drone to feedback. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skyloop.sim.world import Vec3
 
 
 def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feedback:
-    """Return a report as feedback.
+    """Convert a report to feedback.
 
     Args:
         report: The drone's estimated and true state, on this host's clock.
@@ -43,7 +43,7 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
 
 
 def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
-    """Return the simulation's time and, if reported, the truth as native telemetry."""
+    """Return the simulation time and, if reported, the truth as native telemetry."""
     native: dict[str, Value] = {"sim.time_s": report.truth.time_s}
     if not options.truth:
         return native
@@ -62,9 +62,9 @@ def native_of(report: Report, options: SimOptions) -> dict[str, Value]:
 
 
 def truth_at(reports: Sequence[Report], captured_ns: int) -> Report:
-    """Return the report at a time, interpolating the drone's true motion between its two neighbours.
+    """Return a report for the given time, interpolating the drone's true motion between the two nearest reports.
 
-    ``reports`` is sorted and not empty; times outside it get the first or last report.
+    ``reports`` must be sorted and not empty; for times outside its range, the first or last report is returned.
     """
     after = bisect_right(reports, captured_ns, key=lambda report: report.captured_ns)
     if after == 0:

@@ -1,1 +1,1 @@
-"""``tello://HOST``: the Ryze Tello and its text protocol."""
+"""``tello://`` addresses: the Ryze Tello and its text protocol."""

@@ -1,4 +1,4 @@
-"""The driver of ``tello://``, which joins link, video and parameters."""
+"""The driver for ``tello://``, which combines the link, the video and the parameters."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class TelloDriver(Driver):
         self._link: TelloLink | None = None
         self._settings: DroneSettings | None = None
         self._video: LiveVideo | None = None
-        self._video_ns = 0  # arrival of the last picture
+        self._video_ns = 0  # when the last image arrived
 
     def capabilities(self) -> Capabilities:
         """Return the drone's capabilities.
 
-        The list includes the camera that looks down, although only SDK 3.0 can switch to it.
+        They include the downward camera, although only SDK 3.0 can switch to it.
         """
         return Capabilities(
             vehicle="tello",
@@ -54,7 +54,7 @@ class TelloDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.video:
-            TelloVideo()  # raises if PyAV is not installed
+            TelloVideo()  # raises an error now if PyAV is not installed
         session = TelloSession(
             self.options, monotonic_ns(), extra=self._video_telemetry, video_ns=lambda: self._video_ns
         )
@@ -92,7 +92,7 @@ class TelloDriver(Driver):
         return self._apply(action, new=False)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return preflight findings from the drone's newest state."""
+        """Return preflight findings based on the drone's newest state."""
         link = self._link
         if link is None:
             raise DriverError(f"{self.uri} is not open")
@@ -102,11 +102,11 @@ class TelloDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters. Those that depend on the version of the SDK appear once it is known."""
+        """Return the parameters. Those that depend on the SDK version appear once that is known."""
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter. Waits up to 0.95 s for the drone's answer."""
+        """Write a parameter. Waits up to 0.95 s for the drone's reply."""
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)
@@ -138,7 +138,7 @@ class TelloDriver(Driver):
         decoder = TelloVideo(self.options.concealed, hand_on)
 
         def came(coded: Coded) -> None:
-            # Video that cannot be shown for too long is requested again, like video that does not arrive.
+            # If nothing can be shown for too long, request the video again, as if it had stopped arriving.
             if coded.is_key or not (decoder.waits and (sink.wants(settings.camera) or wants_stream())):
                 self._video_ns = monotonic_ns()
 

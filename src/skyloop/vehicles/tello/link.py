@@ -1,4 +1,4 @@
-"""The sockets of one drone: for commands and their answers, and for state."""
+"""One drone's sockets: one for commands and their replies, one for state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BUFFER: Final = 1 << 20  # half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
-    """Return a socket that sends commands and receives answers from the drone's port only."""
+    """Return a socket that sends commands and receives replies only from the drone's port."""
     made = _through(options)
     try:
         made.bind((options.local or "", 0))
@@ -31,7 +31,7 @@ def command_socket(options: TelloOptions, address: str) -> socket.socket:
 
 
 def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.socket:
-    """Return a socket bound to a UDP port of this host. It receives from any sender: check who it is."""
+    """Return a socket bound to a local UDP port. It receives from any sender, so the caller must check the sender."""
     made = _through(options)
     try:
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
@@ -59,28 +59,28 @@ def _through(options: TelloOptions) -> socket.socket:
     return made
 
 
-ASK_S: Final = 0.95  #: a command without an answer in this time has failed
+ASK_S: Final = 0.95  #: a command that gets no reply within this time fails
 
 
 class TelloLink(VehicleLink[TelloSession]):
-    """The link to one drone: commands, their answers, and state."""
+    """The link to one drone: commands, their replies, and state."""
 
     def __init__(
         self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
     ) -> None:
         super().__init__("skyloop-tello", session, deliver, clock)
-        self.addresses: tuple[str, str] | None = None  #: the drone's and this host's, on the way to it
+        self.addresses: tuple[str, str] | None = None  #: the drone's address, and this host's on the route to it
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
 
     # From the proxy's threads ----------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, new: bool = True) -> AnyAction:
-        """Pass an action to the session and send it soon. Any thread. See :meth:`SetpointController.apply`."""
+        """Pass an action to the session; see :meth:`TelloSession.command`. May be called from any thread."""
         return self._decide(partial(self.session.command, action, new=new))
 
     def ask(self, text: str) -> str | None:
-        """Send a command and wait up to 0.95 s for its answer; None without one. Any thread but the link's."""
+        """Send a command and wait up to 0.95 s for the reply; None if there is none. Not for the link's own thread."""
         return self._wait_for_answer(partial(self.session.ask, text), ASK_S, None)
 
     # On the link's thread --------------------------------------------------------------------------------------
@@ -88,7 +88,7 @@ class TelloLink(VehicleLink[TelloSession]):
     def _open_sockets(self) -> None:
         options = self.session.options
         with self.lock:
-            self._close_sockets()  # first, as the new one for state needs the same port
+            self._close_sockets()  # first, because the new socket for state needs the same port
         address = self._lookup.address(options.host)
         commands = command_socket(options, address)
         local = str(commands.getsockname()[0])

@@ -1,4 +1,4 @@
-"""Options of a ``tello://`` address. Pure. ``docs/tello.md`` lists them."""
+"""Options in a ``tello://`` address, listed in ``docs/tello.md``. Pure."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from skyloop.vehicles.tello.wire import PORT, STATE_PORT, VIDEO_PORT
 
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")
-MOST_CONCEALED: Final = 30  #: pictures between keys
-_LEAST_PORT: Final = 1025  # accepted by the Tello's command
+MOST_CONCEALED: Final = 30  #: number of images from one key frame to the next
+_LEAST_PORT: Final = 1025  # lowest port that the Tello's command accepts
 KNOWN: Final = {
     *("local", "interface", "port", "state_port", "video_port", "video", "concealed", "pads", "velocity_axes"),
     *INTRINSICS_OPTIONS,
@@ -25,11 +25,11 @@ KNOWN: Final = {
 
 
 class VelocityAxes(StrEnum):
-    """The axes of the drone's ``vgx`` and ``vgy``, which the SDK's guides do not specify."""
+    """Possible axes of the drone's ``vgx`` and ``vgy``, which the SDK's guides do not specify."""
 
     START = "start"  #: x along the heading at switch-on
     BODY = "body"  #: x along its nose
-    NONE = "none"  #: unusable: feedback has no velocity
+    NONE = "none"  #: values not used, so that feedback has no velocity
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +37,19 @@ class TelloOptions:
     """A parsed address."""
 
     host: str
-    local: str | None = None  #: this host's address to send from and receive at
+    local: str | None = None  #: this host's address for sending and receiving
     interface: str | None = None  #: this host's network interface
     port: int = PORT
     state_port: int = STATE_PORT
     video_port: int = VIDEO_PORT
     video: bool = True
-    concealed: int = 0  #: damaged pictures that a displayed one may build on
-    pads: bool = False  #: detect mission pads from the start
+    concealed: int = 0  #: maximum number of damaged images on which a displayed one may depend
+    pads: bool = False  #: whether to detect mission pads from the start
     velocity_axes: VelocityAxes = VelocityAxes.START
 
     @property
     def own_ports(self) -> bool:
-        """Whether a command must tell the drone where to send state and video."""
+        """Whether a command must set the ports to which the drone sends state and video."""
         return (self.state_port, self.video_port) != (STATE_PORT, VIDEO_PORT)
 
 

@@ -1,6 +1,6 @@
-"""Settings of the driver and of the drone as parameters, and how to write them.
+"""The driver's and the drone's settings as parameters, and how to write them.
 
-The drone's settings can't be queried. The last written value is shown, and sent again after a link loss.
+The drone's settings can't be queried, so the last written value is shown, and sent again after a link loss.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GREATEST: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A setting stored in the drone: its parameter, the first SDK that has it, and the command for each value."""
+    """A setting stored in the drone, with its parameter, the first SDK that has it, and the command for each value."""
 
     parameter: Parameter
     since: Sdk
@@ -89,7 +89,7 @@ SETTINGS: Final = {
         ),
     )
 }
-#: Parameter, field of :class:`Scale`, unit, range, description.
+#: Each parameter with its field in :class:`Scale`, unit, range and description.
 _SCALES: Final = (
     ("speed", "speed", "m/s", (0.05, _GREATEST), "horizontal speed along each axis"),
     ("climb", "climb", "m/s", (0.05, _GREATEST), "climb and descent"),
@@ -101,7 +101,7 @@ FULL: Final = "tello.full_stick."
 
 
 def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
-    """Return the parameters of the largest set-points and of the effect of a full stick."""
+    """Return the parameters for the largest set-points and for the effect of a full stick."""
     usual = Scale()
     made = []
     for name, field, unit, (low, high), text in _SCALES:
@@ -132,7 +132,7 @@ def flip_parameter(value: str) -> Parameter:
 
 
 def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
-    """Return the drone's reported properties, read-only."""
+    """Return the properties that the drone reports, as read-only parameters."""
     made = []
     if sdk is not None:
         made.append(
@@ -148,12 +148,12 @@ def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
 
 
 def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
-    """Return the settings in this version of the SDK; none while it is unknown."""
+    """Return the settings that this SDK version has; none while the version is unknown."""
     return {name: setting for name, setting in SETTINGS.items() if sdk is not None and sdk.knows(setting.since)}
 
 
 class DroneSettings:
-    """The values of all parameters. The drone's own are written through the link."""
+    """Holds the values of all parameters. The drone's own are written through the link."""
 
     def __init__(self, link: TelloLink) -> None:
         self._link = link
@@ -163,7 +163,7 @@ class DroneSettings:
 
     @property
     def camera(self) -> str:
-        """The camera that the drone sends."""
+        """The camera whose images the drone sends."""
         return str(self._values[CAMERA])
 
     def parameters(self) -> list[Parameter]:
@@ -181,7 +181,7 @@ class DroneSettings:
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force. Takes up to 0.95 s.
 
-        Raises for a wrong name or value, for a flip on the ground, and if the drone refuses or does not answer.
+        Raises an error for a wrong name or value, for a flip on the ground, or if the drone refuses or does not reply.
         """
         known = {parameter.name: parameter for parameter in self.parameters()}
         if name not in known:

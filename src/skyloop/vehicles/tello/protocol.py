@@ -1,4 +1,4 @@
-"""The protocol of one drone from the first datagram on: state and answers in, commands out. No socket, no clock."""
+"""The protocol with one drone from the first datagram onwards: state and replies in, commands out. No I/O, no clock."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from skyloop.vehicles.tello.setpoints import SetpointController
 from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
 from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
-PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
-TRIES: Final = 3  #: of a request before it fails
-MOTION_NS: Final = nanoseconds(20.0)  #: limit for the answer to a take-off or landing
+PATIENCE_NS: Final = nanoseconds(0.3)  #: time allowed for a reply; real drones take at most 29 ms over a good link
+TRIES: Final = 3  #: how many times a request is sent before it fails
+MOTION_NS: Final = nanoseconds(20.0)  #: time allowed for the reply to a take-off or landing
 
-#: Receives the answer, or None if there was none.
+#: Called with the reply, or None if there was none.
 Done = Callable[[str | None], None]
 
 
 @dataclass(slots=True)
 class Request:
-    """A command that expects an answer."""
+    """A command to which a reply is expected."""
 
     text: str
-    done: Done  #: called with the answer, or None if there was none
-    tries: int = TRIES  #: how often to send it at most
-    sent_ns: int | None = None  #: when last sent
+    done: Done  #: called with the reply, or None if there was none
+    tries: int = TRIES  #: maximum number of times to send it
+    sent_ns: int | None = None  #: when it was last sent
 
 
 class Conversation:
     """Sends one request at a time.
 
-    *Motions*, such as a take-off, are sent elsewhere, but their answers arrive here, seconds later. Until then, no
-    request is sent that has the same answers.
+    *Motions* such as a take-off are sent elsewhere, but their replies arrive here seconds later. Until then, requests
+    with the same possible replies are not sent.
 
-    ``counts``: ``answered`` and ``unanswered`` requests, and ``stray`` replies that match neither.
+    ``counts`` has ``answered`` and ``unanswered`` requests, and ``stray`` replies that match nothing.
     """
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("answered", "unanswered", "stray"), 0))
         self._queue: deque[Request] = deque()
         self._asked: Request | None = None
-        self._motions: dict[str, int] = {}  # command, and when last sent
+        self._motions: dict[str, int] = {}  # when each motion was last sent
 
     @property
     def idle(self) -> bool:
@@ -68,7 +68,7 @@ class Conversation:
         self._queue.append(request)
 
     def moved(self, text: str, now_ns: int) -> None:
-        """Note that a motion was sent."""
+        """Record that a motion was sent."""
         self._motions[text] = now_ns
 
     def abandon(self) -> None:
@@ -82,7 +82,7 @@ class Conversation:
             request.done(None)
 
     def on_reply(self, reply: str) -> str | None:
-        """Handle a reply; return the motion that it answers, or None."""
+        """Handle a reply; return the motion to which it belongs, or None."""
         asked = self._asked
         plain_error = is_error(reply) and ":" not in reply
         if asked is not None and answers(reply, asked.text) and not (plain_error and self._motions):
@@ -124,32 +124,32 @@ class Conversation:
         return None
 
 
-TICK_NS: Final = nanoseconds(0.05)  #: between two ``rc``
-HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc``
-DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states arrive ten times a second
-LOST_NS: Final = nanoseconds(1.5)  #: of silence
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
-ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state arrives
-ALIVE_NS: Final = nanoseconds(4.0)  #: between requests that prevent the drone's automatic landing after 15 s
-ALONE_NS: Final = nanoseconds(30.0)  #: without any command it has landed by then: it begins to after 15 s
-ASK_NS: Final = nanoseconds(5.0)  #: limit for asking a drone flown by another program for its version
-DEAF: Final = 2  #: unanswered requests in a row that mean our commands are not received
-VIDEO_NS: Final = nanoseconds(2.0)  #: after this time without usable video, request it
+TICK_NS: Final = nanoseconds(0.05)  #: time between two ``rc`` commands
+HURRY_NS: Final = nanoseconds(0.02)  #: minimum time between two ``rc`` commands
+DEGRADED_NS: Final = nanoseconds(0.6)  #: silence after which the link is DEGRADED; state arrives ten times per second
+LOST_NS: Final = nanoseconds(1.5)  #: silence after which the link is LOST
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that has sent nothing by then is reported as lost
+ENTER_NS: Final = nanoseconds(0.5)  #: time between two ``command`` commands while no state arrives
+ALIVE_NS: Final = nanoseconds(4.0)  #: time between the requests that prevent automatic landing after 15 s
+ALONE_NS: Final = nanoseconds(30.0)  #: a drone without commands has landed by then, having begun after 15 s
+ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
+DEAF: Final = 2  #: consecutive unanswered requests that mean our commands are not being received
+VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
 ALIVE: Final = "wifi?"
-DEFAULT_HOST: Final = "192.168.10.1"  #: of a Tello that is its own access point
+DEFAULT_HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
 _TELLOS_NETWORK: Final = "192.168.10."
 
 _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 
 
 class TelloSession(VehicleSession):
-    """The protocol between one opened driver and its drone. Not thread-safe.
+    """The protocol between an open driver and its drone. Not thread-safe.
 
     Args:
         options: Options of the vehicle's address.
         now_ns: The time of opening.
         extra: Returns further telemetry for ``Feedback.native``.
-        video_ns: Returns when usable video or a key picture last arrived; 0 for never.
+        video_ns: Returns when usable video or a key frame last arrived; 0 if never.
     """
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
@@ -167,16 +167,16 @@ class TelloSession(VehicleSession):
         self.setpoints = SetpointController()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
-        self._watch = RestartWatch()  # watches the count of seconds with running motors
-        self.sdk: Sdk | None = None  #: None until ``sdk?`` is answered; SDK 1.3 answers with an error
+        self._watch = RestartWatch()  # watches the count of seconds for which the motors have run
+        self.sdk: Sdk | None = None  #: None until there is a reply to ``sdk?``; SDK 1.3 replies with an error
         self.serial = ""
         self.ready = False  #: whether state arrives and commands are answered
-        self.remembered: dict[str, str] = {}  #: parameter to the command that set it, for a link loss
+        self.remembered: dict[str, str] = {}  #: the command that last set each parameter, for a link loss
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
-        self._lost_ns = self._sent_ns = now_ns  # the link loss or a later hover request; the last sent datagram
+        self._lost_ns = self._sent_ns = now_ns  # when the link was lost or hovering requested later; last datagram
         self._alive_ns = self._found_ns = now_ns
         self._asked_video_ns = 0
         self._asking_version = False
@@ -185,8 +185,8 @@ class TelloSession(VehicleSession):
         self._rc_ns = 0
         self._flips: list[str] = []
         self._reported_ports = False
-        self._answered = False  # while no state arrives
-        self.local = ""  #: this host's address towards the drone
+        self._answered = False  # whether there was a reply while no state arrives
+        self.local = ""  #: this host's address on the route to the drone
         self._place = f"{options.host}, UDP port {options.port}"
         self._set_link_state(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
         if options.pads:
@@ -195,7 +195,7 @@ class TelloSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action and send it soon; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)
@@ -209,12 +209,12 @@ class TelloSession(VehicleSession):
         return applied
 
     def ask(self, text: str, done: Done) -> None:
-        """Send a command; ``done`` receives the answer, or None without one."""
+        """Send a command; ``done`` is called with the reply, or None if there is none."""
         self.conversation.ask(Request(text, done))
         self.due_ns = 0
 
     def flip(self, direction: str) -> None:
-        """Send a flip, once: a repeat would flip the drone twice."""
+        """Send a flip only once, because a repeat would flip the drone twice."""
         self._flips.append(f"flip {direction}")
         self.due_ns = 0
 
@@ -225,13 +225,13 @@ class TelloSession(VehicleSession):
         return self.setpoints.forget_landing()
 
     def close(self) -> None:
-        """End the session; queued requests get no answer."""
+        """End the session; queued requests stay unanswered."""
         self.conversation.abandon()
 
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_state(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the state port. Never raises for any content."""
+        """Handle a datagram from the state port. Never raises, whatever the content."""
         try:
             state = parse(datagram)
         except DecodeError:
@@ -256,11 +256,11 @@ class TelloSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return preflight findings from the drone's newest state."""
+        """Return preflight findings based on the drone's newest state."""
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
-        """Handle a datagram from the command port. Never raises for any content."""
+        """Handle a datagram from the command port. Never raises, whatever the content."""
         reply = decoded(datagram)
         if not reply:
             self.counts["damaged"] += 1
@@ -294,7 +294,7 @@ class TelloSession(VehicleSession):
     # Time ------------------------------------------------------------------------------------------------------
 
     def poll(self, now_ns: int) -> list[bytes]:
-        """Return the commands that are due now, one per datagram."""
+        """Return the commands to send now, one per datagram."""
         self._check_silence(now_ns)
         self.due_ns = now_ns + TICK_NS
         texts = []
@@ -321,7 +321,7 @@ class TelloSession(VehicleSession):
         return [text.encode("ascii") for text in texts]
 
     def _left_to_land(self, now_ns: int) -> bool:
-        """Return whether to send only landings and stops, so that a lost drone lands without further commands."""
+        """Return whether to send only landings and stops: without other commands, a lost drone lands automatically."""
         if not self.setpoints.flies_unheard or now_ns - self._lost_ns < KEPT_NS:
             return False
         if now_ns - self._sent_ns >= ALONE_NS:
@@ -340,7 +340,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
-        """Return whether to send no requests, as each one delays the automatic landing of a drone without a pilot."""
+        """Return whether to send no requests, because each delays the automatic landing of a drone without a pilot."""
         asked = self.ready or self.setpoints.left_alone or now_ns - self._found_ns >= ASK_NS
         return asked and self.setpoints.flown_by_others
 
@@ -413,4 +413,4 @@ class TelloSession(VehicleSession):
 
 
 def _ignore_reply(_reply: str | None) -> None:
-    """Ignore the answer: the drone's state or video shows the effect of the command."""
+    """Ignore the reply, because the drone's state or video shows the effect of the command."""

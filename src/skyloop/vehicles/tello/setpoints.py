@@ -1,6 +1,6 @@
-"""Turn set-points into sticks and motions: keep the last action until the drone's state shows it done. Pure.
+"""Turning set-points into sticks and motions. The last action is kept until the state shows that it is done. Pure.
 
-Answers decide nothing: they arrive seconds late or not at all. A take-off or landing is repeated until it shows.
+Replies are not relied on: they arrive seconds late or not at all. A take-off or landing is repeated until it shows.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ from skyloop.vehicles.tello.wire import (
     is_error,
 )
 
-FULL_TILT_RAD: Final = 0.2  #: attitude of a full stick; chosen: as much as an AR.Drone tilts indoors
+FULL_TILT_RAD: Final = 0.2  #: attitude that a full stick stands for; chosen to equal an AR.Drone's tilt indoors
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """One number per stick: the effect of a full stick, or the largest set-point."""
+    """A number for each stick: the effect of a full stick, or the largest set-point."""
 
     speed: float = FULL_SPEED_M_S  #: [m/s]
     climb: float = FULL_CLIMB_M_S  #: [m/s]
@@ -53,9 +53,9 @@ class Scale:
 
 
 def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
-    """Return the sticks and the set-point they stand for: within the limits, and at most a full stick.
+    """Return the sticks, and the set-point that they command: within the limits, and at most a full stick.
 
-    The Tello holds a speed, not an attitude: a tilt becomes a share of the full stick, and so of the full speed.
+    The Tello holds a speed, not an attitude, so a tilt becomes a fraction of the full stick and thus of the full speed.
     """
     climb = min(full.climb, limits.climb)
     yaw = min(full.yaw_rate, limits.yaw_rate)
@@ -84,23 +84,23 @@ def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
     return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
-AGAIN_NS: Final = nanoseconds(1.5)  #: repeat a take-off or landing that does not show by then
-TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
-RISES_NS: Final = nanoseconds(3.0)  #: how long a sent take-off may still start; real drones rise after 1.1 s
+AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show by then is repeated
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not taken off by then is refusing to
+RISES_NS: Final = nanoseconds(3.0)  #: a take-off may start until this long after it was sent; real drones take 1.1 s
 
 TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
 
 
 class Decision(Enum):
-    """The wish for take-off or landing."""
+    """Whether to take off or land."""
 
-    STAY = auto()  #: in the air if it flies, on the ground otherwise
+    STAY = auto()  #: stay in the air if flying, on the ground otherwise
     TAKE_OFF = auto()
     LAND = auto()
 
 
 class SetpointController:
-    """Remembers the last action and turns it into commands.
+    """Stores the last action and turns it into commands.
 
     ``full`` is the effect of a full stick, ``limits`` the largest set-point.
     """
@@ -109,18 +109,18 @@ class SetpointController:
         self.watch = FlightWatch()
         self.full = Scale()
         self.limits = Scale()
-        self.receiving = False  #: whether the drone's state arrives
-        #: After an abandoned stop or landing, until the next command: silence makes it land after 15 s.
+        self.receiving = False  #: whether the drone's state is arriving
+        #: Set after an abandoned stop or landing until the next command; our silence makes the drone land after 15 s.
         self.left_alone = False
         self.stop = MotorStop(self._leave_alone)
         self._decision = Decision.STAY
         self._stick = LEVEL
         self._decided_ns = 0
-        self._sent_ns: int | None = None  # take-off or landing
-        self._rises_until_ns = 0  # a take-off that we sent may show until then
-        self._state_ns = 0  # arrival of the last state
-        self._was_in_air = False  # in the last state, or by a take-off that we just sent
-        self._steering = False  # we started or took this flight; otherwise another program may fly it
+        self._sent_ns: int | None = None  # when the take-off or landing was sent
+        self._rises_until_ns = 0  # until then, a rise may result from a take-off that we sent
+        self._state_ns = 0  # when the last state arrived
+        self._was_in_air = False  # according to the last state, or because we have just sent a take-off
+        self._steering = False  # whether we started or took over this flight; otherwise another program may be flying
         self._events: list[VehicleEvent] = []
 
     @property
@@ -130,20 +130,20 @@ class SetpointController:
 
     @property
     def flown_by_others(self) -> bool:
-        """Whether we must not keep the drone in the air: we abandoned it, or the flight is not ours."""
+        """Whether we must not keep the drone in the air, because we abandoned it or the flight is not ours."""
         return self.left_alone or (self.watch.phase.airborne and not self._steering)
 
     @property
     def flies_unheard(self) -> bool:
-        """Whether the drone flew or was taking off when the link was lost, and may still fly."""
+        """Whether the drone was flying or taking off when the link was lost, and may still be flying."""
         return not self.receiving and self._was_in_air
 
     def flight_state(self) -> FlightState:
-        """Return the flight state for feedback."""
+        """Return the flight state to report in feedback."""
         if self.stop.shown:
             return FlightState.EMERGENCY
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return FlightState.LANDING  # it may be about to rise
+            return FlightState.LANDING  # because it may be about to rise
         if self.watch.in_air and self._stick != LEVEL:
             return FlightState.FLYING
         return self.watch.phase
@@ -156,15 +156,15 @@ class SetpointController:
         Args:
             action: One of the driver's ``ACTIONS``.
             now_ns: The present time.
-            new: Whether an application just requested it. For a drone that is :attr:`left_alone`, actions that no
-                application requested have no effect, except a landing.
+            new: Whether an application has just requested it. While the drone is :attr:`left_alone`, actions other than
+                landings have no effect unless an application requested them.
 
         Returns:
             The applied action: a set-point within the limits, or hover after an emergency stop.
 
         Raises:
-            DriverError: A take-off without data from the drone or after an emergency stop, or a reset without data or
-                while the motors still run.
+            DriverError: A take-off while the drone is silent or after an emergency stop, or a reset while it is silent
+                or its motors are still running.
         """
         if isinstance(action, Idle):
             return action
@@ -208,7 +208,7 @@ class SetpointController:
 
     def _remain(self, stick: Stick, now_ns: int) -> None:
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
-            return  # otherwise a withdrawn take-off could still happen
+            return  # otherwise a cancelled take-off could still happen
         if self._decision is Decision.LAND:
             self._decide(Decision.STAY, now_ns)
         self._stick = stick
@@ -242,17 +242,17 @@ class SetpointController:
         return True
 
     def forget_flight(self) -> None:
-        """Assume a landing: without contact or commands, the drone had the time to land automatically."""
+        """Assume that the drone has landed: without contact or commands, it had time to land automatically."""
         self._was_in_air = self._steering = False
 
     # Receiving ----------------------------------------------------------------------------------------------------
 
     def on_state(self, now_ns: int) -> None:
-        """Handle a new state that the watch has seen."""
+        """Handle a new state after the watch has processed it."""
         phase, rose = self.watch.phase, self._was_in_air and self._decision is Decision.TAKE_OFF
         self.receiving, self._state_ns = True, now_ns
         self._was_in_air = phase.airborne
-        if rose and phase is FlightState.LANDED:  # it fell over or was stopped: start only once
+        if rose and phase is FlightState.LANDED:  # it fell over or was stopped: don't start it again
             self._decide(Decision.STAY, now_ns)
             text = "the drone began to take off, and its motors stopped: it is not started again"
             self._events.append(message(text, "no_takeoff", Severity.WARNING))
@@ -264,7 +264,7 @@ class SetpointController:
             self._steering = self._decision is not Decision.STAY
 
     def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
-        """Handle the answer to a take-off or landing. For an emergency stop only the motors' state counts."""
+        """Handle the reply to a take-off or landing. For an emergency stop, only the motors' state counts."""
         refused = is_error(reply)
         if motion == LAND:
             self.watch.landing_answered = self._decision is Decision.LAND and not refused
@@ -291,7 +291,7 @@ class SetpointController:
         return events
 
     def motions(self, now_ns: int) -> list[str]:
-        """Return the due commands that are answered seconds later."""
+        """Return the motions to send now, whose replies take seconds."""
         if self.stop.active:
             return [EMERGENCY] if self.stop.step(self._motors_are_off(now_ns), now_ns) else []
         if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
@@ -311,9 +311,9 @@ class SetpointController:
         return []
 
     def stick(self) -> Stick | None:
-        """Return the sticks for ``rc``; None to send none.
+        """Return the sticks for ``rc``, or None not to send any.
 
-        None for a drone that is on the ground, taking off, landing, or flown by another program.
+        That is so if the drone is on the ground, taking off, landing, or flown by another program.
         """
         if self.stop.active or self._decision is not Decision.STAY or not self._steering:
             return None

@@ -1,8 +1,8 @@
-"""Convert state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
+"""Converting state strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
 
-No field of the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` grows by one each second
-only while the motors run, and the distance sensor shows whether the ground is near. Our own commands only name the
-observation: a climb after a take-off command is a take-off.
+No field in the state gives the phase of flight, so :class:`FlightWatch` infers it: ``time`` increases by one every
+second only while the motors run, and the distance sensor shows whether the ground is near. Our own commands serve only
+to interpret what is observed: a climb after a take-off command is a take-off.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 
 
 def height_m(state: State) -> float | None:
-    """Return the height above the surface below [m]: measured if possible, else above the place of take-off.
+    """Return the measured height above the surface below [m] or, if there is none, that above the take-off point.
 
-    The distance sensor reports 10 cm on the ground and at a height of 10 cm; the reported height tells them apart.
+    The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells which.
     """
     if state.distance_cm is not None:
         on_ground = state.distance_cm <= GROUND_CM and (state.height_cm or 0.0) < GROUND_CM
@@ -37,7 +37,7 @@ def height_m(state: State) -> float | None:
 
 
 def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
-    """Return the velocity forward, left, up [m/s], from numbers along these axes; None if unknown.
+    """Return the velocity forward, left, up [m/s] from values along ``axes``; None if unknown.
 
     ``vgx``, ``vgy`` and ``vgz`` are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
     """
@@ -85,14 +85,14 @@ def _angle(degrees: float | None) -> float | None:
 
 # The phase of flight -------------------------------------------------------------------------------------------------
 
-STILL_NS: Final = nanoseconds(1.6)  #: if the count of seconds pauses for this long, the motors are off
-GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or not yet begun
-LOW_M: Final = 0.15  #: at most this height is near the ground
-HIGH_M: Final = 0.25  #: from this height on the drone is off the ground
-HOVER_M: Final = 0.4  #: least height at the end of a take-off
-SLOW_DM_S: Final = 1.0  #: vertical speed at the end of a take-off, at most
-SETTLED: Final = 3  #: consecutive high and slow samples that end a take-off
-RISE_NS: Final = nanoseconds(8.0)  #: longest take-off
+STILL_NS: Final = nanoseconds(1.6)  #: the motors are off if the count of seconds pauses for this long
+GRACE_NS: Final = nanoseconds(2.5)  #: how long to wait for a count that has just stopped or has not begun yet
+LOW_M: Final = 0.15  #: heights up to this are near the ground
+HIGH_M: Final = 0.25  #: at this height and above, the drone is off the ground
+HOVER_M: Final = 0.4  #: minimum height at the end of a take-off
+SLOW_DM_S: Final = 1.0  #: maximum vertical speed at the end of a take-off
+SETTLED: Final = 3  #: number of consecutive high and slow samples that end a take-off
+RISE_NS: Final = nanoseconds(8.0)  #: maximum duration of a take-off
 
 _S = FlightState
 
@@ -100,8 +100,8 @@ _S = FlightState
 class FlightWatch:
     """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
 
-    ``rising`` and ``sinking``: a take-off or a landing was requested and is not done. ``landing_answered``: the drone
-    answered that it landed.
+    ``rising`` and ``sinking`` mean that a take-off or landing was requested and is not complete, ``landing_answered``
+    that the drone has replied that it landed.
     """
 
     def __init__(self) -> None:
@@ -110,7 +110,7 @@ class FlightWatch:
         self.sinking = False
         self.landing_answered = False
         self._motor_s: int | None = None
-        self._counted_ns: int | None = None  # when the count last grew
+        self._counted_ns: int | None = None  # when the count last increased
         self._since_ns = 0  # when the count was first seen
         self._phase_ns = 0
         self._settled = 0
@@ -121,7 +121,7 @@ class FlightWatch:
         return self.phase is _S.HOVERING
 
     def motors(self, now_ns: int) -> bool | None:
-        """Return whether the motors run; None while unknown."""
+        """Return whether the motors are running; None if unknown."""
         if self._counted_ns is not None and now_ns - self._counted_ns < STILL_NS:
             return True
         return None if self._motor_s is None or now_ns - self._since_ns < STILL_NS else False
@@ -166,7 +166,7 @@ class FlightWatch:
         return _S.HOVERING
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
-        """Return whether a landed drone has taken off. Carrying it around is not a take-off."""
+        """Return whether a landed drone has taken off. Being carried around does not count."""
         begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before landing
         if self.rising and (high or (motors and begun)):
             return True
@@ -175,13 +175,13 @@ class FlightWatch:
 
 # Health --------------------------------------------------------------------------------------------------------------
 
-HOT_C: Final = 90.0  #: estimate: users report that the drone refuses to start its motors somewhat above
-COOL_C: Final = 85.0  #: the drone counts as hot until it is below this again
-PAD_LOST: Final = 5  #: consecutive states without a pad until it counts as out of view
+HOT_C: Final = 90.0  #: an estimate: users report that somewhat above this the drone refuses to start its motors
+COOL_C: Final = 85.0  #: a hot drone no longer counts as hot below this
+PAD_LOST: Final = 5  #: number of consecutive states without a pad after which it counts as out of view
 
 
 class Health:
-    """Reports heat and mission pads, each change once."""
+    """Reports each change in overheating and in the mission pad in view, once."""
 
     def __init__(self) -> None:
         self._hot = False
@@ -194,7 +194,7 @@ class Health:
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return a finding about a drone too hot to fly; nothing while its temperature is unknown."""
+        """Return a finding if the drone is too hot to fly; none while its temperature is unknown."""
         if self._celsius is None:
             return []
         if not self._hot:
@@ -225,7 +225,7 @@ class Health:
 
 
 def _seen(pad: Pad) -> VehicleEvent:
-    """Return the event for a pad with the drone's position in the pad's axes [m]."""
+    """Return the event for a pad in view, with the drone's position in the pad's axes [m]."""
     text = f"mission pad m{pad.number} is in view"
     if pad.place_cm is None:
         return message(text, "mission_pad", pad=pad.number, in_view=True)

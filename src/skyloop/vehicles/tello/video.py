@@ -1,7 +1,7 @@
-"""The drone's video: its cameras, pictures from datagrams, and a decoder that shows only whole pictures.
+"""The drone's video: its cameras, assembling images from datagrams, and a decoder that shows only intact images.
 
-Intrinsics: the calibration of one drone, published with tello_ros, for pictures of 960×720; other drones differ by some
-per cent. Nothing is known about the lens of the camera that looks down.
+The intrinsics are the calibration of one drone for 960×720 images, published with tello_ros; other drones differ by a
+few per cent. Nothing is known about the lens of the downward camera.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ _CAMERAS: Final = (
 
 
 def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
-    """Return both cameras; the drone shows one at a time, and the one that looks down needs SDK 3.0.
+    """Return both cameras, of which the drone sends one at a time; the downward one needs SDK 3.0.
 
-    Intrinsics in the address are the front camera's.
+    Intrinsics in the address apply to the front camera.
     """
     front, bottom = _CAMERAS
     given = intrinsics_of(uri, front.width, front.height)
@@ -64,7 +64,7 @@ def cameras_of(uri: VehicleUri) -> tuple[CameraInfo, ...]:
 
 
 def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | None:
-    """Return a camera's intrinsics for another picture width, to which the drone can scale pictures down.
+    """Return a camera's intrinsics for another image width, to which the drone can scale images down.
 
     None for the bottom camera, whose intrinsics are unknown.
     """
@@ -83,13 +83,13 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
-POLL_S: Final = 0.1  #: longest wait in one read
-SILENT_S: Final = 3.0  #: without a datagram for this long, reopen the port
-BURST: Final = 64  #: datagrams per read
+POLL_S: Final = 0.1  #: longest time that a read waits
+SILENT_S: Final = 3.0  #: the port is reopened if no datagram arrives for this long
+BURST: Final = 64  #: maximum number of datagrams per read
 
 
 class VideoStream:
-    """The port for video. Pictures have no stamps: their first datagram's arrival is their capture time."""
+    """The port for video. Images have no stamps, so the arrival of their first datagram is used as the capture time."""
 
     def __init__(
         self, options: TelloOptions, addresses: Callable[[], tuple[str, str] | None], connection: int, clock: Clock
@@ -115,7 +115,7 @@ class VideoStream:
         return self._assembly.stray
 
     def read(self) -> list[Coded]:
-        """Return the pictures that arrived, within :data:`POLL_S`."""
+        """Return the images that arrive within :data:`POLL_S`."""
         frames: list[Coded] = []
         if wait_readable(self._socket, POLL_S):
             self._drain(frames)
@@ -128,7 +128,7 @@ class VideoStream:
         self._socket.close()
 
     def _drain(self, frames: list[Coded]) -> None:
-        """Read what arrived, up to the end of a picture, so that it is decoded while the next one arrives."""
+        """Read what has arrived up to the end of an image, so that it is decoded while the next one arrives."""
         for _ in range(BURST):
             try:
                 datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
@@ -145,20 +145,20 @@ class VideoStream:
 
 # Decoder -------------------------------------------------------------------------------------------------------------
 
-MOST_UNITS: Final = 120  #: kept for a second decoding; key pictures of the drone are 30 apart
+MOST_UNITS: Final = 120  #: maximum number kept for decoding again; the drone's key frames are 30 images apart
 _PURPOSE: Final = "the video of a Tello"
 
 
 class TelloVideo:
     """Decodes one stream.
 
-    Decoding starts at a whole key picture with a decoder that refuses any damage. If concealment is allowed, a second
-    decoder takes over at the first damage and decodes again from that key; it fills gaps from the previous picture.
-    After a damaged key, or more damaged pictures than allowed, nothing is shown until the next whole key.
+    Decoding starts at an intact key frame with a decoder that rejects any damage. If concealment is allowed, a second
+    decoder takes over at the first damage and decodes again from that key frame, filling gaps from the previous image.
+    After a damaged key frame, or more damaged images than allowed, nothing is shown until the next intact key frame.
 
     Args:
-        concealed: How many damaged pictures a displayed one may build on.
-        on_whole: Called with each picture that is undamaged and builds on undamaged ones. On the decoding thread.
+        concealed: Maximum number of damaged images on which a displayed one may depend.
+        on_whole: Called on the decoding thread with each undamaged image that depends only on undamaged ones.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -168,22 +168,22 @@ class TelloVideo:
         require_pyav(_PURPOSE)
         self._concealed = concealed
         self._on_whole = on_whole
-        self._came: int | None = None  # number of the previous picture
+        self._came: int | None = None  # number of the previous image
         self.waited = 0
         self.damaged = 0
         self._strict: VideoCodecContext | None = None
         self._patching: VideoCodecContext | None = None
-        self._units: list[bytes] = []  # since the key, while there is no damage
-        self._damage = 0  # damaged pictures since the key
+        self._units: list[bytes] = []  # access units since the key frame, while there is no damage
+        self._damage = 0  # number of damaged images since the key frame
         self._number = 0
 
     def restart(self) -> None:
-        """Wait for the next key picture."""
+        """Wait for the next key frame."""
         self._strict = self._patching = None
 
     @property
     def waits(self) -> bool:
-        """Whether nothing can be shown until the next whole key."""
+        """Whether nothing can be shown until the next intact key frame."""
         return self._strict is None and self._patching is None
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
@@ -236,7 +236,7 @@ class TelloVideo:
         return image
 
     def _note_damage(self) -> None:
-        """Conceal from here on, or wait for a key if there is too much damage."""
+        """Conceal from here on, or wait for a key frame if there is too much damage."""
         self.damaged += 1
         self._damage += 1
         if self._damage > self._concealed:
@@ -248,13 +248,13 @@ class TelloVideo:
         self._units = []
 
     def _decode(self, context: VideoCodecContext, data: bytes) -> av.VideoFrame | None:
-        """Return the picture; None without one, or if the decoder reports damage."""
+        """Return the image; None if there is none or the decoder reports damage."""
         import av
 
         try:
             images = context.decode(av.Packet(data))
         except (av.error.FFmpegError, ValueError):
             return None
-        # CABAC may end a damaged picture early without an error; FFmpeg then fills the rest and flags the picture.
+        # CABAC may end a damaged image early without an error; FFmpeg then fills in the rest and flags the image.
         concealed = images and images[-1].is_corrupt and context is not self._patching
         return images[-1] if images and not concealed else None

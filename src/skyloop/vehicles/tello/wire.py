@@ -1,19 +1,18 @@
-"""The Ryze Tello's text protocol: commands, replies, state, video. Pure.
+"""The Ryze Tello's text protocol: commands, replies, state and video. Pure.
 
-From Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide".
+Sources: Ryze, "Tello SDK" 1.3 and "Tello SDK 2.0 User Guide". What SDK 3.0 (Tello Talent, and EDU with newer firmware)
+adds is known from the commands that djitellopy sends.
 
-The additions of SDK 3.0 (Tello Talent, and EDU with newer firmware) are known from the commands that djitellopy sends.
+A reply does not name its command, and may arrive seconds late or twice. It is therefore accepted as a command's reply
+only if it has the form of that command's replies.
 
-A reply does not name its command, and may arrive seconds late or twice. It therefore counts as a command's reply only
-if it has the shape of that command's answers.
+State arrives ten times per second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
+positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm this for both
+attitude and acceleration: a Tello that reports a pitch of 8° reports 0.116 g along x.
 
-State arrives ten times a second; unknown values are None. Axes are those of aviation, x forward, y right, z down:
-positive pitch is nose up, positive roll right side down, positive yaw clockwise. Recorded strings confirm that attitude
-and accelerations agree in this: a Tello that sends a pitch of 8° sends 0.116 g along its x.
-
-Video is H.264 in Annex B form, cut into pieces of 1460 bytes without headers or numbers. A piece that is shorter than
-the others ends a picture; one that begins with a start code begins the next. If a piece is lost in the middle of a
-picture, only the decoder notices.
+Video is H.264 in Annex B form, divided into pieces of 1460 bytes without headers or numbers. A piece shorter than the
+others ends an image, and one that begins with a start code begins the next. If a piece is lost in the middle of an
+image, only the decoder notices.
 """
 
 from __future__ import annotations
@@ -40,36 +39,36 @@ from skyloop.drivers.h264 import unit_type as type_of
 from skyloop.drivers.h264 import units as units_of
 from skyloop.errors import DecodeError
 
-PORT: Final = 8889  #: the Tello's, for commands; it answers to the sender's port
-STATE_PORT: Final = 8890  #: the client's, for state
-VIDEO_PORT: Final = 11111  #: the client's, for video
-HOST: Final = "192.168.10.1"  #: of a Tello that is its own access point
-SILENCE_S: Final = 15.0  #: without a command for this long the Tello lands
+PORT: Final = 8889  #: the Tello's port for commands; it replies to the sender's port
+STATE_PORT: Final = 8890  #: the client's port for state
+VIDEO_PORT: Final = 11111  #: the client's port for video
+HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
+SILENCE_S: Final = 15.0  #: the Tello lands after this time without a command
 
-ENTER: Final = "command"  #: must come first
+ENTER: Final = "command"  #: command that must be sent first
 MAX_STICK: Final = 100
-#: Effect of a stick of 100. Estimates: no guide gives it, and users read ``rc`` as cm/s and degrees a second.
+#: Effect of a stick of 100. An estimate: no guide specifies it; users take ``rc`` to be in cm/s and degrees per second.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
 FULL_YAW_RATE_RAD_S: Final = 1.75
-MAX_COMMAND: Final = 256  #: all commands and replies of the SDK are much shorter
+MAX_COMMAND: Final = 256  #: characters; all commands and replies in the SDK are much shorter
 
 
 class Sdk(StrEnum):
-    """Versions of the protocol, each a superset of the previous ones."""
+    """Protocol versions, each a superset of the previous ones."""
 
     V1_3 = "1.3"
     V2_0 = "2.0"
     V3_0 = "3.0"
 
     def knows(self, other: Sdk) -> bool:
-        """Return whether this version is the other one or newer."""
+        """Return whether this version is the same as the other one or newer."""
         return self.value >= other.value
 
 
 @dataclass(frozen=True, slots=True)
 class Stick:
-    """``rc``: values from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
+    """Values of ``rc``, from -100 to 100. Positive is right, forward, up, and clockwise seen from above."""
 
     right: int = 0
     forward: int = 0
@@ -90,7 +89,7 @@ def ports(state: int, video: int) -> str:
 
 
 def decoded(datagram: bytes) -> str | None:
-    """Return a datagram's text without surrounding white space; None if it is not text of this protocol."""
+    """Return a datagram's text without surrounding white space; None if it is not text as used in this protocol."""
     if len(datagram) > MAX_COMMAND:
         return None
     try:
@@ -104,18 +103,18 @@ _ERROR: Final = re.compile(r"(error|unknown command|out of range|unactive|forced
 
 
 class Shape(Enum):
-    """The form of an answer other than an error."""
+    """Forms of replies other than errors."""
 
     OK = re.compile(r"ok\Z", re.IGNORECASE)
     NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
-    TIME = re.compile(r"\d+( ?s)?\Z")  #: ``time?``: a bare number, or with its unit
+    TIME = re.compile(r"\d+( ?s)?\Z")  #: ``time?``: a number with or without its unit
     LENGTH = re.compile(r"-?\d+ ?(mm|dm|cm)\Z")  #: ``height?``, ``tof?``
     TEMPERATURE = re.compile(r"-?\d+~-?\d+ ?C\Z")  #: ``temp?``
     NAME = re.compile(r"(?=.*[A-Za-z])(?!ok\Z)[0-9A-Za-z]{4,32}\Z")  #: ``sn?``
     FIELDS = re.compile(r"[a-z]+:-?[\d.]+;([a-z]+:-?[\d.]+;)*\Z")  #: ``attitude?``, ``acceleration?``
 
 
-#: Commands with other answers than "ok".
+#: Commands with replies other than "ok".
 READ: Final = {
     "speed?": Shape.NUMBER,
     "battery?": Shape.NUMBER,
@@ -133,17 +132,17 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Return the shape of a command's answer."""
+    """Return the form of a command's reply."""
     return READ.get(command, Shape.OK)
 
 
 def is_error(reply: str) -> bool:
-    """Return whether a reply reports that a command, whichever, was not executed."""
+    """Return whether a reply reports that some command was not executed."""
     return _ERROR.match(reply) is not None
 
 
 def answers(reply: str, command: str) -> bool:
-    """Return whether this reply can belong to this command: an answer of its shape, or an error."""
+    """Return whether this reply can belong to this command, being an error or of the right form."""
     if reply.lower().startswith("unknown command"):
         named = reply.partition(":")[2].strip()
         return named in ("", command)
@@ -151,11 +150,11 @@ def answers(reply: str, command: str) -> bool:
 
 
 MAX_STATE: Final = 1024
-FIELDS: Final = 64  #: more than in any version
-NO_DISTANCE_CM: Final = 6553  #: the distance sensor's "nothing measured"
-GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, and its minimum
-NO_PAD: Final = -1  #: none in view; -2: detection is off
-NOWHERE_CM: Final = -100  #: each coordinate while no pad is in view
+FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
+NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
+GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, which is its minimum
+NO_PAD: Final = -1  #: pad number if none is in view (-2 if detection is off)
+NOWHERE_CM: Final = -100  #: value of each coordinate while no pad is in view
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
 
 Vector = tuple[float, float, float]
@@ -163,37 +162,37 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Pad:
-    """A mission pad in view and the Tello's position above it: axes as printed on the pad, z up [cm]."""
+    """A mission pad in view, and the Tello's position above it in the axes printed on the pad, z up [cm]."""
 
     number: int
     place_cm: Vector | None
-    angles_deg: Vector | None  #: ``mpry``: pitch, roll, yaw to the pad
+    angles_deg: Vector | None  #: ``mpry``: pitch, roll, yaw relative to the pad
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state string. None: missing, or the drone's value for "unknown"."""
+    """A state string. Values are None if they are missing or have the drone's value for "unknown"."""
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
     yaw_deg: float | None = None
     speed_dm_s: Vector | None = None  #: ``vgx``, ``vgy``, ``vgz``
-    temperature_c: tuple[float, float] | None = None  #: lowest and highest
-    distance_cm: float | None = None  #: ``tof``: to the surface below
-    height_cm: float | None = None  #: above the place of take-off; may be negative
+    temperature_c: tuple[float, float] | None = None  #: lowest and highest temperature
+    distance_cm: float | None = None  #: ``tof``: distance to the surface below
+    height_cm: float | None = None  #: height above the take-off point; may be negative
     battery_percent: float | None = None
-    barometer: float | None = None  #: as sent; its zero and unit differ between versions
-    motor_s: int | None = None  #: running time of the motors since switch-on
+    barometer: float | None = None  #: as sent; the zero point and unit differ between versions
+    motor_s: int | None = None  #: total running time of the motors since switch-on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None
-    pads: bool = False  #: whether it has fields for pads
+    pads: bool = False  #: whether there are fields for pads
     fields: tuple[tuple[str, float | Vector], ...] = ()  #: all fields, as sent
 
 
 def parse(datagram: bytes) -> State:
-    """Return the state in a datagram, without invalid fields. Raises :class:`DecodeError` if none is valid.
+    """Return the state in a datagram, leaving out invalid fields; raise :class:`DecodeError` if none is valid.
 
-    A string that was cut off loses its last field, unless it ends with its semicolon.
+    The last field of a truncated string is dropped, unless its semicolon is present.
     """
     if len(datagram) > MAX_STATE:
         raise DecodeError(f"a state string of {len(datagram)} bytes; the Tello's have less than {MAX_STATE}")
@@ -249,7 +248,7 @@ PADS: Final = range(1, 9)  #: valid pad numbers
 
 
 def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector | None) -> Pad | None:
-    if number is None or number not in PADS:  # -1 and 0: none in view; some firmware sends 257 then
+    if number is None or number not in PADS:  # -1 or 0 if none is in view, for which some firmware sends 257
         return None
     angles = fields.get("mpry")
     nowhere = (float(NOWHERE_CM),) * 3
@@ -257,38 +256,38 @@ def _pad(fields: dict[str, float | Vector], number: float | None, place: Vector 
 
 
 def build(fields: list[tuple[str, str]]) -> bytes:
-    """Return a state datagram with these fields, in their order, with the Tello's line end."""
+    """Return a state datagram with these fields in this order, with the line ending that the Tello uses."""
     return ("".join(f"{name}:{value};" for name, value in fields) + "\r\n").encode("ascii")
 
 
-PIECE: Final = 1460  #: bytes in every datagram of a picture but the last
-MAX_PICTURE: Final = 1 << 19  #: bytes; real pictures have a fiftieth of that
-_HEAD: Final = 256  # bytes searched for parameter sets and the beginning of the first slice
+PIECE: Final = 1460  #: bytes in every datagram of an image except the last one
+MAX_PICTURE: Final = 1 << 19  #: bytes; real images have a fiftieth of that
+_HEAD: Final = 256  # number of bytes searched for parameter sets and the beginning of the first slice
 
 
 @dataclass(frozen=True, slots=True)
 class AccessUnit:
-    """One picture as received."""
+    """An encoded image as received."""
 
     data: bytes
-    is_key: bool  #: decoding can begin here
+    is_key: bool  #: whether decoding can begin here
     arrived_ns: int  #: when its first piece arrived
-    after_gap: bool  #: an earlier picture is known to be missing or damaged
-    whole: bool  #: no sign of a missing piece in this picture
-    number: int = 0  #: counts the pictures that arrived
-    width: int = 0  #: by the newest parameters [px]; 0 before the first
+    after_gap: bool  #: whether an earlier image is known to be missing or damaged
+    whole: bool  #: whether no piece of this image seems to be missing
+    number: int = 0  #: count of images that have arrived
+    width: int = 0  #: width according to the newest parameter set [px]; 0 before the first one
     height: int = 0
 
 
 def pieces(picture: bytes) -> list[bytes]:
-    """Return a picture's datagrams."""
+    """Divide an encoded image into datagrams."""
     return [picture[at : at + PIECE] for at in range(0, len(picture), PIECE)]
 
 
 class Assembly:
-    """Assembles pictures from pieces in the order of arrival. Never raises for any input.
+    """Assembles images from pieces in order of arrival. Never raises, whatever the input.
 
-    ``stray`` counts bytes outside of pictures, ``missing`` the pictures missing by the numbers in the stream.
+    ``stray`` counts bytes that don't belong to any image, ``missing`` the images missing according to stream numbers.
     """
 
     def __init__(self) -> None:
@@ -299,15 +298,15 @@ class Assembly:
         self._arrived_ns = 0
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
-        self._gap = True  # since the last returned picture
+        self._gap = True  # whether there was a gap since the last returned image
         self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
-        """Add a datagram that arrived now; return the completed pictures, at most two."""
+        """Add a datagram that arrived now; return the images that it completes, at most two."""
         found = []
         begins = piece.startswith(START)
         if begins and self._has_picture():
-            found += self._end(whole=False)  # the last piece is missing, unless it was as long as the others
+            found += self._end(whole=False)  # the last piece is missing, unless it happened to be as long as the others
         if not begins and not self._pieces:
             self.stray += len(piece)
             self._gap = True
@@ -354,7 +353,7 @@ class Assembly:
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
-        """Return whether this picture's number does not follow the previous one, and remember the number."""
+        """Return whether this image's number does not follow the previous one, and store the number."""
         try:
             for unit in head:
                 if type_of(unit) == SPS:

@@ -1,1 +1,1 @@
-"""``video://PATH``: a vehicle whose camera is a video file or a video device."""
+"""``video://`` addresses: a vehicle whose camera is a video file, a device or a stream."""

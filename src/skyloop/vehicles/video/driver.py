@@ -1,6 +1,6 @@
 """The driver for ``video://``: life cycle, the thread that plays a file or reports on a camera, and options.
 
-``docs/drivers.md`` has the options as a table.
+``docs/drivers.md`` lists the options.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _CLOSE_S = 2.0
 
 
 class VideoDriver(Driver):
-    """A vehicle that can't fly, whose one camera shows a video file, a local device or a stream."""
+    """A vehicle that can't fly and has one camera, which is a video file, a local device or a stream."""
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -55,7 +55,7 @@ class VideoDriver(Driver):
         self._streams = False
 
     def capabilities(self) -> Capabilities:
-        """Return the camera. A file's head is read once for the size of its images; a camera is not opened."""
+        """Return the camera. To learn a file's image size its head is read once; a live camera is not opened."""
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
@@ -64,7 +64,7 @@ class VideoDriver(Driver):
         )
 
     def failsafe(self, action: Hover | Land) -> bool:  # noqa: ARG002
-        """Return True: nothing flies."""
+        """Return True because nothing is flying."""
         return True
 
     def _open(self, sink: Sink) -> None:
@@ -105,7 +105,7 @@ class VideoDriver(Driver):
             publisher = CameraPublisher(sink, options.camera, self._intrinsics, self._stop)
             player = FilePlayer(publisher, partial(open_file, options.path), loop=options.loop, speed=options.speed)
             player.run(source, wait=options.wait)
-        except Exception as error:  # noqa: BLE001  a codec's surprise must not end in silence
+        except Exception as error:  # noqa: BLE001  an unexpected error in a codec must be reported
             sink.event(EventKind.DRIVER_ERROR, f"{self.uri}: {error!r}", Severity.ERROR, where="playing")
             sink.link(LinkState.LOST, f"playback failed: {error!r}")
 
@@ -126,7 +126,7 @@ class VideoDriver(Driver):
         )
 
     def _publish_event(self, sink: Sink, event: VideoEvent, text: str) -> None:
-        """Publish a camera's event, as the link's state where it changes that. On either of its threads."""
+        """Publish a camera's event, as a link state if it changes that. Runs on either of the camera's threads."""
         if event is VideoEvent.STREAMING:
             self._streams = True
             sink.link(LinkState.UP)
@@ -137,7 +137,7 @@ class VideoDriver(Driver):
             event.publish(sink, "camera", text)
 
     def _report_live(self, sink: Sink, live: LiveCamera) -> None:
-        """Publish feedback while the camera streams: only its counters, as nothing flies."""
+        """Publish feedback while the camera streams, which consists only of its counters because nothing is flying."""
         while not self._stop.wait(seconds(FEEDBACK_NS)):
             if self._streams:
                 sink.feedback(Feedback(captured_ns=monotonic_ns(), native=live.telemetry()))
@@ -148,7 +148,7 @@ class VideoDriver(Driver):
             try:
                 source = open_file(options.path)
             except SkyloopError:
-                pass  # open() raises it; until then only the nominal size is known
+                pass  # open() raises the error; until then only the nominal size is known
             else:
                 source.close()
                 self._info = self._describe(source)
@@ -171,7 +171,7 @@ class VideoDriver(Driver):
         )
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the intrinsics from the options; None without a focal length."""
+        """Return the intrinsics given by the options; None if there is no focal length."""
         return intrinsics_of(self.uri, width, height)
 
 
@@ -183,14 +183,14 @@ _AUTO: Final = "auto"
 
 @dataclass(frozen=True, slots=True)
 class DeviceOptions:
-    """Settings of a local camera; a field that is not given leaves it unchanged."""
+    """Settings for a local camera; those not given are left unchanged."""
 
     format: str = ""  #: one of :data:`FORMATS`
     exposure: float | str = ""  #: [ms], or ``auto``
     gain: int | str = ""  #: in the device's own unit, or ``auto``
 
     def configure(self, path: str) -> list[str]:
-        """Set exposure and gain. Return the failures, in words."""
+        """Set exposure and gain; return a readable text for each failure."""
         if self.exposure == "" and self.gain == "":
             return []
         try:
@@ -201,7 +201,7 @@ class DeviceOptions:
         return problems
 
     def apply(self, device: V4l2Device) -> list[str]:
-        """Set exposure and gain of an open device; see :meth:`configure`."""
+        """Set the exposure and gain of an open device; see :meth:`configure`."""
         problems = []
         if self.exposure != "":
             problems.append(device.set_exposure(None if isinstance(self.exposure, str) else self.exposure))
@@ -214,17 +214,17 @@ class DeviceOptions:
 class VideoOptions:
     """A parsed address."""
 
-    place: str  #: path or address, safe to show
-    path: Path  #: of a file
-    source: CameraSource | None  #: of live video; None: a file
-    camera: str  #: its name
-    loop: bool  #: start over at the end
-    speed: float  #: of a file: recorded seconds per second
-    wait: bool  #: whether a file starts only when a client wants its frames
-    width: int  #: to request from a device, and to announce for a stream [px]
+    place: str  #: path or address without secrets
+    path: Path  #: path of the file
+    source: CameraSource | None  #: source of live video; None for a file
+    camera: str  #: the camera's name
+    loop: bool  #: whether to start over at the end
+    speed: float  #: speed at which a file is played, in recorded seconds per second
+    wait: bool  #: whether a file starts only once a client wants its frames
+    width: int  #: width to request from a device or announce for a stream [px]
     height: int
     fps: float
-    stream: bool  #: whether to announce H.264 that is passed on unchanged
+    stream: bool  #: whether to announce H.264 that is relayed unchanged
     device: DeviceOptions
 
 
@@ -268,7 +268,7 @@ def _place(uri: VehicleUri) -> tuple[Path, CameraSource | None]:
 
 
 def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
-    """Check that the options fit the source; raise if they don't."""
+    """Raise an error if the options do not fit the source."""
     if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
         raise UsageError(f"{uri}: loop and speed are for files, not live cameras")
     unfit = {
@@ -281,7 +281,7 @@ def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
 
 
 def _streams(uri: VehicleUri, source: CameraSource | None) -> bool:
-    """Return whether a camera probably sends H.264: a network camera, or a device set to it."""
+    """Return whether a camera probably sends H.264, as a network camera or a device set to that format does."""
     return source is not None and (bool(source.scheme) or uri.options.get("format") == H264)
 
 

@@ -1,4 +1,4 @@
-"""Play a video file, any that PyAV opens or a PaVE stream, into a sink, by its own time stamps."""
+"""Plays video files (PaVE streams, and all that PyAV opens) into a sink according to their own time stamps."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 FFmpegError = av.error.FFmpegError
 
-CHUNK: Final = 1 << 16  #: bytes per read
-SNIFF: Final = 1 << 18  #: a PaVE stream cut at any point shows a header within this many bytes
-DEFAULT_FPS: Final = 30.0  #: if the file does not say
+CHUNK: Final = 1 << 16  #: number of bytes per read
+SNIFF: Final = 1 << 18  #: a PaVE stream has a header within this many bytes, wherever it was cut
+DEFAULT_FPS: Final = 30.0  #: frame rate if the file does not specify it
 _TURNED: Final = frozenset({"mov", "mp4", "matroska", "webm"})  #: formats that can store a rotation
 
 
@@ -43,10 +43,10 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: Unit | None = None  #: its encoded form, if that is passed on unchanged
+    coded: Unit | None = None  #: its encoded form, if that is relayed unchanged
     number: int = 0  #: its number in the stream
-    reason: str = ""  #: why its encoded form is not passed on, in a stream that is
-    turns: int = 0  #: counter-clockwise quarter turns that make it upright
+    reason: str = ""  #: why its encoded form is not relayed although the stream is
+    turns: int = 0  #: number of counter-clockwise quarter turns that make it upright
 
 
 class Source(Protocol):
@@ -55,8 +55,8 @@ class Source(Protocol):
     width: int
     height: int
     fps: float
-    damaged: int  #: pieces that could not be decoded so far
-    stream: str  #: codec of images that can be passed on unchanged, ``h264``, or empty
+    damaged: int  #: number of pieces so far that could not be decoded
+    stream: str  #: ``h264`` if images with this codec can be relayed unchanged, otherwise empty
 
     def images(self) -> Iterator[DecodedImage]:
         """Yield the images in order until the file ends."""
@@ -65,7 +65,7 @@ class Source(Protocol):
 
 
 def is_device(path: Path) -> bool:
-    """Return whether the path names a device, even an absent one, rather than a file."""
+    """Return whether the path is that of a device, present or not, rather than a file."""
     if path.is_relative_to("/dev"):
         return True
     try:
@@ -80,7 +80,7 @@ def open_file(path: Path) -> Source:
         with path.open("rb") as file:
             head = file.read(SNIFF)
     except OSError as error:
-        if "%" in path.name:  # a numbered image sequence: PyAV understands the pattern
+        if "%" in path.name:  # a pattern for a numbered image sequence, which PyAV supports
             return ContainerSource(str(path))
         raise UsageError(f"video://{path}: {error.strerror}") from error
     if path.suffix == ".pave" or PaveParser().feed(head):
@@ -89,7 +89,7 @@ def open_file(path: Path) -> Source:
 
 
 class ContainerSource:
-    """A file, or an image sequence, that PyAV opens."""
+    """A file or image sequence that PyAV opens."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -121,13 +121,13 @@ class ContainerSource:
     def images(self) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`."""
         stamp_s = -1.0 / self.fps
-        coded: dict[int | None, tuple[int, Unit | None]] = {}  # by stamp, because decoders delay images
+        coded: dict[int | None, tuple[int, Unit | None]] = {}  # keyed by stamp, because decoders delay images
         for number, packet in enumerate(self._packets()):
             if self.stream and packet.size:
                 coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
-            except (FFmpegError, ValueError):  # a damaged packet: the decoder continues with the next
+            except (FFmpegError, ValueError):  # a damaged packet: the decoder continues with the next one
                 self.damaged += 1
                 continue
             for image in images:
@@ -143,7 +143,7 @@ class ContainerSource:
         try:
             yield from self._container.demux(self._stream)
         except (FFmpegError, OSError, ValueError):
-            self.damaged += 1  # a truncated file: everything before the cut is good
+            self.damaged += 1  # a truncated file, in which everything before the cut is usable
 
     def close(self) -> None:
         """Close the file."""
@@ -155,9 +155,9 @@ class ContainerSource:
 
 
 def _quarter_turns(name: str) -> int:
-    """Return the counter-clockwise quarter turns that make a file's images upright.
+    """Return the number of counter-clockwise quarter turns that make a file's images upright.
 
-    A phone held upright films sideways, and stores a rotation matrix in the container, which arrives with the images.
+    A phone held upright films sideways and stores a rotation matrix in the container; it is read with the images.
     """
     with suppress(FFmpegError, OSError, ValueError), av.open(name) as container:
         for image in itertools.islice(container.decode(container.streams.video[0]), 1):
@@ -166,10 +166,10 @@ def _quarter_turns(name: str) -> int:
 
 
 class PaveSource:
-    """A file with the raw bytes of an AR.Drone 2's video port.
+    """A file with the raw bytes from an AR.Drone 2's video port.
 
-    Images before the first key frame (a truncated stream, or the drone's stale first frame) and between damage and the
-    next key frame are dropped: they would be smeared.
+    Images before the first key frame (in a truncated stream, or the drone's stale first frame) and between damage and
+    the next key frame are dropped because they would be smeared.
     """
 
     def __init__(self, path: Path) -> None:
@@ -186,7 +186,7 @@ class PaveSource:
         self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
     def images(self) -> Iterator[DecodedImage]:
-        """See :meth:`Source.images`. Every image is decoded, as each needs the previous one."""
+        """See :meth:`Source.images`. Every image is decoded, because each depends on the previous one."""
         decoder = PaveDecoder()
         for frame in self._parser_frames():
             image = decoder.decode(frame)
@@ -207,16 +207,16 @@ class PaveSource:
         self._parser.end()
 
 
-FEEDBACK_NS: Final = 50_000_000  #: between feedback samples
-POLL_S: Final = 0.02  #: between checks for a viewer
-BEHIND_NS: Final = 250_000_000  #: when further behind, restart the schedule instead of rushing to catch up
-GAP_S: Final = 2.0  #: a longer step between stamps, or a step back, is a cut in the recording
+FEEDBACK_NS: Final = 50_000_000  #: time between feedback samples
+POLL_S: Final = 0.02  #: time between checks for a viewer
+BEHIND_NS: Final = 250_000_000  #: if further behind than this, restart the schedule instead of rushing to catch up
+GAP_S: Final = 2.0  #: a step between stamps that is longer than this, or backwards, is a cut in the recording
 
 
 class FilePacer:
-    """Maps a file's own time stamps to the times at which its images are shown.
+    """Converts a file's own time stamps to the times at which its images are shown.
 
-    Times never go backwards. A stamp that jumps (a cut, a reset clock) counts as one usual period.
+    Times never go backwards. A jump in the stamps (a cut, a reset clock) counts as one ordinary period.
     """
 
     def __init__(self, speed: float, period_s: float) -> None:
@@ -226,7 +226,7 @@ class FilePacer:
         self._due_ns = 0
 
     def due_ns(self, stamp_s: float, now_ns: int) -> int:
-        """Return when to show this stamp's image, which was ready at ``now_ns``."""
+        """Return when to show the image with this stamp, which was ready at ``now_ns``."""
         if self._stamp_s is None:
             self._due_ns = now_ns
         else:
@@ -241,7 +241,7 @@ class FilePacer:
 
 
 class CameraPublisher:
-    """Publishes one camera's images and feedback to a sink, and waits between them."""
+    """Publishes one camera's images and feedback to a sink, waiting for the right times."""
 
     def __init__(
         self, sink: Sink, camera: str, intrinsics: Callable[[int, int], Intrinsics | None], stop: threading.Event
@@ -269,7 +269,7 @@ class CameraPublisher:
         return self._relay.wanted
 
     def wait_until(self, due_ns: int) -> bool:
-        """Wait while publishing feedback. Return False if the driver is closing."""
+        """Wait until the given time while publishing feedback. Return False if the driver is closing."""
         while not self.stop.is_set():
             now_ns = monotonic_ns()
             self.publish_state(now_ns)
@@ -279,7 +279,7 @@ class CameraPublisher:
         return False
 
     def publish_state(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Publish feedback if it is due: only the position in the file, as nothing flies."""
+        """Publish feedback if it is due; it consists only of the position in the file because nothing is flying."""
         if now_ns < self._feedback_ns and not at_once:
             return
         self._feedback_ns = now_ns + FEEDBACK_NS
@@ -292,7 +292,7 @@ class CameraPublisher:
         self.sink.feedback(Feedback(captured_ns=now_ns, native=native))
 
     def show(self, image: DecodedImage, due_ns: int) -> bool:
-        """Convert an image now and publish it when due, as captured then. Return False if the driver is closing."""
+        """Convert an image and publish it at ``due_ns``, its capture time. Return False if the driver is closing."""
         pixels = _bgr(image) if self.wanted else None
         if not self.wait_until(due_ns):
             return False
@@ -325,7 +325,7 @@ class FilePlayer:
         self._speed = speed
 
     def run(self, source: Source, *, wait: bool) -> None:
-        """Play until the end, or until the driver closes; with ``wait``, start once a client wants the images."""
+        """Play until the end or until the driver closes; with ``wait``, start only once a client wants the images."""
         publisher = self._publisher
         publisher.sink.link(LinkState.UP)
         while wait and not (publisher.wanted or publisher.wanted_encoded):
@@ -346,7 +346,7 @@ class FilePlayer:
                 return
 
     def _pass(self, source: Source) -> bool:
-        """Play through once. Return whether to play again."""
+        """Play the file once; return whether to play it again."""
         publisher = self._publisher
         pacer = FilePacer(self._speed, 1.0 / source.fps)
         before = publisher.shown
@@ -370,5 +370,5 @@ class FilePlayer:
 
 
 def _bgr(image: DecodedImage) -> NDArray[np.uint8]:
-    """Return an image as BGR, shape (h, w, 3), C-contiguous."""
+    """Return an image as a C-contiguous BGR array, shape (h, w, 3)."""
     return np.ascontiguousarray(np.rot90(image.frame.to_ndarray(format="bgr24"), image.turns), dtype=np.uint8)

@@ -1,8 +1,8 @@
-"""Local cameras listed by Video4Linux: their formats, exposure and gain.
+"""Local cameras known to Video4Linux: their formats, exposure and gain.
 
-It calls the kernel directly. Layouts and numbers are those of ``linux/videodev2.h``
-(``Documentation/userspace-api/media/v4l``), the same on all architectures with 32-bit integers. FFmpeg may stream from
-the device at the same time: settings need no stream.
+This module calls the kernel directly. Layouts and numbers come from ``linux/videodev2.h``
+(``Documentation/userspace-api/media/v4l``) and are the same on all architectures with 32-bit integers. FFmpeg may
+stream from the device at the same time, because settings can be changed independently of a stream.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-#: Takes a descriptor, a request and a buffer, which it changes; raises OSError.
+#: Called with a descriptor, a request and a buffer, which it modifies; raises OSError.
 Ioctl = Callable[[int, int, bytearray], object]
 
 _READ, _WRITE = 2, 1  # _IOC_READ, _IOC_WRITE
 _CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE
 _DEVICE_CAPS: Final = 1 << 31
 _DISCRETE: Final = 1
-_MOST: Final = 256  # cap on formats, sizes and rates, for a device that never ends its list
+_MOST: Final = 256  # maximum number of formats, sizes and rates, in case a device's list never ends
 
 CAPABILITY: Final = struct.Struct("=16s32s32sIII12x")
 FORMAT: Final = struct.Struct("=III32sI16x")
@@ -34,7 +34,7 @@ CONTROL: Final = struct.Struct("=Ii")
 
 
 def _request(direction: int, number: int, layout: struct.Struct) -> int:
-    """Return the kernel's ``_IOC('V', …)``."""
+    """Return the request number, like the kernel's ``_IOC('V', …)``."""
     return direction << 30 | layout.size << 16 | ord("V") << 8 | number
 
 
@@ -49,24 +49,24 @@ ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, INTERVAL)
 AUTO_GAIN: Final = 0x00980912
 GAIN: Final = 0x00980913
 AUTO_EXPOSURE: Final = 0x009A0901
-EXPOSURE: Final = 0x009A0902  #: in units of 100 µs
-_AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # of AUTO_EXPOSURE; UVC cameras use the last one for "auto"
+EXPOSURE: Final = 0x009A0902  #: exposure time in units of 100 µs
+_AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # values of AUTO_EXPOSURE; UVC cameras use the last one for "auto"
 _EXPOSURE_MS: Final = 0.1
 _DISABLED: Final = 1
 
-#: FFmpeg's format names, by our names and the kernel's.
+#: FFmpeg's format names by our own.
 FORMATS: Final = {"mjpeg": "mjpeg", "yuyv": "yuyv422", "h264": "h264", "nv12": "nv12", "grey": "gray"}
 _NAMES: Final = {"MJPG": "mjpeg", "JPEG": "mjpeg", "YUYV": "yuyv", "H264": "h264", "NV12": "nv12", "GREY": "grey"}
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSize:
-    """An image size, or a range of sizes, with its rates."""
+    """An image size, or a range of sizes, with its frame rates."""
 
-    width: int  #: [px]; the largest in a range
+    width: int  #: width [px]; for a range, the largest
     height: int
-    fps: tuple[float, ...]  #: [1/s], highest first; of a range, its ends
-    smallest: tuple[int, int] | None = None  #: of a range
+    fps: tuple[float, ...]  #: frame rates [1/s], highest first; for a range of rates, its two ends
+    smallest: tuple[int, int] | None = None  #: the smallest size in a range
 
     def __str__(self) -> str:
         size = f"{self.width}x{self.height}"
@@ -77,7 +77,7 @@ class FrameSize:
 
 @dataclass(frozen=True, slots=True)
 class PixelFormat:
-    """A format of images."""
+    """A pixel format that a camera supports."""
 
     code: str  #: the kernel's code, such as ``MJPG``
     description: str
@@ -85,7 +85,7 @@ class PixelFormat:
 
     @property
     def option(self) -> str:
-        """The value of ``format=`` that selects it; empty if none does."""
+        """The value of ``format=`` that selects this format; empty if there is none."""
         return _NAMES.get(self.code, "")
 
     def __str__(self) -> str:
@@ -95,7 +95,7 @@ class PixelFormat:
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """A setting of the device, in its own unit."""
+    """A setting of the device, in the device's own unit."""
 
     number: int
     name: str
@@ -112,19 +112,19 @@ class V4l2Device:
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         """Store the arguments. No I/O."""
         if ioctl is None:
-            from fcntl import ioctl as kernels  # missing on Windows
+            from fcntl import ioctl as kernels  # not available on Windows
 
             ioctl = kernels
         self._descriptor = descriptor
         self._ioctl = ioctl
 
     def captures(self) -> bool:
-        """Return whether it captures images; raise OSError if it is not a Video4Linux device."""
+        """Return whether the device captures images; raise OSError if it is not a Video4Linux device."""
         *_, everything, own = CAPABILITY.unpack(self._call(QUERYCAP, bytearray(CAPABILITY.size)))
         return bool((own if everything & _DEVICE_CAPS else everything) & _CAPTURE)
 
     def formats(self) -> list[PixelFormat]:
-        """Return the formats with their sizes and rates, as far as the device reports them."""
+        """Return the formats, with their sizes and rates if the device reports them."""
         found = []
         for index in range(_MOST):
             answer = self._try(ENUM_FMT, FORMAT, index, _CAPTURE, 0, b"", 0)
@@ -146,7 +146,7 @@ class V4l2Device:
         return Control(number, _text(name), minimum, maximum, step, default, value[1])
 
     def set_exposure(self, exposure_ms: float | None) -> str:
-        """Set the exposure [ms]; None: automatic. Return why that failed, in words."""
+        """Set the exposure [ms], None for automatic; return why that failed, as readable text."""
         if exposure_ms is None:
             problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
             return f"the camera has no automatic exposure: {problem}" if problem else ""
@@ -156,11 +156,11 @@ class V4l2Device:
         lowest, highest = known.minimum * _EXPOSURE_MS, known.maximum * _EXPOSURE_MS
         if not lowest <= exposure_ms <= highest:
             return f"exposure is {exposure_ms:g} ms and must be from {lowest:g} to {highest:g} for this camera"
-        self._set(AUTO_EXPOSURE, _MANUAL)  # a device without automatic exposure lacks this control
+        self._set(AUTO_EXPOSURE, _MANUAL)  # the control is missing on a device without automatic exposure
         return self._set(EXPOSURE, round(exposure_ms / _EXPOSURE_MS))
 
     def set_gain(self, gain: int | None) -> str:
-        """Set the gain in the device's own unit; None: automatic. Return why that failed, in words."""
+        """Set the gain in the device's own unit, None for automatic; return why that failed, as readable text."""
         if gain is None:
             problem = self._set(AUTO_GAIN, 1)
             return f"the camera has no automatic gain: {problem}" if problem else ""
@@ -173,7 +173,7 @@ class V4l2Device:
         return self._set(GAIN, gain)
 
     def settings(self) -> list[str]:
-        """Return exposure and gain in words: range and present value."""
+        """Return readable descriptions of exposure and gain: their ranges and present values."""
         found = []
         exposure, mode = self.control(EXPOSURE), self.control(AUTO_EXPOSURE)
         if exposure is not None:
@@ -220,7 +220,7 @@ class V4l2Device:
         return ""
 
     def _try(self, request: int, layout: struct.Struct, *numbers: object) -> tuple[int, ...] | None:
-        """Return the device's answer, or None."""
+        """Return the device's reply, or None if the request failed."""
         try:
             return layout.unpack(self._call(request, bytearray(layout.pack(*numbers))))
         except OSError:
@@ -233,7 +233,7 @@ class V4l2Device:
 
 @contextmanager
 def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
-    """Open a device, such as ``/dev/video0``, for its settings; ``ioctl`` as for :class:`V4l2Device`."""
+    """Open a device such as ``/dev/video0`` to access its settings; ``ioctl`` is as in :class:`V4l2Device`."""
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         yield V4l2Device(descriptor, ioctl)
@@ -263,9 +263,9 @@ _DEVICES: Final = Path("/dev")
 class CameraDevice:
     """A local camera."""
 
-    path: Path  #: such as ``/dev/video0``
-    name: str  #: as reported by its driver
-    allowed: bool  #: whether this user may open it
+    path: Path  #: path such as ``/dev/video0``
+    name: str  #: name reported by its driver
+    allowed: bool  #: whether this user is allowed to open it
 
     def __str__(self) -> str:
         why = "" if self.allowed else ", but this user may not open it: sudo usermod -aG video $USER, and log in again"
@@ -273,9 +273,9 @@ class CameraDevice:
 
 
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
-    """Return the local cameras, by number; none if the system has no Video4Linux.
+    """Return the local cameras in order of their numbers; none if the system has no Video4Linux.
 
-    Only a camera's first node, the one that captures images, is listed.
+    Of each camera, only the first node is listed, which is the one that captures images.
     """
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))
@@ -291,14 +291,14 @@ def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevic
 
 
 def described(found: list[CameraDevice]) -> str:
-    """Return the list of cameras, in words."""
+    """Return the list of cameras as readable text."""
     if not found:
         return "no camera is connected to this machine"
     return f"cameras of this machine: {', '.join(map(str, found))}"
 
 
 def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
-    """Return a camera's description, as lines for people: address, formats, sizes, rates, exposure and gain."""
+    """Return a readable description of a camera, line by line: address, formats, sizes, rates, exposure and gain."""
     try:
         with opened(str(camera.path), ioctl) as device:
             told = [*map(str, device.formats()), *device.settings()]

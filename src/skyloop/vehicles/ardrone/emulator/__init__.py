@@ -1,6 +1,6 @@
-"""Emulate an AR.Drone 1 or 2 on the network over a simulated vehicle, for any program that flies the real one.
+"""An emulated AR.Drone 1 or 2 on the network, flying a simulated vehicle, for any program that flies the real one.
 
-On free ports of this machine, for a test::
+To use it on free local ports, as in a test::
 
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports, with_ardrones
     from skyloop.sim.host import SimHost
@@ -11,8 +11,8 @@ On free ports of this machine, for a test::
         ports = firmware.ports  # .navdata and .at (UDP), .video (TCP; UDP of version 1), .control (TCP)
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` of
-:mod:`skyloop.faults` drops datagrams in both directions.
+``firmware.stop()`` and ``firmware.start()`` restart it on the same ports. ``faults=Faults(seed=1, drop=0.1)`` drops
+datagrams in both directions (see :mod:`skyloop.faults`).
 """
 
 from __future__ import annotations
@@ -44,20 +44,20 @@ if TYPE_CHECKING:
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]
 
 
-REPORTS_HZ: Final = 125.0  #: the report rate of a world that keeps time
+REPORTS_HZ: Final = 125.0  #: report rate that a world can sustain in real time
 
 
 def with_ardrones(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are AR.Drones: their identified response, and the highest navdata rate.
+    """Return the options for a world of AR.Drones: their identified response, and the highest navdata rate.
 
-    The firmware brings its own cameras and ignores those of the options.
+    The firmware has its own cameras and ignores those in the options.
     """
     return replace(options or SimOptions(), parameters=AR_DRONE, rate_hz=REPORTS_HZ, cameras=())
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
 
     version: int
     bind: str
@@ -68,7 +68,7 @@ class Settings:
     torn_start: bool
 
 
-DEMO_HZ: Final = 15.0  #: navdata of the demo mode
+DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 
 
 class RunningFirmware(RunningEmulator):
@@ -79,7 +79,7 @@ class RunningFirmware(RunningEmulator):
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
         self._demo_due_ns = 0
-        self._stale = b""  # the last picture that needs earlier ones
+        self._stale = b""  # the last frame sent, if it depends on earlier ones
         self._navdata_clients, self._video_clients = Listeners(), Listeners()
         self._most_thrust = host.simulation.parameters[drone].most_thrust
         vehicle = SimulatedVehicle(host.simulation, drone)
@@ -132,7 +132,7 @@ class RunningFirmware(RunningEmulator):
         self._update_video()
 
     def _send_text(self, text: bytes) -> None:
-        self._control_port.accept()  # a client that connected just before its command also gets the answer
+        self._control_port.accept()  # so that a client that connected just before its command gets the reply too
         self._control_port.broadcast(text)
 
     def _asked_for_navdata(self, _datagram: bytes, sender: Address) -> None:
@@ -142,7 +142,7 @@ class RunningFirmware(RunningEmulator):
     def _tick(self, report: Report) -> None:
         self.logic.supervise(report.believed)
         if self.logic.lost:
-            self._video_clients = Listeners()  # or an AR.Drone 1 would keep sending to clients that have left
+            self._video_clients = Listeners()  # otherwise an AR.Drone 1 would keep sending to clients that have left
         self._update_video()
         now_ns = monotonic_ns()
         if self.logic.demo or self.logic.bootstrap:
@@ -186,7 +186,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def _seen(self) -> bool:
-        """Whether any client receives pictures."""
+        """Whether any client is receiving video."""
         if self._video_stream is not None:
             return bool(self._video_stream.outlets)
         return bool(self._video_clients)
@@ -204,7 +204,7 @@ class RunningFirmware(RunningEmulator):
         return -believed.pitch_rad, believed.roll_rad, -believed.yaw_rad
 
     def _update_video(self) -> None:
-        """Apply the video configuration. Runs on the loop's thread."""
+        """Apply the configured video settings. Runs on the loop's thread."""
         wanted = self.logic.video
         if wanted == self._shown:
             return
@@ -222,7 +222,7 @@ class RunningFirmware(RunningEmulator):
         self._video_clients.refresh(sender)
 
     def _encoded(self, piece: Piece) -> None:
-        """Send a picture. Runs on the encoder's thread."""
+        """Send an encoded image. Runs on the encoder's thread."""
         self._loop.post(lambda: self._send_video(piece))
 
     def _send_video(self, piece: Piece) -> None:
@@ -237,7 +237,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads -------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate for this camera: the full one, or 0 without a client."""
+        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self._seen else 0.0
 
 
@@ -247,25 +247,25 @@ VERSIONS: Final = (1, 2)
 class ArdroneFirmware(Emulator[RunningFirmware]):
     """The firmware of one drone in a host's world. Several can share a host, each with its own drone and ports.
 
-    Make the host with :func:`with_ardrones`. Full navdata is sent as often as the host reports
-    (:attr:`skyloop.sim.options.SimOptions.rate_hz`), and at most 125 times a second; real drones send 200.
+    Create the host with options from :func:`with_ardrones`. Full navdata is sent at the host's report rate
+    (:attr:`skyloop.sim.options.SimOptions.rate_hz`), but at 125 Hz at most; real drones send it at 200 Hz.
 
     Args:
         host: The simulated world.
-        drone: Its number in that world.
+        drone: Number of the drone in that world.
         version: 1 or 2.
-        bind: The address of this machine to listen on.
-        ports: Ports to listen on; 0 for any free one.
+        bind: The local address to listen on.
+        ports: The ports to listen on; 0 for any free one.
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
         delay_s: Added to those datagrams, in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
-        torn_start: Whether a new client of an AR.Drone 2's video first gets the last picture sent to another client,
-            however old, and then the following frames, key frame or not, as from a real drone. Otherwise its stream
-            begins with the next key frame.
+        torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
+            client, however old, and then the frames that follow, key frames or not. Otherwise its stream begins with
+            the next key frame.
 
     Raises:
-        UsageError: No such version or header size, or the delay is out of range.
-        MissingExtraError: A library that draws or encodes pictures is not installed.
+        UsageError: The version or header size does not exist, or the delay is out of range.
+        MissingExtraError: A library that renders or encodes images is not installed.
     """
 
     def __init__(
@@ -292,15 +292,15 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=running.ports)  # kept for a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports for a restart
         return running
 
     @property
     def ports(self) -> Ports:
-        """The real ports; free ones were chosen for 0."""
+        """The actual ports, with those that were chosen for 0."""
         return self._started.ports
 
     @property
     def logic(self) -> ArdroneLogic:
-        """The state of the running firmware, for tests; belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
         return self._started.logic

@@ -1,4 +1,4 @@
-"""The drone's configuration: values per session, user and application, and the dumps that it sends. Pure."""
+"""The drone's configuration: its values per session, user and application, and the dumps that it sends. Pure."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from skyloop.vehicles.ardrone.wire.configuration import (
     parse_value,
 )
 
-MOST_CUSTOM: Final = 16  #: of sessions, users and applications each; the real drone's number is unknown
+MOST_CUSTOM: Final = 16  #: most sessions, most users and most applications; a real drone's limit is unknown
 
-Ids = tuple[str, str, str]  #: of session, user and application, as in ``CONFIG_IDS``
+Ids = tuple[str, str, str]  #: ids of the session, user and application, as in ``CONFIG_IDS``
 
 _ID: Final = re.compile(r"[0-9a-f]{8}")
 _ID_KEYS: Final = {
@@ -34,9 +34,9 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: The limits that exist three times: in force, for indoors and for outdoors.
+#: Limits that come in three versions: the one in force, one for indoors and one for outdoors.
 TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
-#: Values of the emulated firmware, 2.4.8 and 1.7.4, that differ from the usual defaults.
+#: Values in the emulated firmware (2.4.8 and 1.7.4) that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
     1: {
         "general:num_version_soft": "1.7.4",
@@ -49,14 +49,14 @@ _FACTORY: Final[dict[int, dict[str, Value]]] = {
     2: {"general:num_version_soft": "2.4.8"},
 }
 _CODECS: Final = {1: (VideoCodec.UVLC,), 2: tuple(codec for codec in VideoCodec if codec >= VideoCodec.MP4_360P)}
-_CHANNELS: Final = {1: 4, 2: 2}  # of the camera, or pairs of cameras
+_CHANNELS: Final = {1: 4, 2: 2}  # number of video channels by version: a camera, or a pair of cameras
 
 
 class Configuration:
-    """All keys of an AR.Drone 1 or 2. Never raises for received values: ignores nonsense.
+    """All keys of an AR.Drone 1 or 2. Ignores invalid values received from clients and never raises.
 
-    A number out of range is clamped; no source reports what the drone does. A key of the category session, user or
-    application has a value for each id; new ids begin with the factory's values.
+    A number out of range is clamped; no source says what the drone does with it. A key in the category session, user
+    or application has a separate value for each id; new ids begin with the factory values.
     """
 
     def __init__(self, version: int) -> None:
@@ -89,10 +89,10 @@ class Configuration:
         return self._ids[Category.SESSION], self._ids[Category.USER], self._ids[Category.APPLICATION]
 
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
-        """Handle a ``CONFIG`` with the ids that came right before it, if any; return whether it was obeyed.
+        """Handle a ``CONFIG`` with the ids received immediately before it, if any; return whether it was accepted.
 
-        With a custom session, user or application in force, only commands with its ids are obeyed. ``custom:…_id``
-        is the exception, or no other client could ever begin one.
+        While a custom session, user or application is in force, only commands with its ids are accepted, except for
+        ``custom:…_id``: otherwise no other client could ever start a custom one.
         """
         name = name.strip().lower()
         key = self._keys.get(name)
@@ -115,11 +115,11 @@ class Configuration:
         self._show_ids()
 
     def dump(self) -> bytes:
-        """Return the control port's answer to ``CTRL 4``."""
+        """Return the control port's reply to ``CTRL 4``."""
         return format_dump({name: self[name] for name in self._keys})
 
     def custom_ids(self) -> bytes:
-        """Return the control port's answer to ``CTRL 6``."""
+        """Return the control port's reply to ``CTRL 6``."""
         parts = []
         for category, (title, description) in _DESCRIPTIONS.items():
             parts.append(title)
@@ -147,7 +147,7 @@ class Configuration:
             self._store(f"control:{word.removeprefix(f'{place}_')}", value)
 
     def _choose(self, category: Category, text: str) -> bool:
-        """Begin, switch to or delete (``-id``, ``-all``) a session, user or application."""
+        """Start, switch to or delete (``-id``, ``-all``) a session, user or application."""
         known = self._values[category]
         if text == "-all":
             for gone in [one_id for one_id in known if one_id != DEFAULT_ID]:
@@ -170,7 +170,7 @@ class Configuration:
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 
     def _understood(self, key: Key, text: str) -> Value | None:
-        """Return the value of a text; None if it makes no sense."""
+        """Return the value that a text stands for; None if it is invalid."""
         try:
             value = parse_value(text, _as_number(key.default))
         except DecodeError:
@@ -196,5 +196,5 @@ class Configuration:
 
 
 def _as_number(default: Value) -> Value:
-    """Accept a decimal point in whole numbers, as the firmware's C does."""
+    """Allow a decimal point in whole numbers, as the firmware's C code does."""
     return float(default) if isinstance(default, int) and not isinstance(default, bool) else default

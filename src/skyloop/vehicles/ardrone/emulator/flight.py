@@ -1,10 +1,10 @@
 """The firmware's flight logic: turns AT commands, silence and battery state into set-points. Pure: no clock.
 
-Follows the Developer Guide's description of the drone's decisions. Flight animations are not modelled: they are
-recorded, and navdata shows a flip for its duration, but the vehicle keeps following its last command.
+The decisions are those described in the Developer Guide. Flight animations are not modelled: a request is stored and
+navdata reports a flip for its duration, but the vehicle continues to follow its last command.
 
-Values of a ``PCMD`` are from -1 to 1 of the configured limits, with the drone's signs: roll > 0 right, pitch < 0 nose
-down, gaz > 0 up, yaw > 0 clockwise.
+The values of a ``PCMD`` are fractions of the configured limits from -1 to 1, with the drone's signs: roll > 0 right,
+pitch < 0 nose down, gaz > 0 up, yaw > 0 clockwise.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
 TAKEOFF_ALTITUDE_M: Final = 0.85  #: real drones hover at 0.7 to 1 m after a take-off
-_LEAST_TURNING_SPEED_M_S: Final = 1.0  # of a coordinated turn; slower turns use this speed
+_LEAST_TURNING_SPEED_M_S: Final = 1.0  # a coordinated turn at a lower speed is computed for this one
 _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
 
@@ -34,7 +34,7 @@ _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 class Progress:
     """A ``PCMD`` or ``PCMD_MAG`` as received.
 
-    ``heading`` is the remote control's, as a share of 180° from north, clockwise; None in a ``PCMD``.
+    ``heading`` is the remote control's heading, clockwise from north, as a fraction of 180°; None in a ``PCMD``.
     """
 
     flags: int
@@ -55,7 +55,7 @@ NO_PROGRESS: Final = Progress(0, 0.0, 0.0, 0.0, 0.0)
 
 
 def limits_of(configuration: Configuration) -> Limits:
-    """Return the vehicle's limits for the configuration, clamped to the range of the simulated vehicle."""
+    """Return the limits given by the configuration, clamped to the simulated vehicle's range."""
     return Limits(
         tilt_rad=_possible("tilt_rad", configuration.number("control:euler_angle_max")),
         climb_m_s=_possible("climb_m_s", configuration.number("control:control_vz_max") / 1000),
@@ -68,13 +68,13 @@ def limits_of(configuration: Configuration) -> Limits:
 def set_point(
     progress: Progress, configuration: Configuration, *, yaw_rad: float, forward_m_s: float
 ) -> Attitude | Hover:
-    """Return the set-point for a ``PCMD``, within the configured limits."""
+    """Return the set-point that a ``PCMD`` requests, within the configured limits."""
     if not progress.flags & Pcmd.PROGRESSIVE:
         return Hover()
     most_tilt = configuration.number("control:euler_angle_max")
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        # Relative to the remote control's heading: turn it by the difference from the drone's.
+        # The command is relative to the remote control's heading: rotate it by the difference from the drone's.
         right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
@@ -92,11 +92,11 @@ def _possible(name: str, value: float) -> float:
     return within(value, *LIMIT_RANGES[name])
 
 
-HOVER_AFTER_S: Final = 0.25  #: of silence: Developer Guide, general:com_watchdog (from memory, not checked)
-LOST_AFTER_S: Final = 2.0  #: of silence until the link counts as lost
-CUT_OUT_TILT_RAD: Final = math.radians(60)  #: estimate: no source gives the angle
-BATTERY_RECOVERY_MV: Final = 500  #: estimate; this far above vbat_min a battery no longer counts as low
-CALIBRATION_RATE_RAD_S: Final = 1.5  #: estimate: the calibration's turn takes about 4 s
+HOVER_AFTER_S: Final = 0.25  #: silence before it hovers: general:com_watchdog in the Developer Guide (not checked)
+LOST_AFTER_S: Final = 2.0  #: silence before the link counts as lost
+CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, as no source gives the angle
+BATTERY_RECOVERY_MV: Final = 500  #: how far above vbat_min a battery no longer counts as low; an estimate
+CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate of the calibration's turn, which takes about 4 s; an estimate
 FIRST_FLIP: Final = 16
 LAST_ANIMATION: Final = 19
 
@@ -105,7 +105,7 @@ _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 @dataclass(frozen=True, slots=True)
 class Animation:
-    """A requested flight animation; only recorded."""
+    """A requested flight animation, which is stored but not flown."""
 
     number: int
     until_ns: int
@@ -118,23 +118,23 @@ class FlightControl:
         self._vehicle = vehicle
         self._configuration = configuration
         self._version = version
-        self._toggle_ready = True  # the emergency bit was 0 since its last effect
-        self._emergency = State(0)  # the reasons, without EMERGENCY itself
+        self._toggle_ready = True  # whether the emergency bit has been 0 since it last took effect
+        self._emergency = State(0)  # the bits for the reasons, without EMERGENCY itself
         self._calibrating_until_ns = 0
         self._believed: VehicleFeedback | None = None
-        self.start = False  #: the take-off bit of the last REF
+        self.start = False  #: the take-off bit in the last REF
         self.battery_low = False
-        self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM; navdata is relative to them
-        self.progress = NO_PROGRESS  #: the last valid one
+        self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM, subtracted in navdata
+        self.progress = NO_PROGRESS  #: the last valid PCMD or PCMD_MAG
         self.animation: Animation | None = None
-        self.calibrations = 0  #: calibrations of the magnetometer started so far
+        self.calibrations = 0  #: number of magnetometer calibrations started so far
 
     # Commands --------------------------------------------------------------------------------------------------
 
     def ref(self, bits: int) -> None:
         """Handle ``REF``: take off, land, toggle the emergency.
 
-        The fixed bits are ignored, as some programs leave them out.
+        The fixed bits are not checked, because some programs omit them.
         """
         self.start = bool(bits & Ref.TAKEOFF)
         if bits & Ref.EMERGENCY:
@@ -151,7 +151,7 @@ class FlightControl:
     def follow(self, progress: Progress, now_ns: int) -> None:
         """Handle ``PCMD`` or ``PCMD_MAG``.
 
-        Ignored if a number is not finite. During a calibration of the magnetometer it is only stored.
+        A command with a number that is not finite is ignored. During a magnetometer calibration it is only stored.
         """
         if not progress.makes_sense:
             return
@@ -169,7 +169,7 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: take the present attitude as level. Refused in the air."""
+        """Handle ``FTRIM``: use the present attitude as level. Refused in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
@@ -182,7 +182,7 @@ class FlightControl:
         self._vehicle.command(Attitude(0.0, 0.0, 0.0, -CALIBRATION_RATE_RAD_S))
 
     def animate(self, number: int, duration_ms: int, now_ns: int) -> None:
-        """Handle ``ANIM``, or the key ``control:flight_anim``. In flight only."""
+        """Handle ``ANIM``, or a write to the key ``control:flight_anim``. Ignored unless flying."""
         if 0 <= number <= LAST_ANIMATION and 0 <= duration_ms <= 60_000 and self._vehicle.state in _FLYING:
             self.animation = Animation(number, now_ns + duration_ms * 1_000_000)
 
@@ -191,13 +191,13 @@ class FlightControl:
         return now_ns < self._calibrating_until_ns
 
     def flipping(self, now_ns: int) -> bool:
-        """Return whether a requested flip is still in its time."""
+        """Return whether the duration of a requested flip is not over yet."""
         return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
 
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Check battery and angles, and the link by the time without commands. Called regularly."""
+        """Check the battery, the angles and, by the time since the last command, the link. Called regularly."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:
@@ -211,7 +211,7 @@ class FlightControl:
             self._in_flight(lambda: self._vehicle.command(Hover()))
 
     def emergency_bits(self, state: FlightState) -> State:
-        """Return the bits of navdata for an emergency and its reason."""
+        """Return the navdata bits for an emergency and its reason."""
         if state is not FlightState.EMERGENCY:
             return State(0)
         return State.EMERGENCY | (self._emergency or State.CUTOUT)
@@ -224,7 +224,7 @@ class FlightControl:
         elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
             self._emergency = State(0)
             self._toggle_ready = False
-        # A reset in mid-fall is ignored; if the bit is still set when the drone lies on the ground, it works then.
+        # A reset during the fall is ignored. It takes effect on the ground if the bit is still set.
 
     def _watch_battery(self, believed: VehicleFeedback) -> None:
         least_mv = self._configuration.number("general:vbat_min")

@@ -1,6 +1,6 @@
-"""The drone's logic: handle AT commands and keep the link, the configuration and the state bits.
+"""The drone's logic: handles AT commands and maintains the link, the configuration and the state bits.
 
-Pure: the clock is an argument, and output goes to a function.
+Pure: the clock is an argument, and output is passed to a function.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
-RESTART: Final = 1  #: the sequence number of a client's restart
+RESTART: Final = 1  #: the sequence number with which a client restarts the count
 
 
 class CommandSequence:
-    """Accepts a command only if its number is greater than that of the last accepted one, or is 1, which restarts.
+    """Accepts a command only if its number is greater than the last accepted one, or is 1, which restarts the count.
 
-    After two seconds without an accepted command any number greater than 0 is new again. The Developer Guide tells
-    clients to begin with 1; a drone that insisted on it would never obey a client whose first datagram was lost, so
-    this one does not.
+    After two seconds without an accepted command, any number greater than 0 is accepted. The Developer Guide says that
+    clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost,
+    so this one does not.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class CommandSequence:
         self._taken_ns: int | None = None
 
     def takes(self, number: int, now_ns: int) -> bool:
-        """Return whether to execute the command with this number, received now."""
+        """Return whether to execute a command with this number that was received now."""
         if self._taken_ns is not None and now_ns - self._taken_ns > nanoseconds(SILENCE_RESET_S):
             self._last = 0
         if number != RESTART and number <= self._last:
@@ -44,7 +44,7 @@ class CommandSequence:
         return True
 
 
-WATCHDOG_S: Final = 0.05  #: of silence: Developer Guide, 7.1.2
+WATCHDOG_S: Final = 0.05  #: silence before the watchdog bit is set: Developer Guide, 7.1.2
 
 _ALWAYS: Final = (
     State.ALTITUDE_CONTROL
@@ -55,7 +55,7 @@ _ALWAYS: Final = (
     | State.VIDEO_THREAD
     | State.ACQUISITION_THREAD
 )
-_NOTHING_DETECTED: Final = 3  # detect:detect_type
+_NOTHING_DETECTED: Final = 3  # value of detect:detect_type for no detection
 _CAMERAS: Final = {
     VideoChannel.FRONT: ("front",),
     VideoChannel.BOTTOM: ("bottom",),
@@ -63,13 +63,13 @@ _CAMERAS: Final = {
     VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
 }
 _INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
-#: Commands that a real drone accepts and that have no effect here: legacy and factory commands.
+#: Legacy and factory commands, which a real drone accepts and which have no effect here.
 _WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
 
 
 @dataclass(frozen=True, slots=True)
 class VideoSettings:
-    """The configured video."""
+    """The video settings as configured."""
 
     channel: VideoChannel
     codec: VideoCodec
@@ -89,7 +89,7 @@ class VideoSettings:
 
 @dataclass(frozen=True, slots=True)
 class LedAnimation:
-    """The last request; a simulated drone has no lights."""
+    """The last requested LED animation, which is only stored: a simulated drone has no lights."""
 
     number: int
     frequency_hz: float
@@ -104,18 +104,18 @@ class ArdroneLogic:
         self._send_text = send_text
         self._clock = clock
         self._sequence = CommandSequence()
-        self._received_ns = clock()  # the last command, or the start before the first one
-        self._linked = False  # a command arrived since the start or the last link loss
+        self._received_ns = clock()  # time of the last command, or of the start if there was none
+        self._linked = False  # whether a command has arrived since the start or the last link loss
         self._watchdog = True
         self._ack = False
-        self.lost = False  #: the link counts as lost after a long silence
-        self._ids: Ids | None = None  # from the command right before
+        self.lost = False  #: whether the link counts as lost after a long silence
+        self._ids: Ids | None = None  # ids from the immediately preceding command
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
-        self.bootstrap = True  #: sends no options until the mode is configured
+        self.bootstrap = True  #: whether the drone sends no options yet, until its mode is configured
         self.leds: LedAnimation | None = None
-        self.malformed = 0  #: nonsense lines, unknown commands and wrong arguments
-        self.stale = 0  #: commands whose sequence number was not new
+        self.malformed = 0  #: number of invalid lines, unknown commands and wrong arguments
+        self.stale = 0  #: number of commands whose sequence number was not new
         self._handlers: dict[str, Callable[..., None]] = {
             "REF": self._ref,
             "PCMD": self._pcmd,
@@ -136,7 +136,7 @@ class ArdroneLogic:
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Execute the commands of a datagram. Never raises for any content."""
+        """Execute the commands in a datagram. Never raises, whatever the content."""
         commands, malformed = parse_commands(datagram)
         self.malformed += malformed
         for command in commands:
@@ -149,7 +149,7 @@ class ArdroneLogic:
             self._execute(command, ids)
 
     def supervise(self, believed: VehicleFeedback) -> None:
-        """Run the watchdogs and check battery and angles. Called regularly, with the vehicle's own estimate."""
+        """Run the watchdogs and check the battery and angles. Called regularly with the vehicle's own estimate."""
         silence_s = self.silence_s
         if silence_s > WATCHDOG_S:
             self._watchdog = True
@@ -163,7 +163,7 @@ class ArdroneLogic:
         return seconds(self._clock() - self._received_ns)
 
     def _lose_link(self) -> None:
-        """Reset the link: the next client begins with bootstrap and the default session, user and application."""
+        """Reset the link: the next client starts in bootstrap with the default session, user and application."""
         self.lost, self._linked = True, False
         self.bootstrap = True
         self._ack = False
@@ -173,7 +173,7 @@ class ArdroneLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state(self, *, video: bool) -> State:
-        """Return the state bits; ``video``: whether any client receives pictures."""
+        """Return the state bits; ``video`` says whether any client is receiving video."""
         flight_state = self._vehicle.state
         bits = {
             State.FLYING: flight_state.airborne,
@@ -195,12 +195,12 @@ class ArdroneLogic:
 
     @property
     def demo(self) -> bool:
-        """Whether navdata is sent 15 times a second with few options."""
+        """Whether navdata is sent in demo mode, 15 times per second and with few options."""
         return bool(self.configuration["general:navdata_demo"])
 
     @property
     def video(self) -> VideoSettings:
-        """The video as configured now."""
+        """The video settings as currently configured."""
         number, keys = self.configuration.number, self.configuration
         most = number("video:max_bitrate") if "video:max_bitrate" in keys else float("inf")
         return VideoSettings(
@@ -221,7 +221,7 @@ class ArdroneLogic:
             handler = partial(handler, ids)
         try:
             handler(*command.arguments)
-        except (TypeError, ValueError, OverflowError):  # too few or too many arguments, or text in place of a number
+        except (TypeError, ValueError, OverflowError):  # too few or too many arguments, or text instead of a number
             self.malformed += 1
 
     def _ref(self, bits: int) -> None:
@@ -243,7 +243,7 @@ class ArdroneLogic:
         self._watchdog = False
 
     def _ctrl(self, mode: int, _unused: int = 0) -> None:
-        if mode in (Ctrl.NONE, Ctrl.CLEAR_ACK):  # the guide says 0, the SDK sends 5
+        if mode in (Ctrl.NONE, Ctrl.CLEAR_ACK):  # the guide specifies 0, the SDK sends 5
             self._ack = False
         elif mode == Ctrl.GET_CONFIGURATION:
             self._answer(self.configuration.dump())
@@ -264,7 +264,7 @@ class ArdroneLogic:
         self._ids = (str(session).lower(), str(user).lower(), str(application).lower())
 
     def _config(self, ids: Ids | None, name: str, value: str) -> None:
-        self._ack = True  # acknowledges reception only, not execution
+        self._ack = True  # acknowledges that the command was received, not that it was executed
         self._set(str(name), str(value), ids)
 
     def _set(self, name: str, text: str, ids: Ids | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A TCP port of the drone that sends to its clients and discards what it receives."""
+"""A TCP port of the drone that sends to its clients and discards the data that they send."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from typing import Final
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE
 from skyloop.vehicles.emulation.datagrams import Address, Loop, bound
 
-MOST: Final = 8  #: recipients of datagrams
+MOST: Final = 8  #: maximum number of recipients of datagrams
 
 
 class Listeners:
-    """Addresses of recipients, each with its own sequence.
+    """Recipients' addresses, each with its own sequence.
 
-    At most :data:`MOST`; a further one replaces the one with the oldest request. Requests need not be repeated, as
-    with the real drone.
+    There are at most :data:`MOST`; one more replaces the one whose last request is the oldest. As with the real drone,
+    requests need not be repeated.
     """
 
     def __init__(self) -> None:
-        self._sequences: dict[Address, int] = {}  # in the order of their last requests
+        self._sequences: dict[Address, int] = {}  # ordered by the time of the last request
 
     def refresh(self, address: Address) -> bool:
-        """Add an address that sent a request. Return whether it is new."""
+        """Record a request from an address; return whether the address is new."""
         sequence = self._sequences.pop(address, None)
         self._sequences[address] = FIRST_SEQUENCE if sequence is None else sequence
         if len(self._sequences) > MOST:
@@ -32,7 +32,7 @@ class Listeners:
         return sequence is None
 
     def next_sequences(self) -> list[tuple[Address, int]]:
-        """Return all addresses with the next sequence number for each."""
+        """Return each address with its next sequence number."""
         now = list(self._sequences.items())
         for address, sequence in now:
             self._sequences[address] = (sequence + 1) & 0xFFFFFFFF
@@ -42,17 +42,17 @@ class Listeners:
         return len(self._sequences)
 
 
-MOST_CLIENTS: Final = 8  #: of a TCP port
-MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client, beyond the system's buffer
+MOST_CLIENTS: Final = 8  #: maximum number of clients of a TCP port
+MOST_BACKLOG: Final = 256 * 1024  #: bytes queued for one client in addition to the system's buffer
 _SYSTEM_BUFFER: Final = 64 * 1024
 _READ: Final = 4096
 
 
 class Outlet:
-    """One connection.
+    """The connection to one client.
 
-    A client that reads too slowly loses whole pieces of the stream, from the first one that does not fit to the next
-    one that can be understood without its predecessors.
+    A client that reads too slowly loses whole pieces of the stream, from the first one that does not fit until the next
+    one that can be decoded without its predecessors.
     """
 
     def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
@@ -63,14 +63,14 @@ class Outlet:
         self._backlog = 0
         self._writing = False
         self._skipping = False
-        self.dropped = 0  #: pieces dropped
+        self.dropped = 0  #: number of pieces dropped
         connection.setblocking(False)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SYSTEM_BUFFER)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         loop.watch(connection, self._read)
 
     def offer(self, piece: bytes, *, starts: bool) -> None:
-        """Send a piece, unless the client is too slow; ``starts``: a stream can begin with it."""
+        """Send a piece unless the client is too slow; ``starts`` says whether a stream can begin with it."""
         if starts:
             self._skipping = False
         if self._skipping or self._backlog > MOST_BACKLOG:
@@ -83,7 +83,7 @@ class Outlet:
             self._write()
 
     def skip_to_start(self) -> None:
-        """Drop pieces until the next one that a stream can begin with."""
+        """Drop pieces until the next one with which a stream can begin."""
         self._skipping = True
 
     def close(self) -> None:
@@ -129,20 +129,20 @@ class StreamPort:
         self._joined = joined
         self._socket = bound(socket.SOCK_STREAM, bind, name)
         self._socket.listen(MOST_CLIENTS)
-        self.outlets: list[Outlet] = []  #: replaced as a whole, as other threads may read it
+        self.outlets: list[Outlet] = []  #: replaced as a whole, because other threads may read it
         loop.watch(self._socket, self.accept)
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return int(self._socket.getsockname()[1])
 
     def accept(self) -> None:
-        """Accept the waiting connections."""
+        """Accept all pending connections."""
         while True:
             try:
                 connection, _ = self._socket.accept()
-            except OSError:  # none waiting, or closed meanwhile
+            except OSError:  # none pending, or already closed
                 return
             if len(self.outlets) >= MOST_CLIENTS:
                 connection.close()

@@ -1,8 +1,8 @@
-"""Make the options of navdata from the vehicle's own estimate, in the drone's units, axes and signs. Pure.
+"""Navdata options made from the vehicle's own estimate, in the drone's units, axes and signs. Pure.
 
-The drone's body axes are x forward, y right, z down; theta is positive nose up, psi clockwise. Values that the
-simulation does not have are zero: tags seen by the drone's own vision, optical flow, trackers, internal values of
-barometer and vision, GPS (no receiver plugged in).
+The drone's body axes are x forward, y right, z down; theta is positive nose up, psi positive clockwise. Values that the
+simulation does not provide are zero: tags seen by the drone's own vision, optical flow, trackers, internal values of
+the barometer and of vision, and GPS (no receiver is plugged in).
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from skyloop.vehicles.ardrone.wire.navdata import ControlState
 from skyloop.vehicles.emulation.video import NOTHING_SENT, VideoStatus
 
 STANDARD_PRESSURE_PA: Final = 101_325
-PRESSURE_PA_PER_M: Final = 12.0  #: near the ground, international standard atmosphere
+PRESSURE_PA_PER_M: Final = 12.0  #: decrease in pressure per metre near the ground, international standard atmosphere
 TEMPERATURE_DECI_C: Final = 250
-FIELD_MG: Final = (200.0, 400.0)  #: horizontal and downward field of the Earth, milligauss: middle latitudes
-LAST_TAG_1: Final = 19  #: of an AR.Drone 1: VIDEO_STREAM
+FIELD_MG: Final = (200.0, 400.0)  #: horizontal and downward components of the Earth's field at middle latitudes
+LAST_TAG_1: Final = 19  #: highest tag that an AR.Drone 1 sends: VIDEO_STREAM
 
 _CONTROL_STATES: Final = {
     FlightState.LANDED: ControlState.LANDED,
@@ -39,14 +39,14 @@ _CONTROL_STATES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The inputs of all options."""
+    """The inputs from which all options are made."""
 
     believed: VehicleFeedback
     state: FlightState
-    time: int  #: from :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time`
-    thrust: float = 0.0  #: as a share of the weight
+    time: int  #: see :meth:`skyloop.vehicles.ardrone.emulator.video.DroneClock.navdata_time`
+    thrust: float = 0.0  #: as a multiple of the weight
     most_thrust: float = 1.9
-    trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that count as level
+    trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that are reported as level
     progress: Progress = NO_PROGRESS
     flipping: bool = False
     video: VideoStatus = NOTHING_SENT
@@ -65,12 +65,12 @@ class Snapshot:
 
     @property
     def psi_mdeg(self) -> float:
-        """Yaw, clockwise [0.001°]."""
+        """Yaw, positive clockwise [0.001°]."""
         return -math.degrees(self.believed.yaw_rad) * 1000
 
     @property
     def heading_deg(self) -> float:
-        """Heading, clockwise from north, from -180 to 180."""
+        """Heading, positive clockwise from north, from -180 to 180."""
         return (90.0 - math.degrees(self.believed.yaw_rad) + 180.0) % 360.0 - 180.0
 
     @property
@@ -86,15 +86,15 @@ class Snapshot:
 
 
 def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
-    """Return the options with these tags, in the given order."""
+    """Return the options with these tags, in the order of the tags given."""
     return [_MAKERS[tag](snapshot) for tag in tags]
 
 
 def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
-    """Return the tags of the options to send, ascending, for the mask ``general:navdata_options``.
+    """Return the tags of the options to send, in ascending order, for the mask ``general:navdata_options``.
 
-    Demo mode sends those of the usual mask and of the configured one. Full mode sends those of the configured mask, or
-    all if it still is the usual one, as real drones do for programs that never configured it.
+    In demo mode these are the tags in the default mask and in the configured one. In full mode they are those in the
+    configured mask or, if it is still the default, all: real drones do so for programs that never configure it.
     """
     if demo:
         mask |= NAVDATA_OPTIONS_USUAL
@@ -105,7 +105,7 @@ def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
 
 
 def _demo(s: Snapshot) -> o.Demo:
-    vx, vy, _ = s.velocity_mm_s  # real drones leave vz at 0
+    vx, vy, _ = s.velocity_mm_s  # real drones always report vz as 0
     state = ControlState.LOOPING if s.flipping and s.state.airborne else _CONTROL_STATES[s.state]
     return o.Demo(
         ctrl_state=state << 16,
@@ -132,7 +132,7 @@ def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
 
 
 def _raw(s: Snapshot) -> o.RawMeasures:
-    """Return raw measures. The converters' scales are estimates; programs read the battery's voltage here."""
+    """Return the raw measurements. The converters' scales are estimates; programs read the battery voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
         gyros=tuple(_within(rate * 16.4, -32768, 32767) for rate in _rates_deg_s(s)),
@@ -147,7 +147,7 @@ def _physical(s: Snapshot) -> o.PhysMeasures:
 
 
 def _euler_angles(s: Snapshot) -> o.EulerAngles:
-    """Return the attitude from the accelerometers alone, which is right only without acceleration."""
+    """Return the attitude computed from the accelerometers alone, which is correct only without acceleration."""
     x, y, z = s.believed.acceleration_m_s2
     theta = math.degrees(math.atan2(x, math.hypot(y, z)))
     return o.EulerAngles(theta * 1000, -math.degrees(math.atan2(y, abs(z))) * 1000)
@@ -167,7 +167,7 @@ def _rc_references(s: Snapshot) -> o.RcReferences:
 
 
 def _pwm(s: Snapshot) -> o.Pwm:
-    """Return motor values in proportion to thrust, the same for all motors."""
+    """Return motor values proportional to thrust, the same for all motors."""
     motor = _within(255 * s.thrust / s.most_thrust, 0, 255)
     return o.Pwm(motors=(motor,) * 4, saturations=(255 if motor else 0,) * 4, vz_ref=s.progress.gaz)
 

@@ -1,9 +1,9 @@
-"""The AR.Drones' cameras, clock, formats and codecs: turn pictures into stream pieces. Pure.
+"""The AR.Drones' cameras, clock, video formats and encoders. Pure.
 
-An AR.Drone 1 encodes in UVLC. The decoder, :mod:`skyloop.vehicles.ardrone.wire.uvlc`, documents the format and its
-sources; the encoder shares only the tables with it. Like the Parrot SDK's encoder, it sends complete pictures only,
-codes every macroblock, truncates levels towards zero, extends the Developer Guide's table of levels, which ends at 127,
-by its own rule, and pads a picture with zeros to a whole word.
+An AR.Drone 1 encodes its video with UVLC. The format and its sources are documented with the decoder,
+:mod:`skyloop.vehicles.ardrone.wire.uvlc`, with which the encoder shares only the tables. Like the Parrot SDK's encoder,
+this one sends only intra pictures, codes every macroblock, truncates levels towards zero, continues the Developer
+Guide's table of levels beyond its end at 127 by the table's own rule, and pads each picture with zeros to a whole word.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ _MICROSECOND_BITS: Final = 21
 
 @dataclass(frozen=True, slots=True)
 class DroneClock:
-    """Time since the drone was switched on. Arguments are times of this host's monotonic clock [ns]."""
+    """Time since the drone was switched on. Arguments are times on this host's monotonic clock [ns]."""
 
     booted_ns: int
 
     def navdata_time(self, at_ns: int) -> int:
-        """Return seconds in the upper 11 bits and microseconds in the lower 21; wraps after 2048 s."""
+        """Return the time with seconds in the upper 11 bits and microseconds in the lower 21; wraps after 2048 s."""
         s, us = divmod((at_ns - self.booted_ns) // _NS_PER_US, _US_PER_S)
         return s % (1 << _SECOND_BITS) << _MICROSECOND_BITS | us
 
     def milliseconds(self, at_ns: int) -> int:
-        """Return milliseconds, as in the video's headers."""
+        """Return the time in milliseconds, as in the video's headers."""
         return (at_ns - self.booted_ns) // _NS_PER_MS
 
 
@@ -82,7 +82,7 @@ FRONT_2: Final = replace(
     cy=190.144373,
     distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0),
 )
-#: The transmitted picture: the middle of the sensor's 320×240 at twice the size.
+#: The transmitted image: the middle of the sensor's 320×240 image, enlarged to twice the size.
 BOTTOM_2_SENT: Final = replace(
     BOTTOM_CAMERA, width=640, height=360, fx=686.994766, fy=688.195055, cx=329.323208, cy=159.323007
 )
@@ -92,14 +92,14 @@ BOTTOM_1: Final = replace(
     BOTTOM_CAMERA, width=176, height=144, fps=15.0, fx=_FOCAL_1_PX, fy=_FOCAL_1_PX, cx=87.5, cy=71.5
 )
 
-CAMERAS: Final = {1: (FRONT_1, BOTTOM_1), 2: (FRONT_2, BOTTOM_2)}  #: front and bottom, by version
+CAMERAS: Final = {1: (FRONT_1, BOTTOM_1), 2: (FRONT_2, BOTTOM_2)}  #: front and bottom cameras by version
 
 
-_PAVE: Final = {"h264": Codec.MPEG4_AVC, "mpeg4": Codec.MPEG4_VISUAL}  #: the codecs in the headers of frames
+_PAVE: Final = {"h264": Codec.MPEG4_AVC, "mpeg4": Codec.MPEG4_VISUAL}  #: codec field of the frame headers
 MP4_360P: Final = Format("mpeg4", 640, 360, 0)
 H264_360P: Final = Format("h264", 640, 360, 1)
 H264_720P: Final = Format("h264", 1280, 720, 2)
-#: Live format for each value of ``video:video_codec``.
+#: Format of the live video for each value of ``video:video_codec``.
 FORMATS: Final = {
     VideoCodec.MP4_360P: MP4_360P,
     VideoCodec.H264_360P: H264_360P,
@@ -114,7 +114,7 @@ FORMATS: Final = {
 
 
 class PavePacker:
-    """Packs pictures of an AR.Drone 2: a PaVE header and a picture in H.264 or MPEG-4."""
+    """Packs an AR.Drone 2's images: a PaVE header, then the image encoded in H.264 or MPEG-4."""
 
     def __init__(self, clock: DroneClock, header_size: int, attitude: Callable[[], tuple[float, float, float]]) -> None:
         self._clock = clock
@@ -125,7 +125,7 @@ class PavePacker:
         self._position = 0
 
     def pack(self, picture: NDArray[np.uint8], settings: VideoSettings, captured_ns: int) -> Piece | None:
-        """Encode a picture with its header; None if the encoder returned nothing."""
+        """Encode an image and add its header; None if the encoder returned nothing."""
         form = FORMATS[settings.codec]
         wanted = form, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -154,23 +154,23 @@ class PavePacker:
 
 
 class UvlcPacker:
-    """Packs pictures of an AR.Drone 1: one complete picture per datagram."""
+    """Packs an AR.Drone 1's images: one intra picture per datagram."""
 
     def __init__(self) -> None:
         self._number = 0
 
     def pack(self, picture: NDArray[np.uint8], _settings: VideoSettings, _captured_ns: int) -> Piece | None:
-        """Encode a picture."""
+        """Encode an image."""
         self._number += 1
         return Piece(encode(picture, self._number & 0xFFFFFFFF), starts=True)
 
 
-MAX_DATAGRAM: Final = 65_507  #: bytes of a UDP datagram over IPv4
-_COARSER: Final = (4, 8, 16, COARSEST_QUANT)  # quantisers to fall back on for a picture that is too busy
-_END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code reserved for the end
+MAX_DATAGRAM: Final = 65_507  #: maximum payload of a UDP datagram over IPv4 in bytes
+_COARSER: Final = (4, 8, 16, COARSEST_QUANT)  # quantisers to try in turn if an image needs too many bytes
+_END_OF_BLOCK: Final = 0b101, 3  # run 0, then the code reserved for the end of a block
 _CODES: Final = {size: code for code, size in SIZES.items()}
 
-# YCbCr of BGR: BT.601, full range.
+# Conversion of BGR to YCbCr: BT.601, full range.
 _LUMA: Final = np.array([0.114, 0.587, 0.299], np.float32)
 _CB: Final = 0.5 / (1 - 0.114)
 _CR: Final = 0.5 / (1 - 0.299)
@@ -181,19 +181,19 @@ Ints = NDArray[np.int64]
 def encode(
     picture: NDArray[np.uint8], number: int, *, quant: int = TABLE_QUANT, max_bytes: int = MAX_DATAGRAM
 ) -> bytes:
-    """Return one datagram with a picture.
+    """Encode an image as one datagram.
 
-    Macroblocks that would lie half outside the picture are left out, as the format requires.
+    Macroblocks that would be partly outside the image are omitted, as the format requires.
 
     Args:
-        picture: BGR, uint8, shape (height, width, 3), of a size in the format.
-        number: The picture's.
-        quant: 1 (finest) to 30, or 31, which is like 2 and used by real drones.
-        max_bytes: A picture that would take more is coded coarser.
+        picture: BGR, uint8, shape (height, width, 3), with one of the format's sizes.
+        number: The picture number.
+        quant: 1 (finest) to 30, or 31, which is like 2 and is the one that real drones use.
+        max_bytes: Maximum size; an image that would need more is quantised more coarsely.
 
     Raises:
-        UsageError: Another size or type, a number or quantiser out of range, or a picture too busy even for the
-            coarsest quantiser.
+        UsageError: The size or type is wrong, the number or quantiser is out of range, or the image does not fit even
+            with the coarsest quantiser.
     """
     _check(picture, number, quant)
     height, width = picture.shape[:2]
@@ -219,7 +219,7 @@ def _check(picture: NDArray[np.uint8], number: int, quant: int) -> None:
 
 
 def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return a picture's transformed macroblocks in the order of the stream. Shape (groups, columns, 6, 64)."""
+    """Return an image's transformed macroblocks in stream order. Shape (groups, columns, 6, 64)."""
     groups, columns = picture.shape[0] // MACROBLOCK, picture.shape[1] // MACROBLOCK
     pixels = picture[: groups * MACROBLOCK, : columns * MACROBLOCK].astype(np.float32)
     luma = pixels @ _LUMA
@@ -240,14 +240,14 @@ def _coefficients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def _quantised(coefficients: NDArray[np.float32], quant: int) -> Ints:
     levels: Ints = (coefficients / STEPS[quant].astype(np.float32)).astype(np.int64)
-    # The mean is rounded, as truncating it would darken the picture; it is never 0, as in the Parrot SDK.
+    # The mean is rounded because truncation would darken the picture. As in the Parrot SDK, it is never 0.
     mean = np.rint(coefficients[..., 0] / STEPS[quant][0])
     levels[..., 0] = np.clip(mean, 1, (1 << DC_BITS) - 1)
     return levels
 
 
 def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> bytes:
-    """Return the packet of quantised macroblocks (groups, columns, 6, 64)."""
+    """Return the packet for quantised macroblocks, shape (groups, columns, 6, 64)."""
     start = [UVLC_START, *size_code, PictureType.INTRA, quant, number]
     widths = [START_CODE_BITS, FORMAT_BITS, RESOLUTION_BITS, TYPE_BITS, QUANT_BITS, NUMBER_BITS]
     bits = [_bits(np.array(start), np.array(widths))]
@@ -264,17 +264,17 @@ def _pack(levels: Ints, size_code: tuple[int, int], quant: int, number: int) -> 
 
 
 def _filling(bits: list[NDArray[np.uint8]], size: int) -> NDArray[np.uint8]:
-    """Return the zeros up to the next multiple of a number of bits."""
+    """Return the zeros that fill up to the next multiple of ``size`` bits."""
     return np.zeros(-sum(map(len, bits)) % size, np.uint8)
 
 
 def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
-    """Return the consecutive codes of a group's macroblocks (columns, 6, 64), and the bits of each."""
+    """Return the consecutive codes for a group's macroblocks (columns, 6, 64), and the width of each in bits."""
     blocks = levels.reshape(-1, COEFFICIENTS)
     values, widths, block_of_pair = _pair_codes(blocks)
     pairs = np.bincount(block_of_pair, minlength=len(blocks))
     described = 0x80 | ((pairs > 0).reshape(-1, BLOCKS) << np.arange(BLOCKS)).sum(axis=1)
-    # Position of each block's mean: before its pairs, and after the macroblock's description if the block is the first.
+    # A block's mean is placed before its pairs, and in the first block after the macroblock's description.
     is_first = np.arange(len(blocks)) % BLOCKS == 0
     ends = np.cumsum(1 + is_first + pairs)
     means = ends - pairs - 1
@@ -289,9 +289,9 @@ def _group_codes(levels: Ints) -> tuple[Ints, Ints]:
 
 
 def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the codes of the nonzero coefficients, the bits of each, and the block of each.
+    """Return a code for each nonzero coefficient, with its width in bits and its block's index.
 
-    A code includes the zeros before its coefficient; the last code of a block includes the block's end.
+    A code includes the run of zeros before its coefficient, and the last one in a block includes the end of the block.
     """
     block, place = np.nonzero(blocks[:, 1:])
     level = blocks[block, place + 1]
@@ -300,7 +300,7 @@ def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
     before = np.where(starts, -1, np.roll(place, 1))
     run_value, run_width = _prefixed(place - before - 1)
     level_value, level_width = _prefixed(np.abs(level))
-    # A level of 1 has no zero before its one bit, unlike a run of 1.
+    # Unlike a run of 1, a level of 1 has no zero before its one bit.
     level_width -= np.abs(level) == 1
     value = (run_value << level_width | level_value) << 1 | (level < 0)
     width = run_width + level_width + 1
@@ -309,7 +309,7 @@ def _pair_codes(blocks: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def _prefixed(number: Ints) -> tuple[Ints, Ints]:
-    """Return the codes of numbers, and the bits of each.
+    """Return the codes for numbers, and the width of each in bits.
 
     A number is coded as one zero for each of its bits, then those bits; 0 is coded as a one.
     """
@@ -319,7 +319,7 @@ def _prefixed(number: Ints) -> tuple[Ints, Ints]:
 
 
 def _bits(values: Ints, widths: Ints) -> NDArray[np.uint8]:
-    """Return the bits of consecutive numbers, each from its most significant bit on."""
+    """Return the bits of consecutive numbers, each beginning with its most significant bit."""
     ends = np.cumsum(widths)
     down = np.repeat(ends, widths) - np.arange(ends[-1]) - 1
     return (np.repeat(values, widths) >> down & 1).astype(np.uint8)

@@ -1,1 +1,1 @@
-"""The Parrot AR.Drone 1 and 2: AT commands, navdata, configuration, video."""
+"""Wire formats of the Parrot AR.Drone 1 and 2: AT commands, navdata, configuration and video."""

@@ -1,8 +1,8 @@
-"""AT commands of the AR.Drone (UDP port 5556): text lines both ways. Pure.
+"""The AR.Drone's AT commands (UDP port 5556): format and parse their text lines. Pure.
 
-``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several commands, and none spans two.
-Numbers are signed decimals, texts stand in double quotes, and a float is sent as the signed integer with the same 32
-bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` of the AR.Drone SDK 2.0.1.
+A command is ``AT*NAME=sequence[,argument]*`` and a carriage return. A datagram can hold several, but none spans two.
+Numbers are signed decimals, texts are in double quotes, and a float is sent as the signed integer with the same 32
+bits. Source: Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` in the AR.Drone SDK 2.0.1.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ MAX_LINE: Final = 1024  #: characters; the drone drops longer lines
 SILENCE_RESET_S: Final = 2.0  #: after this silence the drone expects the sequence to restart at 1
 
 Argument: TypeAlias = int | float | str
-#: A command's name and its arguments after the sequence.
+#: A command's name, and the arguments that follow its sequence number.
 AtMessage: TypeAlias = tuple[str, tuple[Argument, ...]]
 
 
 class Ref(IntFlag):
     """Bits of ``REF``."""
 
-    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors, or ends the emergency
-    TAKEOFF = 1 << 9  #: 1 take off and stay in the air, 0 land and stay on the ground
-    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, required by the guide, not missed by any drone
+    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors or, in an emergency, ends it
+    TAKEOFF = 1 << 9  #: 1: take off and stay in the air; 0: land and stay on the ground
+    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, which the guide requires, although no drone seems to need them
 
 
 class Pcmd(IntFlag):
-    """Bits of the flags of ``PCMD`` and ``PCMD_MAG``."""
+    """Flags in ``PCMD`` and ``PCMD_MAG``."""
 
     HOVER = 0  #: the four values are ignored
     PROGRESSIVE = 1  #: the four values are followed
     COMBINED_YAW = 2
-    ABSOLUTE = 4  #: relative to a heading: ``PCMD_MAG`` only
+    ABSOLUTE = 4  #: the values are relative to a heading (``PCMD_MAG`` only)
 
 
 class Ctrl(IntEnum):
@@ -49,14 +49,14 @@ class Ctrl(IntEnum):
     UPDATE = 1
     PIC_UPDATE = 2
     GET_LOGS = 3
-    GET_CONFIGURATION = 4  #: sent over the control port
+    GET_CONFIGURATION = 4  #: request the configuration over the control port
     CLEAR_ACK = 5
-    GET_CUSTOM_IDS = 6  #: sent over the control port
+    GET_CUSTOM_IDS = 6  #: request the custom ids over the control port
 
 
 @dataclass(frozen=True, slots=True)
 class AtCommand:
-    """One line as received; ``arguments`` are texts and integers (floats still as their bits: :func:`to_float`)."""
+    """One line as received; ``arguments`` are texts and integers (for floats, their bits: see :func:`to_float`)."""
 
     name: str
     sequence: int
@@ -64,7 +64,7 @@ class AtCommand:
 
 
 def format_command(name: str, sequence: int, *arguments: Argument) -> bytes:
-    """Return one line. Raises :class:`UsageError` for a float that is not finite, a quote in a text or a long line."""
+    """Return one line; raise :class:`UsageError` for a float that is not finite, a quote in a text or a long line."""
     words = [str(sequence), *(_word(argument) for argument in arguments)]
     line = f"AT*{name}={','.join(words)}\r".encode("latin-1", "replace")
     if len(line) > MAX_LINE:
@@ -78,7 +78,7 @@ def to_bits(value: float) -> int:
 
 
 def to_float(bits: int) -> float:
-    """Return the float with these 32 bits; higher bits are cut off."""
+    """Return the float with these 32 bits; higher bits are ignored."""
     return float(struct.unpack("<f", struct.pack("<I", bits & 0xFFFFFFFF))[0])
 
 
@@ -87,7 +87,7 @@ _ARGUMENT: Final = re.compile(rb",(?:(-?\d+)|\"([^\"]*)\")")
 
 
 def parse_commands(datagram: bytes) -> tuple[list[AtCommand], int]:
-    """Return a datagram's commands and the number of nonsense lines, which a drone ignores. Never raises."""
+    """Return a datagram's commands, and the number of invalid lines, which a drone ignores. Never raises."""
     commands, malformed = [], 0
     for line in re.split(rb"[\r\n]+", datagram.rstrip(b"\0")):
         if not line:

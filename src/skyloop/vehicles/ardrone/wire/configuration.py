@@ -1,12 +1,12 @@
-"""The configuration of the AR.Drone: its keys, the text form of their values, and the dump on TCP port 5559. Pure.
+"""The AR.Drone's configuration: its keys, the text form of their values, and the dump on TCP port 5559. Pure.
 
-``AT*CONFIG`` sets a key to a value given as text. The drone sends all keys as lines of ``section:key = value`` with a
-zero byte at the end.
+``AT*CONFIG`` sets a key to a value given as text. The drone sends all keys as ``section:key = value`` lines, followed
+by a zero byte.
 
-Sources: AR.Drone SDK 2.0.1 (``ardrone_tool/Control``) and a dump of an AR.Drone 1 with firmware 1.7.4. Names,
-categories and most defaults of the keys: ``config_keys.h`` of that SDK; keys of the AR.Drone 1 only: that dump;
-ranges: the Parrot AR.Drone Developer Guide, chapter 8, where it gives any. Names and order of the animations:
-``ardrone_api.h``; their durations: the requests of the SDK's applications.
+Sources: the AR.Drone SDK 2.0.1 (``ardrone_tool/Control``) and a dump from an AR.Drone 1 with firmware 1.7.4. The keys'
+names, categories and most defaults come from the SDK's ``config_keys.h``, keys that only an AR.Drone 1 has from the
+dump, and ranges, where given, from chapter 8 of the Parrot AR.Drone Developer Guide. The animations' names and order
+come from ``ardrone_api.h``, their durations from the requests that the SDK's applications make.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skyloop.errors import DecodeError
 
 PORT: Final = 5559
 END_OF_DUMP: Final = b"\0"
-DEFAULT_ID: Final = "00000000"  #: of the shared session, user and application
+DEFAULT_ID: Final = "00000000"  #: id of the shared session, user and application
 
 
 def format_value(value: Value) -> str:
@@ -35,7 +35,7 @@ def format_value(value: Value) -> str:
 
 
 def parse_value(text: str, like: Value) -> Value:
-    """Return a text's value with the type of ``like``. Raises :class:`DecodeError` for a text of another type."""
+    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if it is not of that type."""
     text = text.strip()
     try:
         if isinstance(like, bool):
@@ -52,13 +52,13 @@ def parse_value(text: str, like: Value) -> Value:
 
 
 def format_dump(values: dict[str, Value]) -> bytes:
-    """Return the drone's dump of all keys."""
+    """Return a dump of all keys in the drone's format."""
     lines = "".join(f"{name} = {format_value(value)}\n" for name, value in values.items())
     return lines.encode("latin-1", "replace") + END_OF_DUMP
 
 
 def parse_dump(dump: bytes) -> dict[str, str]:
-    """Return the texts of all keys. Meaningless lines are skipped; of a repeated key the last line counts."""
+    """Return the text value of each key. Invalid lines are skipped; if a key is repeated, the last line applies."""
     values = {}
     for line in dump.split(END_OF_DUMP, 1)[0].decode("latin-1").splitlines():
         name, equals, value = line.partition("=")
@@ -78,7 +78,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 
 
 class Category(Enum):
-    """The owner of a key when sessions, users and applications are distinguished (AR.Drone 2)."""
+    """What a key's value belongs to on a drone with sessions, users and applications (AR.Drone 2)."""
 
     COMMON = "common"
     APPLICATION = "application"
@@ -105,7 +105,7 @@ class VideoCodec(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key. ``default`` has the key's type. Units are the drone's own; angles are in radians, lengths in mm."""
+    """A key. ``default`` has the key's type. Units are the drone's own: angles are in radians, lengths in mm."""
 
     name: str  #: ``section:key``
     default: Value
@@ -115,7 +115,7 @@ class Key:
     high: float | None = None
     choices: tuple[int, ...] = ()
     read_only: bool = False
-    versions: tuple[int, ...] = (1, 2)  #: of the AR.Drone
+    versions: tuple[int, ...] = (1, 2)  #: AR.Drone versions that have the key
     text: str = ""
 
 
@@ -331,7 +331,7 @@ LED_ANIMATIONS: Final = (
     "left_red_right_green",
     "blink_standard",
 )
-#: Name and duration [ms].
+#: Name and duration [ms] of each flight animation.
 FLIGHT_ANIMATIONS: Final = (
     ("phi_m30_deg", 1000),
     ("phi_30_deg", 1000),

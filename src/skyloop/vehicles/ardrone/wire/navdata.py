@@ -1,8 +1,8 @@
-"""Navdata of the AR.Drone (UDP port 5554): datagrams of a header, options and a checksum, both ways. Pure.
+"""The AR.Drone's navdata (UDP port 5554): encode and decode datagrams of a header, options and a checksum. Pure.
 
-Little-endian: ``u32 0x55667788, u32 state, u32 sequence, u32 vision defined``, then options of ``u16 tag, u16 size``
-(including these four bytes) and data. The last option is the checksum, the plain sum of all bytes before it.
-Source: ``navdata_common.h`` of the AR.Drone SDK 2.0.1, its sizes checked against a datagram of a real AR.Drone 2.
+Little-endian: ``u32 0x55667788, u32 state, u32 sequence, u32 vision defined``, then options, each with ``u16 tag,
+u16 size`` (which includes these four bytes) and data. The last option is the checksum, the sum of all bytes before it.
+Source: ``navdata_common.h`` in the AR.Drone SDK 2.0.1; sizes were checked against a datagram from a real AR.Drone 2.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _Kind = TypeVar("_Kind", bound=tuple[Any, ...])
 
 
 class State(IntFlag):
-    """Bits of the drone's state, in every datagram."""
+    """The drone's state bits, which are part of every datagram."""
 
     FLYING = 1 << 0
     VIDEO = 1 << 1
@@ -42,8 +42,8 @@ class State(IntFlag):
     CAMERA_READY = 1 << 7
     TRAVELLING = 1 << 8
     USB_KEY = 1 << 9
-    DEMO = 1 << 10  #: only the options of the demo mode, 15 times a second
-    BOOTSTRAP = 1 << 11  #: no options until the mode is configured
+    DEMO = 1 << 10  #: sends only the demo mode's options, 15 times per second
+    BOOTSTRAP = 1 << 11  #: sends no options until the mode is configured
     MOTORS_PROBLEM = 1 << 12
     COMMUNICATION_LOST = 1 << 13
     SOFTWARE_FAULT = 1 << 14
@@ -67,7 +67,7 @@ class State(IntFlag):
 
 
 class ControlState(IntEnum):
-    """The high half of :attr:`Demo.ctrl_state`."""
+    """Values of the upper half of :attr:`Demo.ctrl_state`."""
 
     DEFAULT = 0
     INIT = 1
@@ -88,16 +88,16 @@ class Navdata:
     state: State
     sequence: int
     vision_defined: int
-    options: dict[type[Option], Option]  #: by their type
+    options: dict[type[Option], Option]  #: options by type
     unknown: tuple[tuple[int, int], ...]  #: tag and size of unknown options
 
     def get(self, kind: type[_Kind]) -> _Kind | None:
-        """Return the option of this type, or None if the datagram lacks it."""
+        """Return the option of this type; None if the datagram has none."""
         return cast("_Kind | None", cast("dict[Any, Any]", self.options).get(kind))
 
 
 def decode(datagram: bytes | memoryview) -> Navdata:
-    """Return a datagram's content. Raises :class:`DecodeError` if it is damaged; unknown options are only listed."""
+    """Decode a datagram; raise :class:`DecodeError` if it is damaged. Unknown options are listed but not decoded."""
     end = len(datagram) - _CHECKSUM.size
     if not _HEADER.size <= end <= MAX_DATAGRAM - _CHECKSUM.size:
         raise DecodeError(f"{len(datagram)} bytes are not navdata")
@@ -114,7 +114,7 @@ def decode(datagram: bytes | memoryview) -> Navdata:
 
 
 def encode(state: int, sequence: int, options: Iterable[Option] = (), vision_defined: int = 0) -> bytes:
-    """Return a datagram of these options in their order. Raises :class:`struct.error` for numbers out of range."""
+    """Return a datagram with these options in this order; raise :class:`struct.error` if a number is out of range."""
     parts = [_HEADER.pack(SIGNATURE, state, sequence, vision_defined)]
     for option in options:
         layout = LAYOUTS[type(option)]
@@ -147,16 +147,16 @@ VIDEO: Final = 5555
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The drone's ports; 0 stands for any free one, where there is a choice."""
+    """The drone's ports; where a port can be chosen, 0 means any free one."""
 
     navdata: int = PORT  #: UDP
-    video: int = VIDEO  #: UDP of an AR.Drone 1, TCP of an AR.Drone 2
+    video: int = VIDEO  #: UDP on an AR.Drone 1, TCP on an AR.Drone 2
     at: int = at.PORT  #: UDP
     control: int = configuration.PORT  #: TCP
 
     @classmethod
     def free(cls) -> Ports:
-        """Return any free ones."""
+        """Return ports that are all 0, for any free ones."""
         return cls(0, 0, 0, 0)
 
 

@@ -1,8 +1,8 @@
-"""The options of navdata as typed structures, and their layouts.
+"""The navdata options as typed structures, and their memory layouts.
 
-Names, types and order: ``navdata_common.h`` of the AR.Drone SDK 2.0.1, whose structures are packed without alignment.
-Units are the drone's own: millidegrees, mm/s, mm, mV. Firmware 2.4 sends ``Gps`` under the former tag of
-``Zimmu3000``.
+Names, types and order come from ``navdata_common.h`` in the AR.Drone SDK 2.0.1, whose structures are packed without
+alignment. Units are the drone's own: millidegrees, mm/s, mm, mV. Firmware 2.4 sends ``Gps`` with the tag that
+``Zimmu3000`` used before.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Ints: TypeAlias = tuple[int, ...]
 
 
 class Layout:
-    """The memory layout of one option: a struct format with one word per field; ``3f`` is one field of three floats."""
+    """The memory layout of an option: a struct format with one word per field (``3f`` is one field of three floats)."""
 
     def __init__(self, tag: int, kind: type[Any], form: str) -> None:
         self.tag = tag
@@ -35,16 +35,16 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Bytes, without tag and size."""
+        """Number of bytes, excluding tag and size."""
         return self._struct.size
 
     def unpack(self, data: bytes | memoryview, at: int) -> Any:
-        """Return the structure that begins here."""
+        """Return the structure that begins at offset ``at``."""
         values = self._struct.unpack_from(data, at)
         return self.kind(*values) if self._plain else self.kind(*[values[cut] for cut in self._cuts])
 
     def pack(self, option: Any) -> bytes:
-        """Return a structure's bytes. Raises :class:`struct.error` for a value out of its field's range."""
+        """Return a structure's bytes; raise :class:`struct.error` if a value is out of its field's range."""
         if self._plain:
             return self._struct.pack(*option)
         values: list[float] = []
@@ -53,8 +53,8 @@ class Layout:
         return self._struct.pack(*values)
 
 
-LAYOUTS: Final[dict[type[Any], Layout]] = {}  #: of each structure
-BY_TAG_AND_SIZE: Final[dict[tuple[int, int], Layout]] = {}  #: the size without tag and size
+LAYOUTS: Final[dict[type[Any], Layout]] = {}  #: layout of each structure
+BY_TAG_AND_SIZE: Final[dict[tuple[int, int], Layout]] = {}  #: keyed by tag and size; the size excludes those two fields
 
 _Kind = TypeVar("_Kind", bound=type[Any])
 
@@ -99,7 +99,7 @@ class Time(NamedTuple):
 
 @_option(2, "3H 3h 2h I H H H H H H H H H I i h")
 class RawMeasures(NamedTuple):
-    """The converters' readings; ``vbat_raw`` in mV."""
+    """The analogue-to-digital converters' readings; ``vbat_raw`` is in mV."""
 
     accs: Ints = (0,) * 3
     gyros: Ints = (0,) * 3
@@ -121,7 +121,7 @@ class RawMeasures(NamedTuple):
 
 @_option(3, "f H 3f 3f I I I")
 class PhysMeasures(NamedTuple):
-    """The same in units: accelerations [mg], rates [degree/s]."""
+    """Measurements in physical units: accelerations [mg], rates [degree/s]."""
 
     acc_temp: float = 0.0
     gyro_temp: int = 0
@@ -141,7 +141,7 @@ class GyrosOffsets(NamedTuple):
 
 @_option(5, "f f")
 class EulerAngles(NamedTuple):
-    """Attitude by the accelerometers alone [millidegree]."""
+    """Attitude computed from the accelerometers alone [millidegree]."""
 
     theta: float = 0.0
     phi: float = 0.0
@@ -176,7 +176,7 @@ class References(NamedTuple):
 
 @_option(7, "f f f")
 class Trims(NamedTuple):
-    """Trims from the flat trim."""
+    """Offsets determined by the flat trim."""
 
     angular_rates_r: float = 0.0
     euler_angles_theta: float = 0.0
@@ -185,7 +185,7 @@ class Trims(NamedTuple):
 
 @_option(8, "i i i i i")
 class RcReferences(NamedTuple):
-    """Values from the last ``PCMD``."""
+    """Values in the last ``PCMD``."""
 
     pitch: int = 0
     roll: int = 0
@@ -196,7 +196,7 @@ class RcReferences(NamedTuple):
 
 @_option(9, "4B 4B f f f f i i i f i i i f 4H f f")
 class Pwm(NamedTuple):
-    """The motors."""
+    """The motors' control values."""
 
     motors: Ints = (0,) * 4
     saturations: Ints = (0,) * 4
@@ -244,7 +244,7 @@ class VisionRaw(NamedTuple):
 
 @_option(12, "5f 5f")
 class VisionOpticalFlow(NamedTuple):
-    """Optical flow of five zones."""
+    """Optical flow in five zones."""
 
     dx: Floats = (0.0,) * 5
     dy: Floats = (0.0,) * 5
@@ -252,7 +252,7 @@ class VisionOpticalFlow(NamedTuple):
 
 @_option(13, "I i f f f f i f f f i I 3f f f f I I f f")
 class Vision(NamedTuple):
-    """The inputs of the velocity estimate by vision."""
+    """The inputs to the vision-based velocity estimate."""
 
     state: int = 0
     misc: int = 0
@@ -278,7 +278,7 @@ class Vision(NamedTuple):
 
 @_option(14, "f f f f f f 20f")
 class VisionPerf(NamedTuple):
-    """Durations of the vision's steps [ms]."""
+    """How long each vision step takes [ms]."""
 
     szo: float = 0.0
     corners: float = 0.0
@@ -291,7 +291,7 @@ class VisionPerf(NamedTuple):
 
 @_option(15, "30i 60i")
 class TrackersSend(NamedTuple):
-    """Points tracked across pictures: whether each is locked, then x and y of each."""
+    """Points tracked across images: whether each is locked, then the x and y of each."""
 
     locked: Ints = (0,) * 30
     points: Ints = (0,) * 60
@@ -299,7 +299,7 @@ class TrackersSend(NamedTuple):
 
 @_option(16, "I 4I 4I 4I 4I 4I 4I 4f 36f 12f 4I")
 class VisionDetect(NamedTuple):
-    """Tags seen, up to four: kind, centre and size (0 to 1000 of the picture), distance [cm], orientation [degree]."""
+    """Up to four detected tags: type, centre and size (0 to 1000 across the image), distance [cm], orientation [°]."""
 
     detected: int = 0
     kinds: Ints = (0,) * 4
@@ -349,7 +349,7 @@ class VideoStream(NamedTuple):
 
 @_option(20, "I I")
 class Games(NamedTuple):
-    """Counters of the games."""
+    """Counters used by games."""
 
     double_tap_counter: int = 0
     finish_line_counter: int = 0
@@ -357,7 +357,7 @@ class Games(NamedTuple):
 
 @_option(21, "i h i i")
 class PressureRaw(NamedTuple):
-    """The barometer: temperature [0.1 °C], pressure [Pa]."""
+    """Barometer readings: temperature [0.1 °C], pressure [Pa]."""
 
     up: int = 0
     ut: int = 0
@@ -367,7 +367,7 @@ class PressureRaw(NamedTuple):
 
 @_option(22, "h h h 3f 3f 3f f f f B I f f f")
 class Magneto(NamedTuple):
-    """The magnetometer; headings in degree."""
+    """Magnetometer readings; headings are in degrees."""
 
     mx: int = 0
     my: int = 0
@@ -399,7 +399,7 @@ class WindSpeed(NamedTuple):
 
 @_option(24, "f f f f f f f f f f i f i f f i i")
 class KalmanPressure(NamedTuple):
-    """The barometer's filter."""
+    """State of the barometer's Kalman filter."""
 
     pressure_offset: float = 0.0
     est_z: float = 0.0
@@ -442,7 +442,7 @@ class Wifi(NamedTuple):
 
 @_option(27, "i f")
 class Zimmu3000(NamedTuple):
-    """Another estimate of vertical speed, sent up to firmware 2.2."""
+    """Another estimate of vertical speed, sent by firmware up to 2.2."""
 
     lsb: int = 0
     find: float = 0.0
@@ -450,7 +450,7 @@ class Zimmu3000(NamedTuple):
 
 @_option(27, "d d d d i i i d d d d I 10f d d f I f f f f f I 24B i I f f I")
 class Gps(NamedTuple):
-    """The GPS receiver of firmware 2.4: degrees, metres."""
+    """The GPS receiver's data from firmware 2.4, in degrees and metres."""
 
     latitude: float = 0.0
     longitude: float = 0.0

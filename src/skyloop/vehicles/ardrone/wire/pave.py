@@ -1,8 +1,8 @@
 """Parrot's PaVE video encapsulation (AR.Drone 2): bytes in, frames out. Pure.
 
-Each frame is a little-endian header that starts with ``PaVE``, then one payload; the drone sends them back to back on
-TCP port 5555. Layout: ``video_encapsulation.h`` of the AR.Drone SDK 2.0.1, checked against two captures of real drones.
-Early firmware writes headers of 64 bytes, later firmware 68: the header has a field for its size.
+Each frame consists of a little-endian header that starts with ``PaVE``, and one payload; the drone sends them back to
+back on TCP port 5555. The layout comes from ``video_encapsulation.h`` in the AR.Drone SDK 2.0.1 and was checked against
+two captures from real drones. Headers have 64 bytes in early firmware and 68 in later; a field gives their size.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ SIGNATURE: Final = b"PaVE"
 MIN_HEADER: Final = 64
 MAX_HEADER: Final = 128
 MAX_SIDE: Final = 4096
-DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: a 720p key frame of the drone is under 100 kB
+DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: bytes; the drone's 720p key frames are smaller than 100 kB
 
-_HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and with advertised_size, 52 bytes
+_HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and including advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1
-_RESERVED: Final = struct.Struct("<I3f")  # the last 16 bytes of a long header; in a short one the last 12 are zeros
+_RESERVED: Final = struct.Struct("<I3f")  # last 16 bytes of a long header; the last 12 of a short one are zeros
 _VERSION: Final = 2
 _MACROBLOCK: Final = 16
 
@@ -40,25 +40,25 @@ class FrameType(IntEnum):
     """Values of the header's frame type field."""
 
     UNKNOWN = 0
-    IDR = 1  #: needs no earlier frame, and contains the stream's parameters
-    I = 2  # noqa: E741  the name in the format's documentation
+    IDR = 1  #: needs no earlier frame and includes the stream's parameters
+    I = 2  # noqa: E741  the name used in the format's documentation
     P = 3
     HEADERS = 4  #: parameters only, no picture
 
 
 @dataclass(frozen=True, slots=True)
 class PaveFrame:
-    """One frame of the stream as sent by the drone."""
+    """One frame of the stream, as sent by the drone."""
 
     codec: int  #: one of :class:`Codec`, or another number
     type: int  #: one of :class:`FrameType`, or another number
-    number: int  #: counts the drone's frames
-    timestamp_ms: int  #: time of the drone's own clock
-    width: int  #: width of the picture to show [px]
+    number: int  #: the drone's frame count
+    timestamp_ms: int  #: time on the drone's own clock
+    width: int  #: width of the image to show [px]
     height: int
     stream_id: int
     payload: bytes
-    after_damage: bool  #: bytes were skipped between the previous frame and this one
+    after_damage: bool  #: whether bytes were skipped between the previous frame and this one
 
     @property
     def is_key(self) -> bool:
@@ -95,12 +95,12 @@ def build_header(
     header_size: int = 68,
     attitude_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> bytes:
-    """Return the header of a frame in one slice and one chunk. Numbers too large for their field wrap around.
+    """Return the header for a frame with one slice and one chunk. Numbers too large for their fields wrap around.
 
-    ``width`` and ``height`` [px] are the picture's; it is encoded in whole macroblocks. ``position`` counts the bytes
-    of all earlier payloads without their ``sps_size`` and ``pps_size``. ``attitude_rad``, the drone's theta, phi and
-    psi, exists only in the header of 68 bytes (seen in a capture, not documented). Raises :class:`UsageError` for a
-    ``header_size`` other than 64 and 68.
+    ``width`` and ``height`` [px] are those of the image, although it is encoded in whole macroblocks. ``position`` is
+    the size of all earlier payloads without their ``sps_size`` and ``pps_size``. ``attitude_rad``, the drone's theta,
+    phi and psi, exists only in the 68-byte header (seen in a capture, not documented). Raises :class:`UsageError`
+    unless ``header_size`` is 64 or 68.
     """
     if header_size not in (MIN_HEADER, _HEADER.size + _RESERVED.size):
         raise UsageError(f"a header has 64 bytes, as early firmware writes it, or 68, not {header_size}")
@@ -115,11 +115,11 @@ def build_header(
 
 
 class PaveParser:
-    """Splits a stream of bytes into frames, for any split of the input and any damage.
+    """Splits a byte stream into frames, however the input is divided or damaged.
 
-    Resynchronises on the next header after damage: ``skipped_bytes`` counts the bytes that belong to no frame,
-    ``broken_frames`` the frames that were cut short. Holds at most one frame (``max_payload`` and a header) in
-    addition to the bytes of the last call.
+    After damage it resynchronises on the next header: ``skipped_bytes`` counts bytes that do not belong to any frame,
+    ``broken_frames`` counts truncated frames. It buffers at most one frame (``max_payload`` and a header) in addition
+    to the bytes from the last call.
     """
 
     def __init__(self, max_payload: int = DEFAULT_MAX_PAYLOAD) -> None:
@@ -129,16 +129,16 @@ class PaveParser:
         self.broken_frames = 0
         self._buffer = bytearray()
         self._header: _Header | None = None  # header of the frame at the buffer's start
-        self._searched = 0  # the buffer has been searched for a header up to here
+        self._searched = 0  # position up to which the buffer has been searched for a header
         self._damaged = False
 
     @property
     def buffered(self) -> int:
-        """Bytes held back until their frame is complete."""
+        """Number of bytes held back until their frame is complete."""
         return len(self._buffer)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[PaveFrame]:
-        """Add bytes of the stream; return the frames that are now complete. Never raises for any input."""
+        """Add bytes from the stream; return the frames that they complete. Never raises, whatever the input."""
         self._buffer += data
         frames: list[PaveFrame] = []
         while (header := self._header or self._find_header()) is not None:
@@ -156,13 +156,13 @@ class PaveParser:
         return frames
 
     def end(self) -> None:
-        """Handle the end of the stream: the remaining bytes belong to no whole frame."""
+        """Handle the end of the stream: the remaining bytes cannot become a complete frame."""
         if self._header is not None:
             self.broken_frames += 1
         self._skip(len(self._buffer))
 
     def _find_header(self) -> _Header | None:
-        """Move the buffer's start to the next plausible header; return None if that takes more bytes."""
+        """Move the buffer's start to the next plausible header; return None if that needs more bytes."""
         while (start := self._buffer.find(SIGNATURE)) >= 0:
             self._skip(start)
             if len(self._buffer) < MIN_HEADER:
@@ -176,15 +176,15 @@ class PaveParser:
         return None
 
     def _break_off(self, header: _Header) -> bool:
-        """Return whether another frame begins inside this one's payload: a wrong length, or missing bytes.
+        """Return whether another frame begins within this one's payload, as after a wrong length or missing bytes.
 
-        Without this check one flipped bit in a length would cost all the frames inside it.
+        Without this check, one flipped bit in a length could lose all the frames within that length.
         """
         limit = min(header.size + header.payload_size, len(self._buffer))
         while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
             self._searched = inner
             if inner + MIN_HEADER > len(self._buffer):
-                return False  # cannot tell yet
+                return False  # not enough bytes to tell yet
             if _read_header(self._buffer, inner, self.max_payload) is not None:
                 self.broken_frames += 1
                 self._skip(inner)
@@ -194,7 +194,7 @@ class PaveParser:
         return False
 
     def _is_followed_well(self, header: _Header) -> bool:
-        """Return whether the bytes after the frame begin another one; otherwise bytes of this one are wrong."""
+        """Return whether another frame begins right after this one; if not, some of this one's bytes are wrong."""
         end = header.size + header.payload_size
         return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 
@@ -225,7 +225,7 @@ class PaveParser:
 
 
 def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None:
-    """Return the header at a position with at least MIN_HEADER bytes, or None if it makes no sense."""
+    """Return the header at a position followed by at least MIN_HEADER bytes; None if it is not valid."""
     fields = _HEADER.unpack_from(buffer, at)
     _, version, codec, size, payload_size, encoded_width, encoded_height, width, height, number, timestamp_ms = fields[
         :11
@@ -236,5 +236,5 @@ def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None
     if payload_size > max_payload or not (width <= encoded_width <= MAX_SIDE and height <= encoded_height <= MAX_SIDE):
         return None
     if control & _ADVERTISEMENT:
-        payload_size = 0  # an advertisement announces a size and carries nothing
+        payload_size = 0  # an advertisement announces a size but has no payload
     return _Header(size, payload_size, codec, frame_type, number, timestamp_ms, width, height, stream_id)

@@ -1,31 +1,32 @@
-"""UVLC, the video codec of the Parrot AR.Drone 1: a datagram in, a picture out. Pure; NumPy only.
+"""UVLC, the Parrot AR.Drone 1's video codec: a datagram in, a picture out. Pure; NumPy only.
 
-The drone sends one picture per datagram from its UDP port 5555, without a header: 16-line groups of 16x16
-macroblocks, 4:2:0, of 8x8 cosine-transformed blocks, each a 10-bit mean and run and level codes
-(:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; the sources of this decoder
-are:
+The drone sends one picture per datagram from its UDP port 5555, without an additional header. A picture consists of
+16-line groups of 16x16 macroblocks (4:2:0), made of 8x8 cosine-transformed blocks. Each block is a 10-bit mean, then
+run and level codes (:mod:`skyloop.vehicles.ardrone.wire.uvlc_codes`). No recording of this video is public; the
+decoder's sources are:
 
-* the **Developer Guide** of the AR.Drone SDK 1.7, and **uvlc.txt** in the Parrot SDK 1.8 and 2.0: layout and codes;
+* the **Developer Guide** for the AR.Drone SDK 1.7, and **uvlc.txt** in the Parrot SDK 1.8 and 2.0: layout and codes;
 * the **Parrot SDK** itself (ARDroneLib, VLIB; its licence forbids copying code), whose encoder ran in the drone;
-* **venthur/python-ardrone** (``arvideo.py``) and **djtrance/ardrone1_video_decoder**, whose authors saw pictures of
-  real drones with them; the latter also prints the first 12 bytes of one.
+* **venthur/python-ardrone** (``arvideo.py``) and **djtrance/ardrone1_video_decoder**, whose authors viewed real drones'
+  pictures with them; the latter also prints the first 12 bytes of one.
 
-Where they contradict each other, the version that worked on real drones counts:
+Where they disagree, this module follows whatever worked with real drones:
 
-* A set first bit of a macroblock means *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
-* Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if that is 31 (Parrot SDK from 1.8 on:
-  31 is "the old table"). At 31, the only one seen from real drones, that is the fixed table 3, 5, 7 … of
-  python-ardrone. No picture was seen that needs the H.263-like rule in older comments of the SDK.
+* If a macroblock's first bit is set, it is *not coded* (Parrot SDK, both decoders; uvlc.txt says the opposite).
+* Coefficients are level · (1 + q · (1 + i + j)), where q is the quantiser, or 2 if the quantiser is 31 ("the old
+  table", Parrot SDK since 1.8). For 31, the only one seen from real drones, this is python-ardrone's fixed table
+  3, 5, 7 …. No picture was found that needs the H.263-like rule mentioned in older comments in the SDK.
 * The mean is unsigned (Parrot SDK, python-ardrone). The guide's example is negative, but then white would not fit.
-* Groups start at whole bytes (uvlc.txt, Parrot SDK, python-ardrone) or whole words (djtrance): both are accepted.
-* Luma and chroma use the full range, BT.601 (conversion of the Parrot SDK; python-ardrone used 16 to 235).
-* A quantiser change (uvlc.txt: −1, −2, +1, +2; the SDK's two ends disagree) lasts to the end of the group; at 31 it is
-  read and ignored, as in python-ardrone.
-* Macroblocks that would lie half outside are not coded (Parrot SDK): 88x72 has 80x64, 160x120 has 160x112.
-* P pictures were never seen. As in the Parrot SDK their coded macroblocks are complete in themselves. The others repeat
-  the previous picture, as in H.263, which the guide names as the origin; its number must be one less.
+* Groups start on a byte (uvlc.txt, Parrot SDK, python-ardrone) or on a word (djtrance): both are accepted.
+* Luma and chroma use the full range of BT.601 (as in the Parrot SDK's conversion; python-ardrone used 16 to 235).
+* A quantiser change (uvlc.txt: −1, −2, +1, +2; the SDK's encoder and decoder disagree) applies until the end of the
+  group; at 31 it is read and ignored, as in python-ardrone.
+* Macroblocks that would be partly outside the picture are not coded (Parrot SDK): for 88x72, 80x64 is coded, and for
+  160x120, 160x112.
+* P pictures have never been seen. As in the Parrot SDK, their coded macroblocks are complete in themselves. The others
+  repeat the previous picture, whose number must be one less, as in H.263, which the guide names as the codec's origin.
 
-There is no checksum, so a damaged packet can pass for a picture. The decoder checks all that the format allows.
+There is no checksum, so a damaged packet can pass for a picture. The decoder checks everything that the format allows.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ from skyloop.vehicles.ardrone.wire.uvlc_codes import (
     bit_windows,
 )
 
-MAX_PACKET: Final = 65_535  #: bytes; a picture is one datagram
-_MAX_TAIL_BITS: Final = 64  # zeros that fill a word after the end of the picture
-# Upper bounds of coefficients of 8-bit samples, with the rounding of a fixed-point transform; a level may be rounded
-# up by half a step.
+MAX_PACKET: Final = 65_535  #: bytes, because a picture is one datagram
+_MAX_TAIL_BITS: Final = 64  # zeros that pad the last word after the end of the picture
+# Upper bounds for the coefficients of 8-bit samples, allowing for the rounding of a fixed-point transform. A level may
+# also be rounded up by half a step.
 _MAX_DC: Final = 2048
 _MAX_AC: Final = 1024
 
@@ -77,11 +78,11 @@ Samples = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UvlcPicture:
-    """One picture of the drone's camera."""
+    """One picture from the drone's camera."""
 
-    number: int  #: counts the drone's pictures, 32 bits
+    number: int  #: the drone's picture count, 32 bits
     type: PictureType
-    quant: int  #: quantiser in the picture's header
+    quant: int  #: quantiser given in the picture's header
     width: int  #: width of the coded part [px]
     height: int
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
@@ -99,7 +100,7 @@ class UvlcHeader:
 
 
 def is_p264(packet: bytes | bytearray | memoryview) -> bool:
-    """Return whether a datagram begins like a picture of P264, the drone's other codec, which is not supported."""
+    """Return whether a datagram begins like a P264 picture; that is the drone's other codec, which is not supported."""
     return len(packet) >= 4 and int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
 
 
@@ -111,7 +112,7 @@ def is_intra(packet: bytes | bytearray | memoryview) -> bool:
 
 
 class UvlcDecoder:
-    """Decodes the pictures of one drone in the order of arrival. Not thread-safe."""
+    """Decodes one drone's pictures in order of arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._last: tuple[UvlcHeader, Samples] | None = None
@@ -119,8 +120,8 @@ class UvlcDecoder:
     def decode(self, packet: bytes | bytearray | memoryview) -> UvlcPicture:
         """Return the picture in a datagram.
 
-        Raises DecodeError, and stays ready for the next one, for anything but one whole picture: torn or damaged data,
-        other codecs (:func:`is_p264`), or changes to a picture that did not precede it.
+        Raises DecodeError for anything but one complete picture (truncated or damaged data, another codec
+        (:func:`is_p264`), or changes to a picture other than the previous one), and is then ready for the next.
         """
         reader = _Reader(bytes(packet))
         header = reader.read_header()
@@ -132,7 +133,7 @@ class UvlcDecoder:
         return UvlcPicture(header.number, header.type, header.quant, header.width, header.height, pixels)
 
     def _before(self, header: UvlcHeader) -> Samples | None:
-        """Return the samples that a picture builds upon; None if it is complete in itself."""
+        """Return the samples that a picture depends on; None if it is complete in itself."""
         if header.type is PictureType.INTRA:
             return None
         if self._last is None:
@@ -159,9 +160,9 @@ class _Reader:
         self._window = self._walker.window
         self._end = 8 * len(packet)
         self._at = 0
-        self._coded: list[bool] = []  # for each macroblock
-        self._quants: list[int] = []  # for each coded macroblock
-        self._means: list[int] = []  # for each block of the coded macroblocks
+        self._coded: list[bool] = []  # whether each macroblock is coded
+        self._quants: list[int] = []  # quantiser of each coded macroblock
+        self._means: list[int] = []  # mean of each block in the coded macroblocks
 
     def read_header(self) -> UvlcHeader:
         code = self._read(START_CODE_BITS)
@@ -180,7 +181,7 @@ class _Reader:
         return UvlcHeader(self._read(NUMBER_BITS), PictureType(kind), quant, width, height)
 
     def read_groups(self, header: UvlcHeader) -> None:
-        """Read all groups and the picture's end."""
+        """Read all groups and the end of the picture."""
         quant = header.quant
         for group in range(header.height // MACROBLOCK):
             if group:
@@ -192,7 +193,7 @@ class _Reader:
             raise DecodeError(f"{self._end - self._at} bits follow the picture's end")
 
     def _read_start(self, code: int) -> None:
-        """Go to the next whole byte, or the next whole word, where a start code must be."""
+        """Advance to the next byte or word boundary, where there must be a start code."""
         starts = [-(-self._at // size) * size for size in (8, 32)]
         found = [self._window[start] << 6 | self._window[start + WINDOW] >> (WINDOW - 6) for start in starts]
         for start, value in zip(starts, found, strict=True):
@@ -225,14 +226,14 @@ class _Reader:
         for k in range(count):
             try:
                 quant = self._read_macroblock(quant)
-                # The windows extend further beyond the packet than one macroblock without coefficients can.
+                # Checking here is enough: the windows extend beyond the packet by more than one empty macroblock.
                 if self._at > self._end:
                     raise DecodeError("the packet ends before it does")
             except DecodeError as error:
                 raise DecodeError(f"macroblock {k} of group {group}: {error}") from None
 
     def _read_macroblock(self, quant: int) -> int:
-        """Read a macroblock and return the quantiser from here on."""
+        """Read a macroblock and return the quantiser that applies from here on."""
         at, window = self._at, self._window
         coded = window[at] < 0x8000
         self._coded.append(coded)
@@ -259,7 +260,7 @@ class _Reader:
         return quant
 
     def samples(self, before: Samples | None) -> Samples:
-        """Return the samples of all macroblocks in the order of the stream. Shape (macroblocks, 6, 64)."""
+        """Return the samples of all macroblocks in stream order. Shape (macroblocks, 6, 64)."""
         coded = np.array(self._coded)
         samples = np.zeros((coded.size, BLOCKS, COEFFICIENTS), np.uint8) if before is None else before.copy()
         levels = self._walker.levels()
@@ -286,13 +287,13 @@ def _changed_quant(quant: int, code: int) -> int:
 
 
 def _bgr(samples: Samples, width: int, height: int) -> NDArray[np.uint8]:
-    """Return the picture (height, width, 3) of macroblocks (macroblocks, 6, 64)."""
+    """Convert macroblocks (macroblocks, 6, 64) to a picture (height, width, 3)."""
     groups, columns = height // MACROBLOCK, width // MACROBLOCK
     blocks = samples.reshape(groups, columns, BLOCKS, SIDE, SIDE)
     luma = blocks[:, :, :4].reshape(groups, columns, 2, 2, SIDE, SIDE).transpose(0, 2, 4, 1, 3, 5)
     chroma = blocks[:, :, 4:].transpose(2, 0, 3, 1, 4).reshape(2, height // 2, width // 2)
     cb, cr = chroma.astype(np.int32) - 128
-    # BT.601, full range, in 256ths; one chroma sample to each 2x2 pixels.
+    # BT.601, full range, in 256ths; one chroma sample for each 2x2 pixels.
     shifts = (454 * cb, -88 * cb - 183 * cr, 359 * cr)
     quads = luma.reshape(height // 2, 2, width // 2, 2).astype(np.int16)
     pixels = np.empty((height, width, 3), np.uint8)

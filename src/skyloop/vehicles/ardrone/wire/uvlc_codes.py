@@ -1,7 +1,7 @@
-"""UVLC's constants for both ends, and its run and level codes, read many at once. Pure.
+"""UVLC's constants for encoder and decoder, and a fast reader for its run and level codes. Pure.
 
-A coefficient is a *pair*: a run of zeros before it, and its level. Both codes are some zeros, a one, and as many bits
-as there were zeros, less one; a level ends with its sign (Developer Guide, "Specific block entropy-encoding"):
+A coefficient is a *pair*: the run of zeros before it, and its level. Each code is a number of zeros, a one, and one bit
+fewer than there were zeros; a level ends with its sign (Developer Guide, "Specific block entropy-encoding"):
 
 ======== ===== ======================  ======== ================ =========================
 run      code                          level    code
@@ -15,12 +15,13 @@ run      code                          level    code
 
 The end of a block is coded as a level, after a run of 0.
 
-Reading bit by bit would be far too slow in Python. So a table lists, for each 16 bits, the whole pairs that they begin
-with and the distance to the next window. The reader only walks, and NumPy turns its track into coefficients.
+Reading bit by bit would be far too slow in Python. Instead, for each window of 16 bits, a table lists the whole pairs
+with which it begins and the distance to the next window. The reader only steps from window to window, recording its
+track, which NumPy turns into coefficients.
 
-Sources of the numbers, by the names used in :mod:`skyloop.vehicles.ardrone.wire.uvlc`: the Parrot SDK (headers and
-``uvlc.txt`` of ARDroneLib) and the Developer Guide for the layout; venthur/python-ardrone, which showed the video of
-real drones, for the order of the coefficients and for the steps at quantiser 31.
+Sources, named as in :mod:`skyloop.vehicles.ardrone.wire.uvlc`: the Parrot SDK (ARDroneLib's headers and ``uvlc.txt``)
+and the Developer Guide for the layout; venthur/python-ardrone, which displayed real drones' video, for the order of the
+coefficients and the steps for quantiser 31.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ from numpy.typing import NDArray
 from skyloop.errors import DecodeError
 
 START_CODE_BITS: Final = 22
-UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this + k
-P264_START: Final = 0x40  #: the same for the drone's other codec
-END_OF_PICTURE: Final = 0x3F  #: in place of a group 31
+UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; group k has this plus k
+P264_START: Final = 0x40  #: start code of the drone's other codec
+END_OF_PICTURE: Final = 0x3F  #: marks the end where group 31 would start
 MAX_GROUPS: Final = 31
 
 FORMAT_BITS: Final = 2
@@ -48,18 +49,18 @@ QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
-BLOCKS: Final = 6  #: blocks of a macroblock: four of luma in reading order, then Cb, Cr, at half resolution
+BLOCKS: Final = 6  #: blocks in a macroblock: four for luma in reading order, then Cb and Cr at half resolution
 SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
 DC_BITS: Final = 10
 
 FINEST_QUANT: Final = 1
 COARSEST_QUANT: Final = 30
-TABLE_QUANT: Final = 31  #: a mode, not a size: uses the steps of ``TABLE_QUALITY``. Real drones send it
+TABLE_QUANT: Final = 31  #: not a step size but a mode that uses the steps of ``TABLE_QUALITY``; real drones send it
 TABLE_QUALITY: Final = 2
-DQUANT: Final = (-1, -2, 1, 2)  #: values of the two bits of a quantiser change
+DQUANT: Final = (-1, -2, 1, 2)  #: quantiser changes, indexed by their two-bit code
 
-MAX_RUN_ZEROS: Final = 6  #: leading zeros of the longest code of a run
+MAX_RUN_ZEROS: Final = 6  #: number of leading zeros in the longest code for a run
 
 
 class PictureType(IntEnum):
@@ -75,7 +76,7 @@ def _sizes() -> dict[tuple[int, int], tuple[int, int]]:
     return {code: size for code, size in sizes.items() if size[1] // MACROBLOCK <= MAX_GROUPS}
 
 
-#: (format, resolution) of the header to (width, height) [px]. The header can name larger pictures, but the start codes
+#: (width, height) [px] by the header's (format, resolution). The header can specify larger pictures, but start codes
 #: cannot number their groups.
 SIZES: Final = _sizes()
 
@@ -86,7 +87,7 @@ def _zigzag() -> NDArray[np.intp]:
     return np.array([row * SIDE + column for row, column in cells])
 
 
-#: Position of the k-th coefficient of the stream in the block, row by row; rows are vertical frequencies. Shape (64,).
+#: Position in the block, row by row, of the stream's k-th coefficient; rows are vertical frequencies. Shape (64,).
 ZIGZAG: Final = _zigzag()
 
 
@@ -96,7 +97,7 @@ def _steps() -> NDArray[np.int32]:
     return (1 + quality[:, None] * (1 + ZIGZAG // SIDE + ZIGZAG % SIDE)).astype(np.int32)
 
 
-#: Size of the step of each coefficient, in the stream's order, for each quantiser. Shape (32, 64).
+#: Step size of each coefficient, in stream order, for each quantiser. Shape (32, 64).
 STEPS: Final = _steps()
 
 
@@ -107,24 +108,24 @@ def _inverse_transform() -> NDArray[np.float32]:
     return np.kron(basis, basis)[ZIGZAG].astype(np.float32)
 
 
-#: Coefficients (…, 64) in the stream's order times this are samples (…, 64) row by row; its transpose converts back.
-#: Orthonormal: the first coefficient is 8 times the mean.
+#: Multiplying coefficients (…, 64) in stream order by this gives samples (…, 64) row by row; its transpose is the
+#: inverse. Orthonormal: the first coefficient is 8 times the mean.
 INVERSE_TRANSFORM: Final = _inverse_transform()
 
 
 WINDOW: Final = 16  #: bits per table lookup
-PADDING: Final = 32  #: zero bytes after the packet's, so that no lookup can go past the end
-_PAIRS: Final = 5  #: most whole pairs in a window: the shortest takes 3 bits
-_MAX_LEVEL_ZEROS: Final = 11  #: levels below 2048: no picture of 8-bit samples has greater ones
+PADDING: Final = 32  #: zero bytes appended to the packet, so that no lookup goes past the end
+_PAIRS: Final = 5  #: maximum number of whole pairs in a window, as the shortest takes 3 bits
+_MAX_LEVEL_ZEROS: Final = 11  #: allows levels below 2048; pictures of 8-bit samples have none greater
 
 Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class PairTable:
-    """The pairs at the beginning of each window of 16 bits."""
+    """The pairs with which each window of 16 bits begins."""
 
-    step: NDArray[np.int8]  #: (65536,) bits of the whole pairs; negative: the block ends with them; 0: not even one
+    step: NDArray[np.int8]  #: (65536,) bits in the whole pairs; negative if the block ends with them, 0 without any
     count: NDArray[np.int64]  #: (65536,) number of pairs
     advance: NDArray[np.int64]  #: (65536 · 5,) run + 1 of each pair
     level: NDArray[np.int16]  #: (65536 · 5,) level of each pair
@@ -132,7 +133,7 @@ class PairTable:
 
 @cache
 def pair_table() -> PairTable:
-    """Return the table, made at first use (tens of milliseconds)."""
+    """Return the table, which is built at first use (taking tens of milliseconds)."""
     rest = np.arange(1 << WINDOW)
     used = np.zeros_like(rest)
     count = np.zeros_like(rest)
@@ -151,7 +152,7 @@ def pair_table() -> PairTable:
         if k < _PAIRS:
             negative = (rest << (bits - 1) & 0x8000) != 0
             advance[pair, k] = run[pair] + 1
-            magnitude = np.maximum(magnitude, 1)  # the code without a zero stands for run 0, but level 1
+            magnitude = np.maximum(magnitude, 1)  # the code without zeros means run 0, but level 1
             level[pair, k] = np.where(negative, -magnitude, magnitude)[pair]
         count += pair
         used += np.where(whole, bits, 0)
@@ -162,7 +163,7 @@ def pair_table() -> PairTable:
 
 
 def _value(window: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the leading zeros of windows, the number coded there, and its bits, without a sign."""
+    """Return each window's count of leading zeros, the unsigned number coded there, and the code's width in bits."""
     zeros = WINDOW - np.frexp(window.astype(np.float64))[1].astype(np.int64)
     extra = np.maximum(zeros - 1, 0)
     tail = (window << (zeros + 1) & 0xFFFF) >> (WINDOW - extra)
@@ -170,9 +171,9 @@ def _value(window: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def bit_windows(packet: bytes) -> NDArray[np.uint16]:
-    """Return the 16 bits from each bit of a packet on, in the order of the stream, with zeros beyond its end.
+    """Return, for each bit in stream order, the 16 bits that begin with it; bits beyond the packet's end are zero.
 
-    The stream is a sequence of 32-bit little-endian words read from the most significant bit on; ``packet`` must
+    The stream is a sequence of 32-bit little-endian words, each read from its most significant bit; ``packet`` must
     consist of whole words. Shape (8 · (bytes + about 30),).
     """
     words = np.frombuffer(packet, dtype="<u4").astype(">u4")
@@ -182,21 +183,21 @@ def bit_windows(packet: bytes) -> NDArray[np.uint16]:
 
 
 class BlockWalker:
-    """Walks over the pairs of blocks and records its track."""
+    """Steps through the pairs of blocks, recording its track."""
 
     def __init__(self, windows: NDArray[np.uint16]) -> None:
         self._table = pair_table()
         self._windows = windows
-        self.window = windows.data  #: the same, faster for single lookups
+        self.window = windows.data  #: the windows as a memory view, which is faster for single lookups
         self._steps = self._table.step[windows].data
-        self._visits: list[int] = []  # bits where windows with whole pairs, or one long pair, begin
-        self._ends: list[int] = []  # visits done when each block had ended
-        self._long: list[tuple[int, int, int]] = []  # visit, run + 1 and level of each pair longer than a window
+        self._visits: list[int] = []  # positions of the windows with whole pairs, and of the long pairs [bits]
+        self._ends: list[int] = []  # number of visits at the end of each block
+        self._long: list[tuple[int, int, int]] = []  # for each pair longer than a window: visit, run + 1 and level
 
     def walk(self, at: int) -> int:
-        """Read the pairs of the next block from bit ``at`` to its end; return the bit after it.
+        """Read the next block's pairs from bit ``at`` to the end of the block; return the position of the bit after it.
 
-        Raises DecodeError for an invalid code; bits beyond the packet read as one.
+        Raises DecodeError for an invalid code, which includes bits beyond the packet.
         """
         visits, steps = self._visits, self._steps
         while (step := steps[at]) >= 0:
@@ -211,7 +212,7 @@ class BlockWalker:
         self._ends.append(len(self._visits))
 
     def _long_pair(self, at: int) -> int:
-        """Read one pair that is invalid or does not fit in a window; return the bit after it."""
+        """Read one pair that is invalid or does not fit in a window; return the position of the bit after it."""
         zeros, run, at = self._read_value(at)
         if zeros > MAX_RUN_ZEROS:
             raise DecodeError(f"{zeros} zeros do not begin a code of a run")
@@ -224,7 +225,7 @@ class BlockWalker:
         return at + 1
 
     def _read_value(self, at: int) -> tuple[int, int, int]:
-        """Return the leading zeros, the number and the next bit of the code at a bit, without a sign."""
+        """Return a code's count of leading zeros, its number without a sign, and the position of the bit after it."""
         zeros = WINDOW - self.window[at].bit_length()
         at += zeros + 1
         if zeros < 2:
@@ -233,7 +234,7 @@ class BlockWalker:
         return zeros, 1 << extra | self.window[at] >> (WINDOW - extra), at + extra
 
     def levels(self) -> NDArray[np.float32]:
-        """Return the levels of all blocks so far, in the stream's order; those of the mean's position are 0.
+        """Return the levels of all blocks so far, in stream order; those at the position of the mean are 0.
 
         Shape (blocks, 64). Raises DecodeError for a block with more than 64.
         """
@@ -247,7 +248,7 @@ class BlockWalker:
         advance[pairs_before[long_visit]] = long_advance
         level[pairs_before[long_visit]] = long_level
 
-        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # of blocks, in pairs
+        ends = np.concatenate([[0], np.concatenate([[0], pairs_after])[self._ends]])  # in pairs, for each block
         travelled = np.concatenate([[0], np.cumsum(advance)])
         pairs = np.diff(ends)
         place = travelled[1:] - np.repeat(travelled[ends[:-1]], pairs)

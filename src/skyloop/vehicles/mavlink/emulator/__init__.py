@@ -1,6 +1,6 @@
-"""An emulated ArduCopter or PX4 on the network, flying a simulated vehicle for any MAVLink program.
+"""An emulated ArduCopter or PX4 on the network, flying a simulated vehicle, for any MAVLink program.
 
-On free ports of this machine, for a test::
+To use it on free local ports, as in a test::
 
     from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
@@ -10,7 +10,7 @@ On free ports of this machine, for a test::
     with MavlinkFirmware(host, kind=Kind.PX4, ports=Ports.free(Kind.PX4)) as firmware:
         firmware.address  # mavlink://udpin:127.0.0.1:…, the driver's address
 
-The differences between the two were observed on real autopilots; ``docs/mavlink.md`` has them as a table.
+The differences between the two were observed on real autopilots and are listed in ``docs/mavlink.md``.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px
 
 
 class RunningFirmware(RunningEmulator):
-    """An autopilot that is switched on. It belongs to the loop's thread."""
+    """An autopilot that is switched on. Belongs to the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
         super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
@@ -94,7 +94,7 @@ class RunningFirmware(RunningEmulator):
     # Called by the host, on its threads ------------------------------------------------------------------------
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Report a crash, which stops the motors, to the autopilot."""
+        """Tell the autopilot about a crash, which has stopped the motors."""
         super().happened(occurrence)
         if occurrence.kind is OccurrenceKind.EMERGENCY:
             self._loop.post(partial(self.autopilot.crashed, occurrence.text))
@@ -106,24 +106,24 @@ BOOT_S: Final = 2.0
 class MavlinkFirmware(Emulator[RunningFirmware]):
     """The autopilot of one drone in a host's world. Several may share a host, each with its own drone and ports.
 
-    Make the host with :func:`with_multirotors`.
+    Create the host with options from :func:`with_multirotors`.
 
     Args:
         host: The simulated world.
-        drone: Its number in the world.
+        drone: Number of the drone in that world.
         kind: ArduCopter or PX4.
         bind: The local address to listen on.
-        ports: Ports to listen on; None: those of the autopilot's own simulation.
-        system: Its MAVLink system id, 1 to 255; None: the drone's number plus one.
-        faults: Applied to UDP datagrams, each way.
-        delay_s: Delay of UDP datagrams, each way.
-        boot_s: Simulated time from the start until it can be armed, in seconds (real ones take 5 to 40).
-        gps: Whether it has GPS; without it, the autopilot is not ready until external poses arrive.
-        version: 1: it speaks only MAVLink 1.
-        key: 32 bytes that sign everything; None: nothing is signed.
-        video: Host and port for the front camera's video over UDP; None: no camera.
-        loop: The thread of a whole fleet, started after all of its members and stopped before any; None: a separate
-            thread.
+        ports: The ports to use; None for those of the autopilot's own simulation.
+        system: MAVLink system id, 1 to 255; None for the drone's number plus one.
+        faults: Faults injected into UDP datagrams in both directions.
+        delay_s: Delay added to UDP datagrams in each direction.
+        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real ones take 5 to 40).
+        gps: Whether the vehicle has GPS; without it, the autopilot is not ready until external poses arrive.
+        version: 1 if it supports only MAVLink 1.
+        key: 32-byte key with which everything is signed; None to sign nothing.
+        video: Host and port for the front camera's video over UDP; None for no camera.
+        loop: Thread shared by a fleet, to be started after all its members and stopped before any of them; None for
+            a separate thread.
 
     Raises:
         UsageError: An argument is out of range.
@@ -161,12 +161,12 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
-        self.settings = replace(self.settings, ports=running.ports)  # keep the ports over a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports for a restart
         return running
 
     @property
     def autopilot(self) -> Autopilot:
-        """The running autopilot, for tests; it belongs to its thread."""
+        """The running autopilot, for tests. Belongs to the loop's thread."""
         return self._started.autopilot
 
     @property
@@ -176,14 +176,14 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     @property
     def tcp_address(self) -> str:
-        """Address for a driver on this machine, over TCP; raises for a kind without a TCP port."""
+        """Address for a driver on this machine, over TCP; raises an error for a kind without a TCP port."""
         if self.settings.ports.tcp is None:
             raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
         return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"
 
     @property
     def description(self) -> str:
-        """Kind, system and address, in one line for people."""
+        """A readable one-line summary: kind, system and address."""
         settings = self.settings
         tcp = f", {self.tcp_address}" if settings.ports.tcp is not None else ""
         return (
@@ -193,7 +193,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
 
 CAMERA: Final[CameraModel] = replace(FRONT_CAMERA, fps=20.0)
-_CLOCK: Final = Fraction(1, 90_000)  #: unit of transport stream time [s]
+_CLOCK: Final = Fraction(1, 90_000)  #: time unit of a transport stream [s]
 _X264: Final = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "scenecut=0:repeat-headers=1:threads=1"}
 _SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
 
@@ -231,7 +231,7 @@ class TransportStream:
         """Encode and send an image: BGR, uint8, shape (height, width, 3)."""
         self._begun_ns = captured_ns if self._begun_ns is None else self._begun_ns
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
-        # A drone's exposures may arrive out of order; a stream's stamps must grow.
+        # A drone's exposures may arrive out of order, but a stream's stamps must increase.
         self._stamp = max(self._stamp + 1, round((captured_ns - self._begun_ns) / 1e9 / _CLOCK))
         frame.pts = self._stamp
         frame.time_base = _CLOCK
@@ -244,5 +244,5 @@ class TransportStream:
 
 
 def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
-    """Return the thread that encodes the newest image; not started."""
+    """Return the thread that encodes the newest image, not started yet."""
     return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)

@@ -1,4 +1,4 @@
-"""ArduCopter's behaviour, as observed on 4.7.0-dev. ``docs/mavlink.md`` has it as a table."""
+"""ArduCopter's behaviour as observed with 4.7.0-dev and listed in ``docs/mavlink.md``."""
 
 from __future__ import annotations
 
@@ -50,17 +50,17 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import COPTER_MODES, COPTER_NUMBERS
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
-SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: in stick modes without a remote control
-STICK_TIMEOUT_S: Final = 3.0  #: after this silence, a remote control over MAVLink counts as gone
-STICK_SPEED_M_S: Final = 6.0  #: at full stick
+SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
+STICK_TIMEOUT_S: Final = 3.0  #: a remote control over MAVLink counts as lost after this much silence
+STICK_SPEED_M_S: Final = 6.0  #: speed at full stick
 TURN_RAD_S: Final = math.radians(60)  #: maximum turn rate of CONDITION_YAW
-RTL_LOWEST_M: Final = 0.3  #: lowest return altitude above home
+RTL_LOWEST_M: Final = 0.3  #: lowest altitude above home for a return
 RTL_LEAST_SLOPE: Final = 0.5  #: flatter RTL cones are ignored
-_GUIDED_ITEM: Final = 2  #: "current" of a mission item that is a position to fly to now
+_GUIDED_ITEM: Final = 2  #: value of "current" in a mission item that is a position to fly to now
 _ALTITUDE_ITEM: Final = 3
 CHANNELS: Final = 16
-_OVERRIDDEN: Final = 8  #: channels that an override can set
-_IGNORED: Final = 0xFFFF  #: a channel that an override leaves unchanged
+_OVERRIDDEN: Final = 8  #: number of channels that an override can set
+_IGNORED: Final = 0xFFFF  #: value for a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 _WORDS: Final = {
@@ -76,7 +76,7 @@ class ArduCopter(Autopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT
-    CAPABILITIES = 0xFBEF & ~0xD200  # fences, rally points and terrain are not emulated, and there are no files
+    CAPABILITIES = 0xFBEF & ~0xD200  # without fences, rally points, terrain and files, which are not emulated
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
     FRAMES = frozenset({WORLD, WORLD_OFFSET, BODY, BODY_OFFSET})
@@ -100,7 +100,7 @@ class ArduCopter(Autopilot):
         self._target_s = 0.0
         self._stick: tuple[float, float, float, float] | None = None  # forward, left, up, yaw
         self._stick_s = -STICK_TIMEOUT_S
-        self._overrides: dict[int, int] = {}  # by channel, counted from 0 [µs]
+        self._overrides: dict[int, int] = {}  # pulse widths [µs] by channel, counted from 0
         self._commands |= {
             m.MAV_CMD_CONDITION_YAW: self._condition_yaw,
             m.MAV_CMD_DO_PAUSE_CONTINUE: self._pause_or_continue,
@@ -141,10 +141,10 @@ class ArduCopter(Autopilot):
             self._rising = not self._manoeuvres.rise()
             return
         if not self.flight.airborne:
-            return  # only the command takes off
+            return  # only the command can start a take-off
         if self._target is not None and self.time_s - self._target_s > self.parameters["GUID_TIMEOUT"]:
             if isinstance(self._target, AttitudeTarget):
-                self.flight.lean(0.0, 0.0, 0.0, 0.0)  # level: it drifts on
+                self.flight.lean(0.0, 0.0, 0.0, 0.0)  # level attitude, so the vehicle continues to drift
                 return
             if self._target.place is None:
                 self._target = None
@@ -159,7 +159,7 @@ class ArduCopter(Autopilot):
         self.flight.lean(roll, pitch, share * fastest, target.turn(self.flight))
 
     def _fly_by_sticks(self) -> None:
-        """Follow the remote control. Without one, the simulated one's throttle stick is low."""
+        """Follow the remote control. Without MAVLink input, the simulated one applies, with its throttle stick down."""
         if self._stick is not None and self.time_s - self._stick_s < STICK_TIMEOUT_S:
             self.flight.move_body(*self._stick)
         elif self.flight.place[2] > 0.3:
@@ -198,7 +198,7 @@ class ArduCopter(Autopilot):
         return Speeds(min(GO_M_S, across), min(SINK_M_S, up), min(SINK_M_S, down))
 
     def _begin_return(self) -> None:
-        """Return at RTL_ALT, or lower near home; never below the present height."""
+        """Start to return at RTL_ALT, or lower near home, but never below the present height."""
         east, north, up = self.flight.place
         above, distance = up - self.home[2], math.hypot(east - self.home[0], north - self.home[1])
         lowest = max(RTL_LOWEST_M, above + max(0.0, self.parameters["RTL_CLIMB_MIN"] / 100.0))
@@ -236,7 +236,7 @@ class ArduCopter(Autopilot):
         return ACCEPTED
 
     def _disarmed(self) -> None:
-        """Keep the mode: after a landing it is LAND, which can't be armed."""
+        """Keep the mode: after a landing it is LAND, in which arming is not possible."""
 
     # Arming and taking off -------------------------------------------------------------------------------------
 
@@ -284,12 +284,12 @@ class ArduCopter(Autopilot):
 
     @staticmethod
     def _finite(target: Target | None) -> Target | None:
-        """Return a target if its numbers are finite; any other is a silent stop."""
+        """Return a target if its numbers are finite; any other target silently stops the vehicle."""
         numbers = () if target is None else (*(target.velocity or ()), *(target.place or ()))
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target with a position relative to the vehicle, as in every frame but one."""
+        """Return a target with a position relative to the vehicle, which is the case for all frames but one."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target
@@ -373,12 +373,12 @@ class ArduCopter(Autopilot):
             return FAILED
         self._set_mode("STABILIZE")
         self._stick, self._overrides, self.failsafe = None, {}, False
-        self._restart()  # mission and parameters stay
+        self._restart()  # keeps the mission and parameters
         return ACCEPTED
 
     @property
     def channels(self) -> list[int] | None:
-        """The remote control's pulse widths [µs]: sticks centred, throttle down, and the overrides."""
+        """The remote control's pulse widths [µs]: sticks centred and throttle down, unless overridden."""
         fresh = self.time_s - self._stick_s < STICK_TIMEOUT_S
         usual = [1500, 1500, 1000, *[1500] * (CHANNELS - 3)]
         return [self._overrides.get(n, width) if fresh else width for n, width in enumerate(usual)]
@@ -407,7 +407,7 @@ class ArduCopter(Autopilot):
         if place is None:
             return MISSION_UNSUPPORTED
         if message.current == _ALTITUDE_ITEM:
-            return MISSION_ACCEPTED  # without effect
+            return MISSION_ACCEPTED  # accepted without any effect
         if self.mode != "GUIDED" or message.command != m.MAV_CMD_NAV_WAYPOINT:
             return MISSION_ERROR
         self._go_to(Target(place))
@@ -435,5 +435,5 @@ class ArduCopter(Autopilot):
 
 
 def _given(arguments: Arguments) -> bool:
-    """Return whether a command names a position: 0° 0° and NaN stand for "none"."""
+    """Return whether a command contains a position: 0° 0° and NaN mean "none"."""
     return any(each and not math.isnan(each) for each in arguments[4:6])

@@ -1,6 +1,6 @@
-"""Behaviour shared by both autopilots: messages in, a simulated vehicle flown, messages out. Pure but for the vehicle.
+"""Behaviour shared by both autopilots, which fly a simulated vehicle by messages. Pure except for the vehicle.
 
-Times are the autopilot's, in simulated seconds, so that everything runs faster in a faster world.
+Times are on the autopilot's clock in simulated seconds, so that everything runs faster in a faster world.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ TEMPORARILY_REJECTED: Final = 1
 DENIED: Final = 2
 UNSUPPORTED: Final = 3
 FAILED: Final = 4
-FORCE: Final = 21196  #: parameter of the disarm command: "even in flight"
+FORCE: Final = 21196  #: parameter of the disarm command that means "even in flight"
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
-AFTER_LANDING_S: Final = 2.0  #: on the ground after a flight, until it disarms
-POSES_S: Final = 1.0  #: how long external poses must arrive without GPS
-POSE_GAP_S: Final = 0.5  #: without external poses, until the position is lost
-_GCS: Final = 6  #: MAV_TYPE
-#: Messages that the old request for all messages does not change.
+AFTER_LANDING_S: Final = 2.0  #: time on the ground after a flight until it disarms
+POSES_S: Final = 1.0  #: without GPS, how long external poses must arrive before the position is known
+POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
+_GCS: Final = 6  #: MAV_TYPE of a ground station
+#: Messages that the old request for all messages does not affect.
 _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_HEARTBEAT,
     m.MAVLINK_MSG_ID_TIMESYNC,
@@ -43,7 +43,7 @@ _ON_REQUEST: Final = (
     m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
 )
 _COPIES: Final = 1 << 32
-_NOT_GIVEN: Final = 0x7FFFFFFF  #: placeholder for a position in COMMAND_INT, like NaN in COMMAND_LONG
+_NOT_GIVEN: Final = 0x7FFFFFFF  #: value that means "no position" in COMMAND_INT, like NaN in COMMAND_LONG
 
 Arguments = tuple[float, ...]
 Handler = Callable[[Arguments], int]
@@ -51,20 +51,20 @@ PlaceHandler = Callable[[Arguments, int], int]
 
 
 class Autopilot(ABC):
-    """One autopilot. All methods belong to one thread. Set ``ports``, its links, before the first report."""
+    """One autopilot. All methods belong to one thread. Set ``ports`` (its links) before the first report."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     CAPABILITIES: ClassVar[int]
     VERSION: ClassVar[int]
-    RATES: ClassVar[dict[int, float]]  #: of the messages that a new link gets without a request [1/s]
-    FRAMES: ClassVar[frozenset[int]]  #: of set-points
+    RATES: ClassVar[dict[int, float]]  #: rates of the messages sent on a new link without being requested [1/s]
+    FRAMES: ClassVar[frozenset[int]]  #: frames accepted in set-points
     ABOVE_SEA: ClassVar[frozenset[int]]  #: frames of global positions with altitudes above mean sea level
-    ABOVE_HOME: ClassVar[frozenset[int]]  #: … above home
-    LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of a position in COMMAND_LONG, by command that accepts one
-    NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not have
+    ABOVE_HOME: ClassVar[frozenset[int]]  #: frames of global positions with altitudes above home
+    LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of the position in COMMAND_LONG, for each command that accepts one
+    NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
-    REPORTS_PREARM: ClassVar[bool] = True  #: SYS_STATUS shows that the pre-arm check exists, besides its result
-    DISARM_S: ClassVar[float]  #: it disarms after this time armed on the ground
+    REPORTS_PREARM: ClassVar[bool] = True  #: whether SYS_STATUS marks the pre-arm check as present
+    DISARM_S: ClassVar[float]  #: time armed on the ground after which it disarms
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         self.flight = FlightControl(vehicle)
@@ -76,17 +76,17 @@ class Autopilot(ABC):
         self.armed = False
         self.mode = ""
         self.failsafe = False
-        self.poses = 0  #: external poses received
-        self.set_points = 0  #: set-points accepted
+        self.poses = 0  #: number of external poses received
+        self.set_points = 0  #: number of set-points accepted
         self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up from the flight's origin
-        self._home_given = False  # set by a command: arming then leaves it unchanged
+        self._home_given = False  # whether home was set by a command, so that arming leaves it unchanged
         self._manoeuvres = Manoeuvres(self.flight)
         self._boot_s = boot_s
         self._begun_s: float | None = None
         self._captured_ns = 0
         self._armed_s = 0.0
         self._landed_s: float | None = None
-        self._flown = False  # since arming
+        self._flown = False  # whether it has flown since it was armed
         self._gcs_s: float | None = None
         self._pose_s = -math.inf
         self._posing_s = math.inf
@@ -113,12 +113,12 @@ class Autopilot(ABC):
 
     @property
     def boot_ms(self) -> int:
-        """The same as a 32-bit message field [ms]."""
+        """Time since it was switched on, as in 32-bit message fields [ms]."""
         return round(self.time_s * 1000) % _COPIES
 
     @property
     def boot_ns(self) -> int:
-        """The same [ns]."""
+        """Time since it was switched on [ns]."""
         return round(self.time_s * 1e9)
 
     @property
@@ -130,7 +130,7 @@ class Autopilot(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether its estimator reports a good position, the last step of a boot."""
+        """Whether its estimator reports a good position, which is the last step of booting."""
         return self.time_s >= self._boot_s and self.has_origin
 
     @property
@@ -140,22 +140,22 @@ class Autopilot(ABC):
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its mode."""
+        """Whether it can be armed in its present mode."""
         return True
 
     @property
     def remote(self) -> bool:
-        """Whether it reports a received remote control."""
+        """Whether it reports that it receives a remote control."""
         return False
 
     @property
     def base_mode(self) -> int:
-        """``MAV_MODE_FLAG`` of the heartbeat."""
+        """The heartbeat's ``MAV_MODE_FLAG`` bits."""
         return int(ModeFlag.CUSTOM | (ModeFlag.ARMED if self.armed else 0))
 
     @property
     def system_status(self) -> int:
-        """``MAV_STATE`` of the heartbeat."""
+        """The heartbeat's ``MAV_STATE``."""
         if self.failsafe:
             return SystemState.CRITICAL
         return SystemState.ACTIVE if self.armed else SystemState.STANDBY
@@ -167,7 +167,7 @@ class Autopilot(ABC):
     # Time passes -----------------------------------------------------------------------------------------------
 
     def tick(self, report: Report) -> None:
-        """Handle a new report: fly, and send what is due."""
+        """Handle a new report: fly, and send the messages that are due."""
         self.report = report
         self._captured_ns = report.captured_ns
         if self._begun_s is None:
@@ -183,7 +183,7 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _fly(self) -> None:
-        """Fly according to the mode. Called at every tick while armed."""
+        """Fly according to the mode. Called in every tick while armed."""
 
     def _check_ground(self) -> None:
         if not self.flight.standing:
@@ -220,7 +220,7 @@ class Autopilot(ABC):
                 port.send(parameter)
 
     def send_text(self, text: str, severity: int = WARNING) -> None:
-        """Send a text for people on all links, in chunks if it is long."""
+        """Send a text message on all links, in chunks if it is long."""
         self._text = self._text % 0xFFFF + 1
         for port in self.ports:
             for chunk in chunks_of(text, severity, self._text):
@@ -234,7 +234,7 @@ class Autopilot(ABC):
     # Messages come -----------------------------------------------------------------------------------------------
 
     def on_message(self, port: Port, message: Message, now_ns: int) -> None:
-        """Handle a message; answers go to its port. Before the first report it ignores all messages."""
+        """Handle a message and send replies to its port. All messages before the first report are ignored."""
         if self._begun_s is None or getattr(message, "target_system", 0) not in (0, self.system):
             return
         kind = message.get_type()
@@ -279,16 +279,16 @@ class Autopilot(ABC):
 
     @property
     def channels(self) -> list[int] | None:
-        """The remote control's pulse widths [µs]; None: it reports none."""
+        """The remote control's pulse widths [µs]; None if it reports none."""
         return None
 
     def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
-        """Handle a message that only one of the autopilots answers. Return whether it was handled."""
+        """Handle a message that only one of the two autopilots supports; return whether it was handled."""
         return False
 
     @abstractmethod
     def _counts(self, heartbeat: Message) -> bool:
-        """Return whether this ground station's heartbeat counts."""
+        """Return whether this ground station's heartbeats are monitored."""
 
     @abstractmethod
     def _set_point(self, message: Message) -> None: ...
@@ -304,7 +304,7 @@ class Autopilot(ABC):
         self._pose_s = self.time_s
 
     def _data_stream(self, port: Port, message: Message) -> None:
-        """Handle the old request for messages, which sets one rate for all."""
+        """Handle the old message request, which sets one rate for all messages."""
         rate = min(50, message.req_message_rate) if message.start_stop else 0
         for number in MAKERS:
             if number not in _ON_REQUEST:
@@ -348,12 +348,12 @@ class Autopilot(ABC):
         return maker(self) if maker is not None else None
 
     def _interval(self, port: Port, number: int) -> Message | None:
-        if not 0 <= number <= 0xFFFF:  # the answer has no room for it
+        if not 0 <= number <= 0xFFFF:  # it does not fit in the reply
             return None
         return m.MAVLink_message_interval_message(number, port.streams.interval_us(number))
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
-        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # false for NaN, too
+        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # the comparison is also false for NaN
             return FAILED
         port.streams.set_interval(number, interval_us)
         return ACCEPTED
@@ -389,7 +389,7 @@ class Autopilot(ABC):
         self._disarmed()
 
     def crashed(self, text: str) -> None:
-        """Disarm because the vehicle stopped its motors, for this reason."""
+        """Disarm because the vehicle stopped its motors; ``text`` gives the reason."""
         if self.armed:
             self._disarm(f"Crash: Disarming ({text})")
 
@@ -399,24 +399,24 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _words(self, occasion: str) -> str:
-        """Return its text for an occasion: armed, disarmed, auto_disarm, landed, forced."""
+        """Return the autopilot's text for an occasion: armed, disarmed, auto_disarm, landed or forced."""
 
     @abstractmethod
     def _refuse_arming(self) -> int | None:
-        """Return the result that refuses, after sending its text; None if arming is allowed."""
+        """Return the result code of a refusal to arm, after sending its text; None if arming is allowed."""
 
     @abstractmethod
     def _refuse_disarming(self) -> int:
-        """Return the result that refuses to disarm in flight."""
+        """Return the result code of a refusal to disarm in flight."""
 
     def _datum(self, frame: int) -> float | None:
-        """Return the height of a frame's altitude 0 above the flight's origin [m]; None for an unknown frame."""
+        """Return the height above the flight's origin of a frame's altitude 0 [m]; None for an unknown frame."""
         if frame in self.ABOVE_SEA:
             return -ORIGIN.altitude_m
         return self.home[2] if frame in self.ABOVE_HOME else None
 
     def _place(self, arguments: Arguments, frame: int) -> Vector | None:
-        """Return the position named by a command; None if it names none."""
+        """Return the position contained in a command; None if there is none."""
         latitude, longitude, altitude = arguments[4:7]
         datum = self._datum(frame)
         if datum is None or not on_earth(latitude, longitude) or not math.isfinite(altitude):
@@ -437,7 +437,7 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _split(self, custom_mode: int) -> Arguments:
-        """Return a heartbeat's custom mode as the arguments of the command that sets it."""
+        """Return a heartbeat's custom mode as arguments of the command that sets the mode."""
 
     @abstractmethod
     def _change_mode(self, arguments: Arguments) -> int: ...
@@ -447,9 +447,9 @@ class Autopilot(ABC):
 
     @abstractmethod
     def _go_by(self, manoeuvre: str) -> int:
-        """Land or return, by the command that does not change the mode."""
+        """Handle the command that lands or returns without changing the mode."""
 
 
 def whole(argument: float) -> int:
-    """Return a command's argument as a whole number; 0 for NaN, which stands for "not given"."""
+    """Return a command's argument as a whole number; 0 for NaN, which means "not given"."""
     return round(argument) if math.isfinite(argument) else 0

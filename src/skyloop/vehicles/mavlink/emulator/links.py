@@ -1,4 +1,4 @@
-"""The emulated autopilot's settings and links: UDP to one peer, a TCP server for one client, and their messages."""
+"""The emulated autopilot's settings and links (UDP to one peer, a TCP server for one client) and their messages."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from skyloop.vehicles.emulation.datagrams import Address, ByteServer, DatagramPo
 from skyloop.vehicles.mavlink.wire.codec import Codec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
-APART: Final = 10  #: between the ports of two drones
+APART: Final = 10  #: difference between the port numbers of two drones
 
 
 class Kind(StrEnum):
-    """The emulated autopilot."""
+    """Kinds of emulated autopilot."""
 
     ARDUCOPTER = "arducopter"
     PX4 = "px4"
@@ -29,32 +29,32 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """Ports of one emulated autopilot."""
+    """The ports of one emulated autopilot."""
 
-    udp: int  #: the autopilot's own; sends to ``remote`` until a message arrives
-    remote: int  #: UDP, of the other end
-    tcp: int | None = None  #: TCP server for one client; None: it has none
+    udp: int  #: the autopilot's own UDP port, which sends to ``remote`` until a message arrives
+    remote: int  #: UDP port of the other end
+    tcp: int | None = None  #: port of the TCP server for one client; None if it has none
 
     @classmethod
     def standard(cls, kind: Kind, drone: int = 0) -> Ports:
-        """Return the ports of the autopilots' own simulations."""
+        """Return the ports that the autopilots' own simulations use."""
         if kind is Kind.PX4:
             return cls(udp=14580 + drone, remote=14540 + drone)
         return cls(udp=5763 + APART * drone, remote=14550 + APART * drone, tcp=5760 + APART * drone)
 
     @classmethod
     def counted(cls, kind: Kind, base: int | None, drone: int) -> Ports:
-        """Return ports counted from a base, 10 higher for each further drone.
+        """Return ports numbered from a base, which increases by 10 with each drone.
 
         The autopilot's own UDP port comes first, then the remote one, then TCP.
 
         Args:
             kind: The autopilot.
-            base: The first port; None: the standard ones; 0: any free ones.
-            drone: Its number.
+            base: The first port; None for the standard ones, 0 for any free ones.
+            drone: The drone's number.
 
         Raises:
-            UsageError: They don't fit below 65536.
+            UsageError: A port would be greater than 65535.
         """
         if base is None:
             return cls.standard(kind, drone)
@@ -67,15 +67,15 @@ class Ports:
 
     @classmethod
     def free(cls, kind: Kind) -> Ports:
-        """Return ports that are free now."""
+        """Return ports that are currently free."""
         return cls.several(kind, 0, 1)[0]
 
     @classmethod
     def several(cls, kind: Kind, base: int | None, drones: int) -> list[Ports]:
-        """Return distinct ports for several drones. See :meth:`counted`."""
+        """Return distinct ports for several drones; see :meth:`counted`."""
         if base != 0:
             return [cls.counted(kind, base, drone) for drone in range(drones)]
-        with ExitStack() as held:  # hold all of them open: the system soon hands out a closed port again
+        with ExitStack() as held:  # keep all of them open: the system soon reuses a closed port
             return [cls._held(kind, held) for _ in range(drones)]
 
     @classmethod
@@ -91,19 +91,19 @@ def _free(held: ExitStack, kind: socket.SocketKind) -> int:
 
 
 def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPORTS_HZ) -> SimOptions:
-    """Return options of a world for emulated autopilots: without cameras.
+    """Return the options for a world of emulated autopilots, which has no cameras.
 
     Args:
         options: Options of the world and its drones.
-        rate_hz: How often an autopilot flies and sends [1/s], by default as often as possible. A lower rate makes a
-            fleet cheaper; no message is sent more often.
+        rate_hz: Rate at which an autopilot runs [1/s], by default the highest possible. A lower rate makes a fleet
+            cheaper but also limits the rate of every message.
     """
     return replace(options or SimOptions(), rate_hz=rate_hz, cameras=())
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
 
     kind: Kind
     bind: str
@@ -118,15 +118,15 @@ class Settings:
     video: tuple[str, int] | None
 
     def carries(self, message: Message) -> bool:
-        """Return whether this version has the message: MAVLink 1 has no numbers above 255."""
+        """Return whether this protocol version has the message: MAVLink 1 has no message numbers above 255."""
         return self.version == 2 or message.id < 256
 
 
-MAX_INTERVAL_US: Final = 2**31 - 1  #: maximum of the field of ``MESSAGE_INTERVAL``
+MAX_INTERVAL_US: Final = 2**31 - 1  #: greatest value of the interval field in ``MESSAGE_INTERVAL``
 
 
 class Streams:
-    """The messages of one link. Times are the autopilot's [s]."""
+    """The message intervals on one link. Times are on the autopilot's clock [s]."""
 
     def __init__(self, rates: Mapping[int, float]) -> None:
         self._usual = dict(rates)
@@ -134,7 +134,7 @@ class Streams:
         self._due = dict.fromkeys(self._periods, 0.0)
 
     def reset(self) -> None:
-        """Start over: the autopilot and its clock were switched on again."""
+        """Reset everything, because the autopilot and its clock were restarted."""
         self._periods = {number: 1.0 / rate for number, rate in self._usual.items()}
         self._due = dict.fromkeys(self._periods, 0.0)
 
@@ -152,12 +152,12 @@ class Streams:
         self._due[number] = 0.0
 
     def interval_us(self, number: int) -> int:
-        """Return a message's interval; -1 if it is not sent."""
+        """Return a message's interval; -1 if the message is not sent."""
         period_s = self._periods.get(number)
         return -1 if period_s is None else round(period_s * 1e6)
 
     def due(self, time_s: float) -> list[int]:
-        """Return the messages to send now, each once however late it is."""
+        """Return the messages to send now, each only once, however late it is."""
         found = []
         for number, period_s in self._periods.items():
             due_s = self._due[number]
@@ -171,11 +171,11 @@ class Streams:
 OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
-PEER_NS: Final = nanoseconds(3.0)  #: another peer may replace one that is silent for this long
+PEER_NS: Final = nanoseconds(3.0)  #: a peer that has been silent for this long may be replaced by another
 
 
 class Port(Protocol):
-    """One link of the autopilot, with the message rates requested on it."""
+    """A link of the autopilot, with the message rates requested on it."""
 
     streams: Streams
 
@@ -189,7 +189,7 @@ def _codec(settings: Settings) -> Codec:
 
 
 class UdpPort:
-    """A UDP port: sends to the remote port until a message arrives, then to its sender."""
+    """A UDP port that sends to the remote port until a message arrives, then to that message's sender."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -209,7 +209,7 @@ class UdpPort:
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._port.port
 
     def send(self, message: Message) -> None:
@@ -233,7 +233,7 @@ class UdpPort:
 
 
 class TcpPort:
-    """A TCP server for one client at a time: the next one waits in the kernel, connected but without data."""
+    """A TCP server for one client at a time. The next one waits in the kernel's backlog, connected but without data."""
 
     def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
@@ -246,11 +246,11 @@ class TcpPort:
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def send(self, message: Message) -> None:
-        """Send a message to the client, if there is one."""
+        """Send a message to the client, if any."""
         if self._settings.carries(message):
             self._server.send(self._codec.encode(message, version=self._settings.version))
 

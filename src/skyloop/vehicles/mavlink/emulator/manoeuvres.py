@@ -1,6 +1,6 @@
-"""Set-points, their positions on Earth, and the manoeuvres of both autopilots: rise, return, follow, turn.
+"""Set-points, their positions on Earth, and both autopilots' manoeuvres: rise, return, follow, turn.
 
-Pure but for the vehicle.
+Pure except for the vehicle.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ def geodetic(place: Vector) -> tuple[int, int, int]:
 
 
 def place_of(latitude_deg: float, longitude_deg: float, up: float) -> Vector:
-    """Return east, north, up of a latitude and longitude, at a height above the origin [m]."""
+    """Return the east, north, up coordinates of a latitude and longitude at a height above the origin [m]."""
     return ORIGIN.position_of(latitude_deg, longitude_deg, ORIGIN.altitude_m + up)
 
 
 def on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Return whether the position exists; False for NaN."""
+    """Return whether the coordinates are valid; False for NaN."""
     return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
@@ -47,12 +47,12 @@ _YAW_RATE: Final = 0x800
 _NO_RATES: Final = 0x07
 _NO_THRUST: Final = 0x40
 _NO_ATTITUDE: Final = 0x80
-_UNIT_WITHIN: Final = 1e-3  #: tolerance of a unit quaternion
+_UNIT_WITHIN: Final = 1e-3  #: tolerance of a unit quaternion's norm
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A target of ``SET_POSITION_TARGET_LOCAL_NED`` or ``…_GLOBAL_INT``, in our axes. None: not requested."""
+    """A target from ``SET_POSITION_TARGET_LOCAL_NED`` or ``…_GLOBAL_INT``, in our axes; None means not requested."""
 
     place: Vector | None
     velocity: Vector | None = None
@@ -61,7 +61,7 @@ class Target:
     yaw_rate: float = 0.0
 
     def follow(self, flight: FlightControl, speeds: Speeds = USUAL, turn: float | None = None) -> None:
-        """Fly it, with ``turn`` [rad/s] as yaw rate if given. Called at every tick."""
+        """Fly to the target, with ``turn`` as the yaw rate [rad/s] if given. Called in every tick."""
         if turn is None:
             turn = self.yaw_rate if self.yaw is None else flight.yaw_rate_to(self.yaw)
         if self.velocity is not None and self.place is None:
@@ -75,7 +75,7 @@ class Target:
 
 
 def target_of(message: Message) -> Target:
-    """Return the target of ``SET_POSITION_TARGET_LOCAL_NED``, finite or not."""
+    """Return the target from ``SET_POSITION_TARGET_LOCAL_NED``, even if it is not finite."""
     mask, in_body = message.type_mask, message.coordinate_frame in (BODY, BODY_OFFSET)
     turn = flip if in_body else swap
     return Target(
@@ -88,9 +88,9 @@ def target_of(message: Message) -> Target:
 
 
 def global_target_of(message: Message, datum: float | None) -> Target | None:
-    """Return the target of ``SET_POSITION_TARGET_GLOBAL_INT``; None for an invalid position or frame.
+    """Return the target from ``SET_POSITION_TARGET_GLOBAL_INT``; None for an invalid position or frame.
 
-    ``datum``: height of its altitude 0 above our origin [m].
+    ``datum`` is the height above our origin of the frame's altitude 0 [m].
     """
     mask, place = message.type_mask, None
     if not mask & _POSITION:
@@ -108,12 +108,12 @@ def global_target_of(message: Message, datum: float | None) -> Target | None:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeTarget:
-    """A target of ``SET_ATTITUDE_TARGET``, in our axes and signs. Without an attitude: rates only."""
+    """A target from ``SET_ATTITUDE_TARGET``, in our axes and signs. Without an attitude, it consists of rates only."""
 
     attitude: Vector | None  #: roll, pitch, yaw
     yaw_rate: float
     thrust: float | None
-    unit: bool  #: whether the quaternion is a rotation
+    unit: bool  #: whether the quaternion has unit length
 
     def turn(self, flight: FlightControl) -> float:
         """Return the requested yaw rate [rad/s]."""
@@ -126,7 +126,7 @@ class AttitudeTarget:
 
 
 def attitude_target_of(message: Message) -> AttitudeTarget:
-    """Return the target of ``SET_ATTITUDE_TARGET``."""
+    """Return the target from ``SET_ATTITUDE_TARGET``."""
     mask = message.type_mask
     q = from_wire(message.q)
     roll, pitch, yaw = angles_of(q)
@@ -138,7 +138,7 @@ def attitude_target_of(message: Message) -> AttitudeTarget:
     )
 
 
-_THERE_M: Final = 0.3  #: a waypoint of a return counts as reached within this
+_THERE_M: Final = 0.3  #: a return's waypoint closer than this counts as reached
 
 
 class _Leg(Enum):
@@ -160,11 +160,11 @@ class _Return:
 
 
 class Turn:
-    """Turns by an angle from the present heading.
+    """A turn by an angle from the present heading.
 
     Args:
         flight: The flight to turn.
-        angle: Counter-clockwise [rad]; may be more than half a turn.
+        angle: Angle, positive counter-clockwise [rad]; may be more than half a turn.
         fastest: Maximum yaw rate [rad/s].
     """
 
@@ -173,7 +173,7 @@ class Turn:
         self._left, self._yaw = angle, flight.yaw
 
     def rate(self) -> float:
-        """Return the yaw rate now [rad/s]. Called at every tick."""
+        """Return the present yaw rate [rad/s]. Called in every tick."""
         self._left -= wrap_angle(self._flyer.yaw - self._yaw)
         self._yaw = self._flyer.yaw
         return clamped(YAW_GAIN_PER_S * self._left, self._fastest)
@@ -188,11 +188,11 @@ class Manoeuvres:
         self._return: _Return | None = None
 
     def begin_rise(self, height_m: float) -> None:
-        """Start to rise to a height."""
+        """Start rising to a height."""
         self._rise_m = height_m
 
     def rise(self) -> bool:
-        """Take off and climb. Return whether the height is reached. Called at every tick."""
+        """Take off and climb; return whether the height has been reached. Called in every tick."""
         flight = self._flyer
         if self._rise_m is None:
             return True
@@ -204,18 +204,18 @@ class Manoeuvres:
         return up >= self._rise_m - 0.1
 
     def begin_return(self, home: Vector, height_m: float, *, wait_s: float = 0.0, final_m: float | None = None) -> None:
-        """Start to return: climb, fly home at that height, wait there, and land.
+        """Start returning: climb, fly home at that height, wait there, and land.
 
         Args:
             home: East, north, up from the origin [m].
-            height_m: Height of the way, limited to what it can reach.
+            height_m: Height to fly home at, limited to what the vehicle can reach.
             wait_s: Time to wait above home.
-            final_m: Height to descend to instead of landing; None: land.
+            final_m: Height to descend to instead of landing; None to land.
         """
         self._return = _Return(self._flyer.place, home, min(height_m, self._flyer.highest_m), wait_s, final_m)
 
     def return_home(self, speeds: Speeds = USUAL) -> None:
-        """Continue the return. Called at every tick."""
+        """Continue the return. Called in every tick."""
         flight, way = self._flyer, self._return
         if way is None or flight.standing:
             return
@@ -244,7 +244,7 @@ class Manoeuvres:
         speeds: Speeds = USUAL,
         turn: float | None = None,
     ) -> None:
-        """Follow a set-point, or hold the position without one; ``lean`` flies an attitude. Called at every tick."""
+        """Follow a set-point, or hold position if there is none; ``lean`` flies an attitude. Called in every tick."""
         if isinstance(target, Target):
             target.follow(self._flyer, speeds, turn)
         elif target is not None:

@@ -1,4 +1,4 @@
-"""PX4's behaviour, as observed on 1.17-alpha. ``docs/mavlink.md`` has it as a table."""
+"""PX4's behaviour as observed with 1.17-alpha and listed in ``docs/mavlink.md``."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from skyloop.vehicles.mavlink.wire.modes import PX4_MODES, px4_custom
 from skyloop.vehicles.mavlink.wire.modes import Autopilot as Number
 
-SINK_IN_POSCTL_M_S: Final = -0.7  #: without a remote control
-STICK_SPEED_M_S: Final = 10.0  #: at full stick (MPC_VEL_MANUAL)
-STICK_EXPO: Final = 0.6  #: how much flatter a stick is around its centre (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
-STICK_FILTER_S: Final = 0.1  #: filter of a stick's speed
-LIFTS_OFF_AT: Final = 0.2  #: share of the throttle stick's way up
+SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate if there is no remote control
+STICK_SPEED_M_S: Final = 10.0  #: speed at full stick (MPC_VEL_MANUAL)
+STICK_EXPO: Final = 0.6  #: how much a stick's response is flattened near its centre (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
+STICK_FILTER_S: Final = 0.1  #: time constant of the filter for a stick's speed
+LIFTS_OFF_AT: Final = 0.2  #: throttle at which it lifts off, as a fraction of the stick's travel upwards
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 _WORDS: Final = {
     "armed": "Armed by external command",
@@ -57,7 +57,7 @@ class Px4(Autopilot):
     """An emulated PX4."""
 
     AUTOPILOT = Number.PX4
-    CAPABILITIES = 0xE8FF & ~0xC025  # files, missions, fences and rally points are not emulated
+    CAPABILITIES = 0xE8FF & ~0xC025  # without files, missions, fences and rally points, which are not emulated
     VERSION = 1 << 24 | 17 << 16
     RATES: ClassVar[dict[int, float]] = {
         m.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
@@ -91,17 +91,17 @@ class Px4(Autopilot):
         super().__init__(vehicle, system, boot_s, gps)
         self.parameters = ParameterTable(services.PX4, bytewise=True)
         self.mode = "AUTO.LOITER"
-        self._intended = self.mode  # the mode that the user chose; failsafes keep it
-        self._before = self.mode  # the mode before a manoeuvre
-        self._waiting_at: Target | None = None  # where HOLD should be
+        self._intended = self.mode  # the mode that the user chose, which failsafes don't change
+        self._before = self.mode  # the mode in use before a manoeuvre
+        self._waiting_at: Target | None = None  # the position where HOLD is to wait
         self._speeds = USUAL
         self._target: Target | AttitudeTarget | None = None
         self._target_s = -math.inf
         self._lost_gcs = False
-        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up, turning left; 1 at full stick
-        self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # [1/s], filtered
+        self._stick = (0.0, 0.0, 0.0, 0.0)  # forward, left, up and left turn, each 1 at full stick
+        self._stick_moves = (0.0, 0.0, 0.0, 0.0)  # filtered speed of each stick [1/s]
         self._stick_s = -math.inf
-        self._lost_stick_s: float | None = None  # when a remote control in use went silent
+        self._lost_stick_s: float | None = None  # when the remote control in use went silent
 
     @property
     def custom_mode(self) -> int:
@@ -110,7 +110,7 @@ class Px4(Autopilot):
 
     @property
     def mode_allows_arming(self) -> bool:
-        """Whether it can be armed in its mode."""
+        """Whether it can be armed in its present mode."""
         return self.mode != "OFFBOARD" or self._fresh
 
     def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
@@ -121,14 +121,14 @@ class Px4(Autopilot):
 
     @property
     def _fresh(self) -> bool:
-        """Return whether set-points arrive."""
+        """Return whether set-points are arriving."""
         return self.time_s - self._target_s <= self.parameters["COM_OF_LOSS_T"]
 
     # Modes -----------------------------------------------------------------------------------------------------
 
     @property
     def remote(self) -> bool:
-        """Whether it receives a remote control; a ground station's joystick counts."""
+        """Whether it receives a remote control, which may be a ground station's joystick."""
         return self.time_s - self._stick_s <= self.parameters["COM_RC_LOSS_T"]
 
     def _fly(self) -> None:
@@ -158,12 +158,12 @@ class Px4(Autopilot):
             self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
         elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost:
-            self.failsafe = False  # recovered: the user had chosen it
+            self.failsafe = False  # recovered, because the user had chosen this mode
             self._enter("OFFBOARD")
 
     @property
     def _lost(self) -> bool:
-        """Return whether a ground station or remote control has gone silent: OFFBOARD then does not come back."""
+        """Return whether a ground station or remote control has gone silent, which prevents a return to OFFBOARD."""
         return self._lost_gcs or self._lost_stick_s is not None
 
     def _fly_offboard(self) -> None:
@@ -182,7 +182,7 @@ class Px4(Autopilot):
         self.flight.lean_by_thrust(roll, pitch, thrust, target.turn(self.flight))
 
     def _enter(self, mode: str) -> None:
-        """Change the mode. Only the next heartbeat reports it."""
+        """Change the mode. The next heartbeat reports the change."""
         if mode != self.mode:
             self._before, self.mode = self.mode, mode
             self._waiting_at, self._speeds = None, USUAL
@@ -190,7 +190,7 @@ class Px4(Autopilot):
                 self._begin_return()
 
     def _begin_return(self) -> None:
-        """Return at RTL_RETURN_ALT, or within a cone over home; never below the present height."""
+        """Start to return at RTL_RETURN_ALT, or lower within a cone above home, but never below the present height."""
         east, north, up = self.flight.place
         above, distance = up - self.home[2], math.hypot(east - self.home[0], north - self.home[1])
         highest, near = self.parameters["RTL_RETURN_ALT"], self.parameters["NAV_ACC_RAD"]
@@ -214,7 +214,7 @@ class Px4(Autopilot):
         return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24 & 0xFF)
 
     def _change_mode(self, arguments: Arguments) -> int:
-        """Change the mode. Accepted even if it has no effect."""
+        """Change the mode. The command is accepted even if it has no effect."""
         main, sub = whole(arguments[1]), whole(arguments[2]) if len(arguments) > 2 else 0
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if mode is None or mode == "AUTO.READY":
@@ -252,7 +252,7 @@ class Px4(Autopilot):
         return TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
-        """Take off, armed or not, on the ground or flying."""
+        """Take off, whether or not the vehicle is armed, and on the ground or in the air."""
         amsl = arguments[6]
         above = self.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
         height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
@@ -289,7 +289,7 @@ class Px4(Autopilot):
     # Places and speeds by command ------------------------------------------------------------------------------
 
     def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
-        """HOLD at another position. While disarmed, it only changes the mode."""
+        """Enter HOLD at another position. While disarmed, this changes only the mode."""
         if whole(arguments[1]) != 1:
             return UNSUPPORTED
         fresh = self.mode != "AUTO.LOITER"
@@ -327,7 +327,7 @@ class Px4(Autopilot):
         return ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
-        """Change the speed. Accepted even if it has no effect."""
+        """Change the speed. The command is accepted even if it has no effect."""
         self._speeds = Speeds(across=arguments[1]) if 0 < arguments[1] < math.inf else USUAL
         return ACCEPTED
 
@@ -341,17 +341,17 @@ class Px4(Autopilot):
     # A remote control over MAVLink --------------------------------------------------------------------------------
 
     def _sticks(self, message: Message) -> None:
-        """Read a ground station's joystick. Overrides of a receiver's channels have no effect: none is mapped."""
+        """Read a ground station's joystick. Channel overrides have no effect because no channels are mapped."""
         if message.get_type() != "MANUAL_CONTROL" or message.target not in (0, self.system):
             return
         throttle = 2 * message.z - 1000
         ways = (message.x, -message.y, throttle, -message.r)
-        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # beyond: no such axis
+        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # beyond: no axis
         stick = (forward, left, up, turn)
         since_s = self.time_s - self._stick_s
         if not self.remote:
             self._stick_moves = (0.0, 0.0, 0.0, 0.0)
-        elif since_s == 0.0:  # two in one step: the next one shows how far it moved
+        elif since_s == 0.0:  # two in one step: wait for the next one to see how far the stick moved
             return
         else:
             share = since_s / (since_s + STICK_FILTER_S)
@@ -363,7 +363,7 @@ class Px4(Autopilot):
             self._take_over()
 
     def _take_over(self) -> None:
-        """Enter position mode for the pilot, unless the present mode ignores sticks."""
+        """Give the pilot control in position mode, unless the present mode ignores the sticks."""
         mode_bit = 2 if self.mode == "OFFBOARD" else 1
         if self.mode not in _STICKS and round(self.parameters["COM_RC_OVERRIDE"]) & mode_bit:
             self._set_mode("POSCTL")
@@ -380,9 +380,9 @@ class Px4(Autopilot):
         self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
 
     def _check_sticks(self) -> None:
-        """Hold, then return, in any mode, once a remote control that was in use has gone silent."""
+        """In any mode, hold and then return once a remote control that was in use has gone silent."""
         if self.remote:
-            if self._lost_stick_s is not None:  # back before the return began
+            if self._lost_stick_s is not None:  # the remote control came back before the return began
                 self.failsafe, self._lost_stick_s = False, None
                 self._enter(self._intended)
             return

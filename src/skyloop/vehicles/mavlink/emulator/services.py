@@ -1,4 +1,4 @@
-"""The emulated autopilots' parameters, and answers to requests for missions, files and logs. Pure.
+"""The emulated autopilots' parameters, and replies to requests for missions, files and logs. Pure.
 
 An ArduCopter stores a mission but does not fly it.
 """
@@ -19,18 +19,18 @@ MISSION_ERROR: Final = 1
 MISSION_UNSUPPORTED: Final = 3
 MISSION_NO_SPACE: Final = 4
 MISSION_INVALID_SEQUENCE: Final = 13
-MOST_ITEMS: Final = 500  #: of a mission
-_SCALE: Final = 1e7  #: of latitude and longitude in MISSION_ITEM_INT
+MOST_ITEMS: Final = 500  #: maximum number of items in a mission
+_SCALE: Final = 1e7  #: scale of latitude and longitude in MISSION_ITEM_INT
 _HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
 MISSION_INVALID_X: Final = 10
 MISSION_INVALID_Y: Final = 11
 MISSION_INVALID_Z: Final = 12
 
-# The file protocol's requests and answers.
+# The file protocol's requests and replies.
 _END_SESSION: Final = 1
 _END_SESSIONS: Final = 2
-_NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: list, open, create, remove, ...: requests with a file name
-_IN_SESSION: Final = (5, 7, 15)  #: read, write, read in a burst; nothing was opened
+_NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: requests with a file name: list, open, create, remove, ...
+_IN_SESSION: Final = (5, 7, 15)  #: requests on an open file (no file is ever open here): read, write, read in a burst
 _LIST: Final = 3
 _ACK: Final = 128
 _NAK: Final = 129
@@ -48,13 +48,13 @@ _PAYLOAD: Final = 251
 
 
 def mission_ack(message: Message, result: int) -> Message:
-    """Return a ``MISSION_ACK`` to the sender of a message."""
+    """Return a ``MISSION_ACK`` addressed to a message's sender."""
     kind = getattr(message, "mission_type", 0)
     return m.MAVLink_mission_ack_message(message.get_srcSystem(), message.get_srcComponent(), result, kind)
 
 
 class Mission:
-    """A mission as ArduCopter stores it: item 0 is always home, even after an upload.
+    """A mission stored as in ArduCopter: item 0 is always home, even after an upload.
 
     Attributes:
         current: The number of the next item to fly.
@@ -62,12 +62,12 @@ class Mission:
 
     def __init__(self) -> None:
         self.current = 0
-        self._items: list[Message] = []  # from number 1 on
+        self._items: list[Message] = []  # items from number 1 onwards
         self._coming: list[Message] = []
-        self._wanted = 0  # item awaited in an upload; 0: no upload
+        self._wanted = 0  # number of the item awaited in an upload; 0 if there is no upload
 
     def answers(self, message: Message, home: tuple[int, int, int]) -> list[Message] | None:
-        """Return the answers to a message; None if it is not about a mission."""
+        """Return the replies to a message; None if it is not about a mission."""
         kind = message.get_type()
         if getattr(message, "mission_type", 0) != 0:
             return None
@@ -125,12 +125,12 @@ class Mission:
 
 
 def answers(message: Message) -> Iterable[Message]:
-    """Yield the answers to a message; none if it is not such a request."""
+    """Yield the replies to a message; none if it is not a request handled here."""
     kind = message.get_type()
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "MISSION_REQUEST_LIST":
         yield m.MAVLink_mission_count_message(*sender, 0, message.mission_type)
-    elif kind == "MISSION_COUNT":  # an upload; an empty one clears nothing
+    elif kind == "MISSION_COUNT":  # an upload; an empty one does not clear anything
         yield mission_ack(message, MISSION_UNSUPPORTED if message.count else MISSION_ACCEPTED)
     elif kind == "MISSION_CLEAR_ALL":
         yield mission_ack(message, MISSION_ACCEPTED)
@@ -164,12 +164,12 @@ def _error(opcode: int) -> int:
     return _INVALID_SESSION if opcode in _IN_SESSION else _UNKNOWN_COMMAND
 
 
-AT_ONCE: Final = 16  #: list parameters sent with each report
+AT_ONCE: Final = 16  #: number of listed parameters sent with each report
 INT8: Final = 2
 INT16: Final = 4
 INT32: Final = 6
 
-#: Name: value and MAV_PARAM_TYPE. The defaults of ArduCopter 4.7-dev.
+#: Default value and MAV_PARAM_TYPE of each parameter in ArduCopter 4.7-dev.
 ARDUCOPTER: Final[dict[str, tuple[float, int]]] = {
     "ANGLE_MAX": (3000, INT16),
     "ARMING_CHECK": (1, INT32),
@@ -204,7 +204,7 @@ ARDUCOPTER: Final[dict[str, tuple[float, int]]] = {
     "WPNAV_SPEED_DN": (150.0, REAL32),
     "WPNAV_SPEED_UP": (250.0, REAL32),
 }
-#: The defaults of PX4 1.17.
+#: Default value and MAV_PARAM_TYPE of each parameter in PX4 1.17.
 PX4: Final[dict[str, tuple[float, int]]] = {
     "COM_DISARM_LAND": (2.0, REAL32),
     "COM_DISARM_PRFLT": (10.0, REAL32),
@@ -240,7 +240,7 @@ PX4: Final[dict[str, tuple[float, int]]] = {
 
 
 class ParameterTable:
-    """The values, and the lists being sent."""
+    """The parameters' values, and the lists being sent."""
 
     def __init__(self, standard: Mapping[str, tuple[float, int]], *, bytewise: bool) -> None:
         self._kinds = {name: kind for name, (_, kind) in standard.items()}
@@ -258,7 +258,7 @@ class ParameterTable:
         self._values[name] = value
 
     def on_message(self, port: Port, message: Message) -> Iterable[Message]:
-        """Handle a parameter message; yield the immediate answers."""
+        """Handle a parameter message; yield the immediate replies."""
         kind = message.get_type()
         if kind == "PARAM_REQUEST_LIST":
             self._lists[port] = deque(range(len(self._names)))
@@ -272,7 +272,7 @@ class ParameterTable:
             yield self._value(message.param_id)
 
     def pending(self, port: Port) -> list[Message]:
-        """Return the part of a list that is due now."""
+        """Return the part of a list that is to be sent now."""
         waiting = self._lists.get(port)
         if not waiting:
             return []

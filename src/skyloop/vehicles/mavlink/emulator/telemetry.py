@@ -1,4 +1,4 @@
-"""Convert the simulation's reports to MAVLink messages, by message number. Pure."""
+"""MAVLink messages made from the simulation's reports, by message number. Pure."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ PREARM: Final = 0x10000000
 REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
-#: Estimator flags for a known position: relative and absolute, now and predicted in the air. DroneKit waits for the
-#: last.
+#: Estimator flags for a known position: relative and absolute, now and predicted for the air. DroneKit waits for the
+#: last one.
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
 _LANDED: Final = {
     FlightState.LANDED: Landed.ON_GROUND,
@@ -33,7 +33,7 @@ _LANDED: Final = {
 
 
 class AutopilotState(Protocol):
-    """The state behind the messages; see :class:`skyloop.vehicles.mavlink.emulator.autopilot.Autopilot`."""
+    """The state from which messages are made; see :class:`skyloop.vehicles.mavlink.emulator.autopilot.Autopilot`."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
     REPORTS_PREARM: ClassVar[bool]
@@ -136,7 +136,7 @@ def _ekf(a: AutopilotState) -> Message:
 
 
 def _estimator(a: AutopilotState) -> Message:
-    """Report the estimator. At rest it assumes a constant position (0x80), which still counts as known."""
+    """Report the estimator's state. At rest it assumes a constant position (0x80), which still counts as known."""
     flags = 0x1 | 0x2 | 0x4 | 0x20 | (_PLACED if a.settled else 0x80)
     flags |= 0x80 if a.flight.standing else 0
     return m.MAVLink_estimator_status_message(a.boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)

@@ -1,4 +1,4 @@
-"""MAVLink parts shared by the driver and the emulated autopilot: frames, modes, axes, parameter values, texts.
+"""MAVLink code shared by the driver and the emulated autopilot: frames, modes, axes, parameter values and texts.
 
-Messages come from pymavlink, which only :mod:`skyloop.vehicles.mavlink.wire.codec` imports.
+Messages are pymavlink's, which only :mod:`skyloop.vehicles.mavlink.wire.codec` imports.
 """

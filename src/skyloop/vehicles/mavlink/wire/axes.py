@@ -1,10 +1,10 @@
 """Conversions between MAVLink's axes and ours. Pure.
 
-World: MAVLink has north, east, down; we have east, north, up. Body: MAVLink has forward, right, down; we have forward,
-left, up. Yaw: MAVLink counts clockwise from north; we count counter-clockwise from east. Quaternions: w, x, y, z in
-messages; x, y, z, w in all code.
+World axes: MAVLink uses north, east, down; we use east, north, up. Body axes: MAVLink uses forward, right, down; we use
+forward, left, up. Yaw: MAVLink measures clockwise from north; we measure counter-clockwise from east. Quaternions are
+w, x, y, z in messages and x, y, z, w everywhere in the code.
 
-``flip`` and ``swap`` are their own inverses, and so is :func:`yaw_between`. :class:`WorldAxes` moves the origin.
+:func:`flip`, :func:`swap` and :func:`yaw_between` are their own inverses. :class:`WorldAxes` moves the origin.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ _HALF = math.sqrt(0.5)
 
 
 def flip(x: float, y: float, z: float) -> Vector:
-    """Convert body axes, either way."""
+    """Convert between our body axes and MAVLink's, in either direction."""
     return x, 0.0 - y, 0.0 - z
 
 
 def swap(x: float, y: float, z: float) -> Vector:
-    """Convert world axes, either way."""
+    """Convert between our world axes and MAVLink's, in either direction."""
     return y, x, 0.0 - z
 
 
 def yaw_between(yaw: float) -> float:
-    """Convert a heading, either way."""
+    """Convert between our heading and MAVLink's, in either direction."""
     return wrap_angle(math.pi / 2 - yaw)
 
 
 def to_wire(q: Quaternion) -> list[float]:
-    """Return a quaternion (x, y, z, w) as a message's field ``q``: w, x, y, z."""
+    """Convert a quaternion (x, y, z, w) to a message's field ``q`` (w, x, y, z)."""
     x, y, z, w = q
     return [w, x, y, z]
 
 
 def from_wire(q: Sequence[float]) -> Quaternion:
-    """Return a message's field ``q`` (w, x, y, z) as x, y, z, w."""
+    """Convert a message's field ``q`` (w, x, y, z) to x, y, z, w."""
     w, x, y, z = q
     return x, y, z, w
 
@@ -58,7 +58,7 @@ def turned_axes(q: Sequence[float]) -> Quaternion:
 
 
 def angles_of(q: Quaternion) -> Vector:
-    """Return roll, pitch and yaw of a unit quaternion (x, y, z, w)."""
+    """Return the roll, pitch and yaw of a unit quaternion (x, y, z, w)."""
     x, y, z, w = q
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
@@ -67,32 +67,32 @@ def angles_of(q: Quaternion) -> Vector:
     )
 
 
-ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: message with the origin of the autopilot's axes
-ORIGIN_HZ: Final = 1.0  #: requested rate
+ORIGIN: Final = "GPS_GLOBAL_ORIGIN"  #: the message with the origin of the autopilot's axes
+ORIGIN_HZ: Final = 1.0  #: rate at which that message is requested
 _POSITIONS: Final = ("SET_POSITION_TARGET_LOCAL_NED", "ODOMETRY", "VISION_POSITION_ESTIMATE")
 
 
 class WorldAxes:
     """Moves positions in messages between the world's axes and the autopilot's, which are parallel.
 
-    For an autopilot whose axes begin at its first fix: ArduPilot refuses another origin while it flies by GPS, so
-    several vehicles would each have their own.
+    Needed for autopilots whose axes have their origin at the first fix. ArduPilot refuses another origin while it uses
+    GPS, so several vehicles would each have their own.
 
     Args:
-        begin: Origin of the world's axes: latitude and longitude [°] and altitude [m]; None: the autopilot's own.
+        begin: Origin of the world's axes: latitude and longitude [°] and altitude [m]; None for the autopilot's own.
     """
 
     def __init__(self, begin: tuple[float, float, float] | None) -> None:
         self.begin = begin
-        self._shift: Vector | None = None if begin is not None else (0.0, 0.0, 0.0)  # origin offset: north, east, down
+        self._shift: Vector | None = None if begin is not None else (0.0, 0.0, 0.0)  # origin's offset north, east, down
 
     def forget(self) -> None:
-        """Forget the autopilot's origin: it may have rebooted."""
+        """Forget the autopilot's origin, because the autopilot may have rebooted."""
         if self.begin is not None:
             self._shift = None
 
     def received(self, message: Message, radius_m: float) -> bool:
-        """Move the vehicle's local position into the world's axes; return whether the message can be used."""
+        """Convert the vehicle's local position to the world's axes; return whether the message can be used."""
         if self.begin is None:
             return True
         kind = message.get_type()
@@ -103,7 +103,7 @@ class WorldAxes:
         return kind != "LOCAL_POSITION_NED" or self._move(message, 1.0)
 
     def sent(self, message: Message) -> bool:
-        """Move a position for the vehicle into its own axes; return whether to send the message."""
+        """Convert a position for the vehicle to its own axes; return whether to send the message."""
         if self.begin is None or message.get_type() not in _POSITIONS:
             return True
         if getattr(message, "coordinate_frame", m.MAV_FRAME_LOCAL_NED) != m.MAV_FRAME_LOCAL_NED:

@@ -1,8 +1,8 @@
-"""MAVLink 1 and 2 frames with pymavlink: bytes to messages and back, with the texts and parameters inside.
+"""Encoding and decoding of MAVLink 1 and 2 frames with pymavlink, and of the texts and parameters in them.
 
-Pure except for the wall clock in signatures. The float field of ``PARAM_VALUE`` and ``PARAM_SET`` holds an integer in
-one of two ways: ArduPilot converts it to a float; PX4 stores its bytes. ``AUTOPILOT_VERSION.capabilities`` says which
-(``PARAM_ENCODE_BYTEWISE``).
+Pure except for the wall clock in signatures. The float field in ``PARAM_VALUE`` and ``PARAM_SET`` can hold an integer
+in two ways: ArduPilot converts it to a float; PX4 stores its bytes. ``PARAM_ENCODE_BYTEWISE`` in
+``AUTOPILOT_VERSION.capabilities`` says which.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ __all__ = ["KEY_BYTES", "MAX_FRAME", "Codec", "Message", "dialect"]
 #: A pymavlink message; its fields are attributes.
 Message: TypeAlias = Any
 
-MAX_FRAME: Final = 280  #: bytes of the longest frame, signature included
+MAX_FRAME: Final = 280  #: size of the longest frame in bytes, including the signature
 KEY_BYTES: Final = 32
-_AROUND_V1: Final = 8  #: bytes of a frame's header and checksum
-_AROUND_V2: Final = 12  #: the same of MAVLink 2
-_SIGNATURE: Final = 13  #: bytes
+_AROUND_V1: Final = 8  #: bytes in a MAVLink 1 frame's header and checksum
+_AROUND_V2: Final = 12  #: bytes in a MAVLink 2 frame's header and checksum
+_SIGNATURE: Final = 13  #: bytes in a signature
 _LEAST: Final = _AROUND_V1
 _MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
-_MOST_SOURCES: Final = 16  #: senders whose cut frames are kept: anybody can send datagrams
-_SIGNED: Final = 1  #: one of the flags that a receiver must understand
-_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, when signature time begins, in steps of 10 µs
+_MOST_SOURCES: Final = 16  #: maximum number of senders whose incomplete frames are kept, as anybody can send datagrams
+_SIGNED: Final = 1  #: the flag, among those that a receiver must understand, that marks a signed frame
+_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, from which signature time counts in steps of 10 µs
 _STEPS_PER_S: Final = 100_000
-_OLD: Final = 60 * _STEPS_PER_S  #: how far behind a new sender's time may be
-_UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: sent by radios, which have no key
+_OLD: Final = 60 * _STEPS_PER_S  #: how far a new sender's time may be behind
+_UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: accepted without a signature: radios have no key
 _HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, sequence number, system, component, type
-_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, the same; the type has three bytes
+_HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, then as above, with a three-byte type
 
 
 class _Kind(NamedTuple):
-    """A message type with numeric fields only, and how to build it from a payload.
+    """A message type with only numeric fields, and how to create such a message from a payload.
 
     pymavlink's own decoder takes three times as long, mostly because it sorts the fields and makes room for strings and
     arrays in every message.
@@ -54,15 +54,15 @@ class _Kind(NamedTuple):
 
     make: type[Message]
     common: dict[str, Any]  #: attributes shared by all messages of the type
-    fields: list[str]  #: in payload order
-    size: int  #: of the whole payload; trailing zeros are not sent
+    fields: list[str]  #: field names in payload order
+    size: int  #: size of the complete payload, although trailing zeros are not sent
     unpack: Callable[[bytes], tuple[Any, ...]]
-    seed: bytes  #: what the checksum covers besides the frame
+    seed: bytes  #: additional bytes that the checksum covers
 
 
-@lru_cache(maxsize=512)  # bounded: anybody may send invalid message numbers
+@lru_cache(maxsize=512)  # bounded, because anybody can send invalid message numbers
 def _kind_of(number: int) -> _Kind | None:
-    """Return how to build a message type; None if it is unknown or has strings or arrays."""
+    """Return how to create messages of a type; None if the type is unknown or has strings or arrays."""
     made: Any = dialect.mavlink_map.get(number)
     if made is None or any(made.array_lengths) or set(made.lengths) != {1}:
         return None
@@ -72,7 +72,7 @@ def _kind_of(number: int) -> _Kind | None:
 
 
 def _decode_plain(data: bytes) -> Message | None:
-    """Return the message of one whole unsigned frame; None: leave it to pymavlink to decode or reject.
+    """Return the message in a single complete unsigned frame; None if pymavlink must decode or reject the data.
 
     The result equals pymavlink's, attribute by attribute.
     """
@@ -102,7 +102,7 @@ def _decode_plain(data: bytes) -> Message | None:
 
 
 def _length_of(data: bytes) -> int | None:
-    """Return the length of the frame that starts here; None if there is none, or too little of it."""
+    """Return the length of the frame with which the data starts; None if there is none or too few bytes to tell."""
     if len(data) < _LEAST or data[0] not in _MARKERS:
         return None
     if data[0] == dialect.PROTOCOL_MARKER_V1:
@@ -111,7 +111,7 @@ def _length_of(data: bytes) -> int | None:
 
 
 def _begins_with_a_frame(data: bytes) -> bool:
-    """Return whether the data starts with a whole, known frame with a valid checksum."""
+    """Return whether the data starts with a complete frame of a known type with a valid checksum."""
     length = _length_of(data)
     if length is None or len(data) < length:
         return False
@@ -126,20 +126,20 @@ def _begins_with_a_frame(data: bytes) -> bool:
 
 
 class _Signatures:
-    """The time and senders of one link's MAVLink 2 signatures. The time only increases."""
+    """The state of one link's MAVLink 2 signatures: the time, which only increases, and the senders."""
 
     def __init__(self, key: bytes) -> None:
         self._key = key
         self._newest = 0  # newest time sent or accepted
-        self._streams: dict[tuple[int, int, int], int] = {}  # newest time accepted by link, system and component
+        self._streams: dict[tuple[int, int, int], int] = {}  # newest accepted time for each link, system and component
 
     def now(self) -> int:
-        """Return the next signature's time: this host's or, if later, just after the newest time so far."""
+        """Return the next signature's time: this host's time or, if that is later, one step after the newest so far."""
         self._newest = max(self._newest + 1, int((time.time() - _SIGNING_EPOCH_S) * _STEPS_PER_S))
         return self._newest
 
     def check(self, frame: bytearray, system: int, component: int) -> bool:
-        """Return whether to accept a signed frame; one signed without the key changes nothing, whatever it claims."""
+        """Return whether to accept a signed frame. A frame signed without the key has no effect on the state."""
         signature = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
         if not hmac.compare_digest(signature, bytes(frame[-6:])):
             return False
@@ -153,28 +153,28 @@ class _Signatures:
 
 
 class Codec:
-    """One end of a link: its sequence numbers, unfinished frames and signatures.
+    """One end of a link, with its sequence numbers, incomplete frames and signatures.
 
-    ``key``: 32 bytes; with a key, everything sent is signed and everything unsigned is rejected (MAVLink 2 only).
+    With a 32-byte ``key``, everything sent is signed and everything unsigned is rejected (MAVLink 2 only).
     """
 
     def __init__(self, system: int, component: int, *, key: bytes | None = None) -> None:
         if key is not None and len(key) != KEY_BYTES:
             raise UsageError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
-        self.frames = 0  #: whole frames received
-        self.damaged = 0  #: damaged frames, and pieces that are no frame
-        self.unknown = 0  #: frames of unknown types
-        self.signed = 0  #: signed frames rejected for lack of a key
+        self.frames = 0  #: number of complete frames received
+        self.damaged = 0  #: number of damaged frames, and of pieces that are not frames
+        self.unknown = 0  #: number of frames of unknown types
+        self.signed = 0  #: number of signed frames rejected because we have no key
         self._key = key
         self._signatures = None if key is None else _Signatures(key)
-        self._rests: dict[Hashable, bytes] = {}  # incomplete frames by sender of datagrams
+        self._rests: dict[Hashable, bytes] = {}  # incomplete frame from each sender of datagrams
         self._sender = dialect.MAVLink(None, srcSystem=system, srcComponent=component)
         self._receiver = self._fresh()
         if key is not None:
             self._sender.signing.secret_key, self._sender.signing.sign_outgoing = key, True
 
     def encode(self, message: Message, *, version: int = 2) -> bytes:
-        """Return a numbered frame. Raises ``struct.error`` for a field that does not fit."""
+        """Return a frame with the next sequence number; raise ``struct.error`` if a value does not fit its field."""
         old = version == 1 and self._key is None
         if self._signatures is not None:
             self._sender.signing.timestamp = self._signatures.now()
@@ -185,17 +185,17 @@ class Codec:
     def decode(self, data: bytes, *, whole: bool = False, source: Hashable = None) -> list[Message]:
         """Return the messages that these bytes complete. Never raises, whatever the input.
 
-        ``whole``: a datagram from ``source``. A frame may continue in the sender's next datagram: some bridges cut a
-        serial line's bytes anywhere.
+        ``whole`` means that they are one datagram from ``source``. A frame may continue in the sender's next datagram,
+        because some bridges divide a serial line's bytes anywhere.
         """
         if not whole:
             return self._parsed(data)
         rest = self._rests.pop(source, b"")
-        if _length_of(data) == len(data):  # nearly every datagram: needs no search for frame boundaries
+        if _length_of(data) == len(data):  # true for nearly every datagram, which saves searching for frame boundaries
             self.damaged += bool(rest)
             return self._decoded(data)
         if rest and _begins_with_a_frame(data):
-            rest = b""  # the end of that frame was lost
+            rest = b""  # the rest of that frame was lost
             self.damaged += 1
         self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         found = self._parsed(rest + data)
@@ -222,7 +222,7 @@ class Codec:
         except dialect.MAVError:
             self.damaged += 1
             return []
-        except Exception:  # noqa: BLE001  noise in a field broke the parser: restart with the next bytes
+        except Exception:  # noqa: BLE001  noise in a field broke the parser: continue with the next bytes
             self._receiver = self._fresh()
             self.damaged += 1
             return []
@@ -252,12 +252,12 @@ class Codec:
         return receiver
 
 
-CHUNK: Final = 50  #: characters of a STATUSTEXT
-_MOST_OPEN: Final = 8  #: unfinished texts; beyond that the oldest is returned incomplete
+CHUNK: Final = 50  #: number of characters in one STATUSTEXT
+_MOST_OPEN: Final = 8  #: maximum number of unfinished texts; beyond that, the oldest is returned incomplete
 
 
 def chunks_of(text: str, severity: int, number: int) -> list[Message]:
-    """Split one text into messages. ``number``: the text's id; 0 for one that fits a single message."""
+    """Split a text into messages. ``number`` is the text's id, or 0 if it fits in a single message."""
     data = text.encode("ascii", "replace")
     if len(data) < CHUNK:
         return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]
@@ -266,7 +266,7 @@ def chunks_of(text: str, severity: int, number: int) -> list[Message]:
 
 
 class Texts:
-    """Joins the chunks of texts. An ellipsis stands for a lost chunk."""
+    """Joins the chunks of texts, with an ellipsis in place of each lost chunk."""
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], tuple[int, dict[int, str]]] = {}
@@ -275,7 +275,7 @@ class Texts:
     def on_message(self, message: Message) -> list[tuple[int, str]]:
         """Return the texts completed by this message, with their severities (0 emergency to 7 debug).
 
-        A chunk that arrives twice, or after its text's last one, starts no new text.
+        A chunk that arrives twice, or after the last one of its text, does not start a new text.
         """
         text = _printable(message.text)
         number = message.id
@@ -285,7 +285,7 @@ class Texts:
         if key in self._ended:
             if self._ended[key].get(message.chunk_seq, text) == text:
                 return []
-            del self._ended[key]  # the vehicle rebooted and numbers its texts from the start
+            del self._ended[key]  # the vehicle rebooted and started numbering its texts again
         _, chunks = self._open.setdefault(key, (message.severity, {}))
         ended: list[tuple[int, str]] = []
         chunks[message.chunk_seq] = text
@@ -308,9 +308,9 @@ def _printable(text: str) -> str:
     return "".join(each if each.isprintable() or each == " " else " " for each in text)
 
 
-BYTEWISE: Final = 0x10  #: a bit of the capabilities
+BYTEWISE: Final = 0x10  #: the capabilities' bit for bytewise encoding of integers
 REAL32: Final = 9
-#: ``MAV_PARAM_TYPE``: layout of an integer in the four bytes, and its range.
+#: For each integer ``MAV_PARAM_TYPE``: the layout in the four bytes, and the range.
 _INTEGERS: Final = {
     1: ("<B3x", 0, 0xFF),
     2: ("<b3x", -0x80, 0x7F),
@@ -322,18 +322,18 @@ _INTEGERS: Final = {
 
 
 def is_integer(kind: int) -> bool:
-    """Return whether this ``MAV_PARAM_TYPE`` is a whole number."""
+    """Return whether this ``MAV_PARAM_TYPE`` is for whole numbers."""
     return kind in _INTEGERS
 
 
 def bounds(kind: int) -> tuple[int, int]:
-    """Return the least and greatest value of an integer type."""
+    """Return the smallest and greatest value of an integer type."""
     _, low, high = _INTEGERS[kind]
     return low, high
 
 
 def from_field(field: float, kind: int, *, bytewise: bool) -> int | float:
-    """Return the number. Raises :class:`DecodeError` for an unknown type or an integer field without an integer."""
+    """Return a field's number; raise :class:`DecodeError` for an unknown type or a non-integer in an integer field."""
     if not is_integer(kind):
         if kind != REAL32:
             raise DecodeError(f"parameter type {kind} is unknown")
@@ -348,7 +348,7 @@ def from_field(field: float, kind: int, *, bytewise: bool) -> int | float:
 
 
 def to_field(value: float, kind: int, *, bytewise: bool) -> float:
-    """Return the field for a number that fits its type. Raises ``struct.error`` otherwise."""
+    """Return the field for a number; raise ``struct.error`` if the number does not fit the type."""
     if not (bytewise and is_integer(kind)):
         return float(value)
     field: float = struct.unpack("<f", struct.pack(_INTEGERS[kind][0], int(value)))[0]

@@ -1,6 +1,6 @@
-"""Mode names: ArduCopter's numbers, and PX4's main and sub modes.
+"""Mode names, with ArduCopter's numbers and PX4's main and sub modes.
 
-Sources: ``mode.h`` of ArduCopter, ``px4_custom_mode.h`` of PX4.
+Sources: ArduCopter's ``mode.h`` and PX4's ``px4_custom_mode.h``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ class Autopilot(IntEnum):
 
 
 class ModeFlag(IntFlag):
-    """``base_mode`` of a heartbeat."""
+    """Flags in a heartbeat's ``base_mode``."""
 
     CUSTOM = 1
     ARMED = 128
 
 
 class SystemState(IntEnum):
-    """``system_status`` of a heartbeat: the values used here."""
+    """Those values of a heartbeat's ``system_status`` that are used here."""
 
     STANDBY = 3
     ACTIVE = 4
@@ -34,7 +34,7 @@ class SystemState(IntEnum):
 
 
 class Landed(IntEnum):
-    """``landed_state`` of ``EXTENDED_SYS_STATE``."""
+    """Values of ``landed_state`` in ``EXTENDED_SYS_STATE``."""
 
     UNKNOWN = 0
     ON_GROUND = 1
@@ -73,7 +73,7 @@ COPTER_MODES: Final = {
 }
 COPTER_NUMBERS: Final = {name: number for number, name in COPTER_MODES.items()}
 
-#: (main, sub).
+#: Main mode and sub mode by name.
 PX4_MODES: Final = {
     (1, 0): "MANUAL",
     (2, 0): "ALTCTL",
@@ -105,6 +105,6 @@ def px4_mode(custom_mode: int) -> str:
 
 
 def px4_custom(name: str) -> int:
-    """Return the ``custom_mode`` of a name."""
+    """Return the ``custom_mode`` for a mode name."""
     main, sub = PX4_NUMBERS[name]
     return main << 16 | sub << 24

@@ -1,6 +1,6 @@
-"""An emulated racing drone with Betaflight, flying a simulated vehicle for any program that speaks MSP over TCP.
+"""An emulated racing drone with Betaflight, flying a simulated vehicle, for any program that uses MSP over TCP.
 
-For a test::
+To use it in a test::
 
     from skyloop.vehicles.msp.emulator import BetaflightFirmware, with_racers
     from skyloop.sim.host import SimHost
@@ -11,8 +11,8 @@ For a test::
         firmware.address  # for a driver: msp://tcp:127.0.0.1:…
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-Its barometer and GPS are the simulated vehicle's. It answers the driver's requests, and is set up as ``docs/msp.md``
-asks.
+Its barometer and GPS are the simulated vehicle's. It answers the driver's requests, and is set up as described in
+``docs/msp.md``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ USUAL: Final = BoardSettings()
 
 
 class RunningFirmware(RunningEmulator):
-    """A flight controller that is switched on. It belongs to the loop's thread."""
+    """A flight controller that is switched on. Belongs to the loop's thread."""
 
     def __init__(
         self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None
@@ -58,7 +58,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._server.port
 
     def _receive(self, data: bytes) -> None:
@@ -83,15 +83,15 @@ class RunningFirmware(RunningEmulator):
 class BetaflightFirmware(Emulator[RunningFirmware]):
     """The flight controller of one drone in a host's world. Several may share a host, each with its own drone and port.
 
-    Make the host with :func:`with_racers`.
+    Create the host with options from :func:`with_racers`.
 
     Args:
         host: The simulated world.
-        drone: Its number in the world.
+        drone: Number of the drone in that world.
         bind: The local address to listen on.
-        port: TCP port; 0: any free one.
-        settings: Its settings.
-        loop: The thread of a whole fleet; None: a separate thread.
+        port: The TCP port; 0 for any free one.
+        settings: The flight controller's settings.
+        loop: Thread shared by a fleet; None for a separate thread.
     """
 
     def __init__(
@@ -111,17 +111,17 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self._bind, self._port, self.settings, self._loop)
-        self._port = running.port  # keep the port over a restart
+        self._port = running.port  # keeps the port for a restart
         return running
 
     @property
     def port(self) -> int:
-        """The bound port, also if 0 was requested."""
+        """The actual port, which was chosen if 0 was requested."""
         return self._started.port
 
     @property
     def board(self) -> Board:
-        """The running flight controller, for tests; it belongs to its thread."""
+        """The running flight controller, for tests. Belongs to the loop's thread."""
         return self._started.board
 
     @property
@@ -131,5 +131,5 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
 
     @property
     def description(self) -> str:
-        """Kind, number and address, in one line for people."""
+        """A readable one-line summary: kind, number and address."""
         return f"betaflight drone {self.drone}: {self.address}"

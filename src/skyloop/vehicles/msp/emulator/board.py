@@ -1,4 +1,4 @@
-"""The flight controller's settings and logic: receiver, arming, failsafe, flight, answers. Pure.
+"""The flight controller's settings and logic: receiver, arming, failsafe, flight and replies. Pure.
 
 Its reaction to missing sticks was measured with Betaflight 4.6.0's SITL (``docs/msp.md``).
 """
@@ -41,13 +41,13 @@ from skyloop.vehicles.msp.wire.messages import (
     Status,
 )
 
-PORT: Final = 5761  #: of the first serial port in Betaflight's SITL
+PORT: Final = 5761  #: TCP port of the first serial port in Betaflight's SITL
 CHANNELS: Final = 18
-HOVER_THROTTLE: Final = 0.32  #: hover throttle, as a share of full throttle; estimate
-THRUST_POWER: Final = 1.6  #: exponent of the throttle; estimate
+HOVER_THROTTLE: Final = 0.32  #: hover throttle as a fraction of full throttle; an estimate
+THRUST_POWER: Final = 1.6  #: exponent with which thrust depends on throttle; an estimate
 CELLS: Final = 4
 
-#: A 5-inch quadrotor with a four-cell battery. Estimates of typical values.
+#: A 5-inch quadrotor with a four-cell battery. The values are estimates of typical ones.
 RACER: Final = VehicleParameters(
     mass_kg=0.6,
     radius_m=0.18,
@@ -64,12 +64,12 @@ RACER: Final = VehicleParameters(
 )
 REPORTS_HZ: Final = 100.0
 _ACTUAL: Final = AxisRates(7, 0, 67)
-#: Betaflight's own: 70 degrees/s around the centre of a stick, 670 at its end.
+#: Betaflight's default rates: 70 degrees/s near the centre of a stick, 670 at its end.
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
-#: (permanent number, name) in the order of the status bits, as listed by Betaflight 4.6 without more features.
+#: Each mode's permanent number and name, in the order of the status bits, as in Betaflight 4.6 with default features.
 BOXES: Final = ((0, "ARM"), (1, "ANGLE"), (2, "HORIZON"), (27, "FAILSAFE"), (28, "AIR MODE"), (36, "PREARM"))
-#: Replies of Betaflight 4.6.0 for which the emulator keeps no state, by number: size in bytes, and the first bytes in
-#: hexadecimal; the rest are zeros. Recorded from its SITL, with default settings, at rest.
+#: Replies of Betaflight 4.6.0 that don't depend on the emulator's state, by number: size in bytes, and the first bytes
+#: in hexadecimal; the rest are zeros. Recorded from its SITL at rest, with default settings.
 RECORDED: Final[dict[int, tuple[int, str]]] = {
     5: (30, "4e6f76203236203230323631353a30343a323700484f52495a4f1f402b20"),
     10: (0, ""),
@@ -115,8 +115,8 @@ RECORDED: Final[dict[int, tuple[int, str]]] = {
 }
 
 
-#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. Missing:
-#: 59, 61, 68 (which restarts it) and 69, which get other answers or none.
+#: Writes up to number 100 that Betaflight 4.6.0 acknowledges even when empty; they have no effect here. Not included
+#: are 59, 61, 68 (which restarts it) and 69, which get other replies or none.
 EMPTY_WRITES: Final = frozenset(
     (11, 33, 35, 37, 39, 41, 43, 45, 51, 53, 55, 57, 60, 62, 65, 76, 78, 91, 93, 95, 97, 99)
 )
@@ -124,7 +124,7 @@ EMPTY_WRITES: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class BoardSettings:
-    """The flight controller's settings: by default, as ``docs/msp.md`` asks."""
+    """The flight controller's settings, by default those described in ``docs/msp.md``."""
 
     ranges: tuple[ModeRange, ...] = (ModeRange(0, 0, 1700, 2100), ModeRange(1, 1, 900, 2100))
     failsafe: FailsafeConfig = field(default_factory=lambda: FailsafeConfig(1.5, 60.0, 1000, 10.0, 1))
@@ -136,39 +136,39 @@ class BoardSettings:
     rx_msp: bool = True
     gps: bool = True
     barometer: bool = True
-    boot_s: float = 0.5  #: until it can be armed [s]; 5 s on real ones
-    flags: int = 0  #: further flags that prevent arming, one bit each
+    boot_s: float = 0.5  #: time until it can be armed [s]; 5 s with real ones
+    flags: int = 0  #: additional flags that prevent arming, one bit each
 
 
 def with_racers(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are racers, without cameras: MSP carries no video."""
+    """Return the options for a world of racers, which have no cameras because MSP does not transmit video."""
     return replace(options or SimOptions(), parameters=RACER, rate_hz=REPORTS_HZ, cameras=())
 
 
 API: Final = (1, 47)
 VERSION: Final = (4, 6, 0)
 NAME: Final = "EMULATED"
-FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: including ARM_SWITCH
-LOSS_NS: Final = nanoseconds(0.15)  #: without sticks for this long, the receiver is lost
-HOLD_NS: Final = nanoseconds(0.3)  #: how long the last sticks stay in force
-RECOVERY_NS: Final = nanoseconds(0.5)  #: how long sticks must arrive again
-IDLE: Final = 0.055  #: share of the throttle at which the motors idle while armed
-LEVEL_RAD: Final = math.radians(25.0)  #: greatest tilt at which it arms
-GROUND_M: Final = 0.06  #: below this height with little thrust, it is on the ground
-ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: an arbitrary origin for the world
+FLAGS: Final = len(BETAFLIGHT_FLAGS) + 1  #: number of flags, including ARM_SWITCH
+LOSS_NS: Final = nanoseconds(0.15)  #: the receiver counts as lost after this time without sticks
+HOLD_NS: Final = nanoseconds(0.3)  #: how long the last sticks remain in force
+RECOVERY_NS: Final = nanoseconds(0.5)  #: how long sticks must arrive before the receiver counts as recovered
+IDLE: Final = 0.055  #: fraction of full throttle at which the motors idle while armed
+LEVEL_RAD: Final = math.radians(25.0)  #: greatest tilt at which it can be armed
+GROUND_M: Final = 0.06  #: it counts as on the ground below this height with little thrust
+ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: arbitrary position of the world's origin on Earth
 SATELLITES: Final = 14
 _ROLL, _PITCH, _YAW, _THROTTLE = range(4)
 
 
 def bit(name: str) -> int:
-    """Return the bit of a flag that prevents arming."""
+    """Return the bit for a flag that prevents arming."""
     return 1 << (FLAGS - 1 if name == ARM_SWITCH else BETAFLIGHT_FLAGS.index(name))
 
 
 class Board:
     """One flight controller. Not thread-safe. Used on the loop's thread.
 
-    ``received``: the latest sticks, in the order roll, pitch, yaw, throttle, AUX; ``frames``: how many frames.
+    ``received`` has the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
     """
 
     def __init__(self, vehicle: Vehicle, settings: BoardSettings, now_ns: int) -> None:
@@ -176,7 +176,7 @@ class Board:
         self.armed = False
         self.received: list[int] = []
         self.frames = 0
-        self.silenced = False  #: answers nothing, like a cut line
+        self.silenced = False  #: whether it replies to nothing, as if the line were cut
         self._flight = FlightControl(vehicle)
         self._report: Report | None = None
         self._begun_ns = now_ns
@@ -186,7 +186,7 @@ class Board:
         self._landing_ns: int | None = None
         self._not_disarmed = False
         self._had_sticks = False
-        self._refused = False  # the arm switch was on while something prevented arming
+        self._refused = False  # whether the arm switch was on while something prevented arming
         self._crashed = False
         self._ground_m = 0.0
         self._data = [1500, 1500, 1500, 885, *[1500] * (CHANNELS - 4)]  # the sticks in force
@@ -305,7 +305,7 @@ class Board:
         return self._report
 
     def _is_on(self, number: int) -> bool:
-        """Return whether a switch is in the range of a mode, by its permanent number."""
+        """Return whether a switch is in the range that activates the mode with this permanent number."""
         ranges = [each for each in self.settings.ranges if each.mode == number]
         return any(each.low_us <= self._data[4 + each.aux] < each.high_us for each in ranges)
 
@@ -333,11 +333,11 @@ class Board:
     # Time ----------------------------------------------------------------------------------------------------------
 
     def crashed(self) -> None:
-        """Disarm: the vehicle hit something hard."""
+        """Disarm because the vehicle hit something hard."""
         self.armed, self._crashed = False, True
 
     def tick(self, report: Report, now_ns: int) -> None:
-        """Handle the vehicle's newest report: receiver, failsafe, switches, motors. Called regularly."""
+        """Handle the vehicle's newest report and update receiver, failsafe, switches and motors. Called regularly."""
         self._report = report
         self._flight.update(report)
         if not self.armed and self._flight.standing:
@@ -370,7 +370,7 @@ class Board:
                 self._data[channel] = usual[channel] if channel < len(usual) else 1500
 
     def _fail(self, now_ns: int) -> None:
-        """Execute the failsafe after the sticks have stopped: land, or drop."""
+        """Execute the failsafe after sticks have stopped arriving: land or drop."""
         config = self.settings.failsafe
         if self._landing_ns is None:
             self._landing_ns = now_ns
@@ -417,5 +417,5 @@ class Board:
         flight.lean_by_thrust(self._lean(roll), self._lean(pitch), thrust, turn)
 
     def _lean(self, stick: float) -> float:
-        """Return the angle of a stick in ANGLE mode; level in other modes, which are not emulated."""
+        """Return the angle that a stick commands in ANGLE mode; level in other modes, which are not emulated."""
         return math.copysign(self._tilt(min(1.0, abs(stick))), stick) if self._is_on(1) else 0.0

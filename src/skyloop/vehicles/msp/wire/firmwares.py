@@ -1,7 +1,7 @@
-"""The firmwares' rate curves and their inverse, from rates and angles to sticks. Pure.
+"""The firmwares' rate curves and their inverses, from rates and angles to sticks. Pure.
 
-Betaflight has five kinds of rates, as plotted in its documentation. From version 4.5 on, ANGLE mode leans along the
-same curve, before that in proportion to the stick. INAV has one cubic for roll and pitch and one for yaw.
+Betaflight has five kinds of rates, plotted in its documentation. Since version 4.5, the lean in ANGLE mode follows the
+same curve; before, it was proportional to the stick. INAV has one cubic for roll and pitch and one for yaw.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Final
 from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire.messages import INAV
 
-Curve = Callable[[float], float]  #: from a stick, 0 to 1, to a rate [degrees/s] or a share; increasing
+Curve = Callable[[float], float]  #: increasing function from a stick, 0 to 1, to a rate [degrees/s] or a fraction
 
 _KINDS: Final = ("betaflight", "raceflight", "kiss", "actual", "quick")
-_STEPS: Final = 24  #: of the bisection
+_STEPS: Final = 24  #: number of steps in the bisection
 
 
 @dataclass(frozen=True, slots=True)
 class AxisRates:
-    """The three numbers of an axis, 0 to 255, as stored by the firmware."""
+    """The three numbers for an axis, 0 to 255, as stored by the firmware."""
 
     centre: int
     expo: int
@@ -31,7 +31,7 @@ class AxisRates:
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Rates of the axes. ``kind``: one of ``betaflight``, ``raceflight``, ``kiss``, ``actual``, ``quick``."""
+    """Rates for all axes. ``kind`` is one of ``betaflight``, ``raceflight``, ``kiss``, ``actual``, ``quick``."""
 
     kind: str
     roll: AxisRates
@@ -40,7 +40,7 @@ class Rates:
 
 
 def betaflight_rates(payload: bytes) -> Rates:
-    """Read Betaflight's ``RC_TUNING``, from API 1.43 on with the kind of rates. Raises :class:`DecodeError`."""
+    """Read Betaflight's ``RC_TUNING``, which includes the kind of rates since API 1.43. Raises :class:`DecodeError`."""
     if len(payload) < 14:
         raise DecodeError(f"RC_TUNING of {len(payload)} bytes: at least 14 expected")
     number = payload[22] if len(payload) > 22 else 0
@@ -53,7 +53,7 @@ def betaflight_rates(payload: bytes) -> Rates:
 
 
 def pack_betaflight_rates(rates: Rates) -> bytes:
-    """Return the payload of Betaflight's ``RC_TUNING``, API 1.46."""
+    """Return the payload for Betaflight's ``RC_TUNING``, API 1.46."""
     roll, pitch, yaw = rates.roll, rates.pitch, rates.yaw
     made = struct.pack("<BBBBBBBBH", roll.centre, roll.expo, roll.most, pitch.most, yaw.most, 0, 50, 0, 0)
     made += bytes((yaw.expo, yaw.centre, pitch.centre, pitch.expo, 0, 100))
@@ -61,7 +61,7 @@ def pack_betaflight_rates(rates: Rates) -> bytes:
 
 
 def rate_curve(kind: str, rates: AxisRates) -> Curve:
-    """Return the turn rate [degrees/s] by stick; for an unknown kind, a straight line to 200."""
+    """Return the curve from stick to turn rate [degrees/s]; for an unknown kind, a straight line up to 200."""
     makers = {"betaflight": _betaflight, "raceflight": _raceflight, "kiss": _kiss, "actual": _actual, "quick": _quick}
     return makers[kind](rates) if kind in makers else lambda stick: 200.0 * stick
 
@@ -104,18 +104,18 @@ def _quick(rates: AxisRates) -> Curve:
 
 
 def inav_curve(expo: int, full: float) -> Curve:
-    """Return INAV's curve from its expo (0 to 100) and the value of a full stick, in any unit."""
+    """Return INAV's curve for an expo (0 to 100) and the value at full stick, in any unit."""
     return lambda stick: full * _bent(stick, expo / 100, 3)
 
 
 def share_of(curve: Curve) -> Curve:
-    """Return the curve as a share of its value at full stick."""
+    """Return the curve as a fraction of its value at full stick."""
     full = curve(1.0)
     return lambda stick: curve(stick) / full if full > 0 else stick
 
 
 def stick_for(curve: Curve, wanted: float) -> float:
-    """Return the stick, -1 to 1, for a value; a full stick if none reaches it."""
+    """Return the stick, -1 to 1, for a value; full stick if the value is out of reach."""
     size = abs(wanted)
     low, high = 0.0, 1.0
     if curve(1.0) <= size:
@@ -131,7 +131,7 @@ def stick_for(curve: Curve, wanted: float) -> float:
     return -stick if wanted < 0 else stick
 
 
-#: Betaflight 4.1 (API 1.42) on, from bit 0; ARM_SWITCH is always a version's last flag.
+#: Flags since Betaflight 4.1 (API 1.42), from bit 0; ARM_SWITCH is always a version's last flag.
 BETAFLIGHT_FLAGS: Final = (
     *("NOGYRO", "FAILSAFE", "RXLOSS", "NOT_DISARMED", "BOXFAILSAFE", "RUNAWAY", "CRASH", "THROTTLE", "ANGLE"),
     *("BOOTGRACE", "NOPREARM", "LOAD", "CALIB", "CLI", "CMS", "BST", "MSP", "PARALYZE", "GPS", "RESCUE_SW"),
@@ -139,7 +139,7 @@ BETAFLIGHT_FLAGS: Final = (
     "POS_HOLD_SW",
 )
 ARM_SWITCH: Final = "ARM_SWITCH"
-#: INAV's flags, by bit.
+#: INAV's flags by bit.
 INAV_FLAGS: Final = {
     6: "GEOZONE",
     7: "FAILSAFE",
@@ -166,7 +166,7 @@ INAV_FLAGS: Final = {
     29: "DSHOT_BEEPER",
     30: "LANDING_DETECTED",
 }
-#: Meaning and remedy of each flag, for people. Flags that clear with time have no remedy.
+#: Readable meaning and remedy for each flag. Flags that clear with time have no remedy.
 MEANINGS: Final = {
     "NOGYRO": "no gyroscope was found",
     "FAILSAFE": "failsafe is active until sticks arrive for half a second",
@@ -209,16 +209,16 @@ MEANINGS: Final = {
     "NO_PREARM": "the prearm switch is off",
 }
 
-# Modes by the names of ``BOXNAMES``: their permanent numbers differ between firmwares.
+# Modes are identified by their names in ``BOXNAMES``, because permanent numbers differ between firmwares.
 ARM: Final = "ARM"
 ANGLE: Final = "ANGLE"
 PREARM: Final = "PREARM"
-MSP_OVERRIDE: Final = ("MSP OVERRIDE", "MSP RC OVERRIDE")  #: Betaflight's, INAV's
-ARMED_OF_INAV: Final = 1 << 2  #: among the flags of INAV's status
+MSP_OVERRIDE: Final = ("MSP OVERRIDE", "MSP RC OVERRIDE")  #: Betaflight's and INAV's names
+ARMED_OF_INAV: Final = 1 << 2  #: bit in the flags of INAV's status that means armed
 
 
 def flag_names(variant: str, flags: int, count: int) -> list[str]:
-    """Return the flags that prevent arming, by the firmware's own names. ``count``: its number of flags; 0: unknown."""
+    """Return the firmware's names for flags that prevent arming. ``count`` is its number of flags, 0 if unknown."""
     names = []
     for bit in range(32):
         if not flags >> bit & 1:
@@ -234,5 +234,5 @@ def flag_names(variant: str, flags: int, count: int) -> list[str]:
 
 
 def explained(names: list[str]) -> str:
-    """Return names with their meanings, for people."""
+    """Return flag names with their meanings, as readable text."""
     return "; ".join(f"{name} ({MEANINGS[name]})" if name in MEANINGS else name for name in names)

@@ -1,7 +1,7 @@
 """MSP frames: version 1, its long form for 255 bytes and more, and version 2. Pure.
 
-Version 1 is ``$M`` direction size function payload xor; version 2 is ``$X`` direction flags function(16) size(16)
-payload CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
+A version 1 frame is ``$M``, direction, size, function, payload and xor; a version 2 frame is ``$X``, direction, flags,
+function (16 bits), size (16 bits), payload and CRC-8/DVB-S2 (INAV's wiki, "MSP V2").
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from enum import Enum
 from typing import Final
 
 MOST: Final = 1024  #: longest payload that the parser waits for; the longest in use, mode names, is below 700 bytes
-LONG: Final = 255  #: size in version 1 that announces the real size in the next two bytes
+LONG: Final = 255  #: size in version 1 which means that the actual size is in the next two bytes
 LARGEST: Final = 0xFFFF
 
 
 class Direction(Enum):
-    """The sender. The value is the third byte of a frame."""
+    """The direction of a frame, as given by its third byte."""
 
-    REQUEST = ord("<")  #: to the flight controller
+    REQUEST = ord("<")  #: sent to the flight controller
     REPLY = ord(">")
-    ERROR = ord("!")  #: the flight controller does not know the function, or refuses it
+    ERROR = ord("!")  #: the flight controller does not support the function or refuses it
 
 
 _DIRECTIONS: Final = {each.value: each for each in Direction}
@@ -31,11 +31,11 @@ _V2: Final = struct.Struct("<BHH")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame."""
+    """An MSP frame."""
 
-    function: int  #: 0 to 65535; from 255 on, version 2 only
+    function: int  #: 0 to 65535; 255 and greater only in version 2
     payload: bytes = b""  #: at most 65535 bytes
-    direction: Direction = Direction.REQUEST  #: the sender
+    direction: Direction = Direction.REQUEST  #: the direction
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -52,7 +52,7 @@ _CRC: Final = _crc_table()
 
 
 def crc8(data: bytes) -> int:
-    """Return the CRC-8/DVB-S2 of some bytes: polynomial 0xD5, not reflected, initial value 0."""
+    """Return the CRC-8/DVB-S2 of the data: polynomial 0xD5, not reflected, initial value 0."""
     crc = 0
     for byte in data:
         crc = _CRC[crc ^ byte]
@@ -60,7 +60,7 @@ def crc8(data: bytes) -> int:
 
 
 def xor(data: bytes) -> int:
-    """Return the exclusive or of all bytes, version 1's checksum."""
+    """Return the exclusive or of all bytes, which is version 1's checksum."""
     made = 0
     for byte in data:
         made ^= byte
@@ -68,7 +68,7 @@ def xor(data: bytes) -> int:
 
 
 def encode(frame: Frame, *, version: int | None = None) -> bytes:
-    """Return a frame's bytes, by default in the lowest version that can hold it. Raises ``ValueError``."""
+    """Return a frame's bytes, by default in the lowest version that can represent it. Raises ``ValueError``."""
     function, payload = frame.function, frame.payload
     if not 0 <= function <= LARGEST or len(payload) > LARGEST:
         raise ValueError(f"function {function} with {len(payload)} bytes does not fit into a frame")
@@ -86,7 +86,7 @@ def encode(frame: Frame, *, version: int | None = None) -> bytes:
 
 
 def whole_frames(data: bytes) -> Iterator[bytes]:
-    """Yield the frames in ``data``, which must be output of :func:`encode`."""
+    """Yield the frames in ``data``, which must be the output of :func:`encode`."""
     while data:
         if data[1:2] == b"X":
             size = 9 + int.from_bytes(data[6:8], "little")
@@ -97,10 +97,10 @@ def whole_frames(data: bytes) -> Iterator[bytes]:
 
 
 class Parser:
-    """Finds frames in a stream of bytes, among any other bytes. Never raises.
+    """Finds frames in a byte stream that may contain other bytes. Never raises.
 
-    After a bad checksum, the search resumes at the byte after the ``$``, so that a frame that lost some bytes does not
-    take the next one with it. ``skipped`` counts bytes outside frames, ``damaged`` bad checksums.
+    After a bad checksum, the search resumes at the byte after the ``$``, so that a frame with missing bytes does not
+    cost the next one. ``skipped`` counts the bytes outside frames, ``damaged`` the bad checksums.
     """
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class Parser:
         self.damaged = 0
 
     def reset(self) -> None:
-        """Forget an incomplete frame: the next bytes come from a new connection."""
+        """Discard an incomplete frame, because the next bytes come from a new connection."""
         self._kept.clear()
 
     def feed(self, data: bytes) -> list[Frame]:
@@ -137,7 +137,7 @@ class Parser:
         return found
 
     def _frame(self, at: int, found: list[Frame]) -> int:
-        """Return the length of the frame at this ``$``; 0: incomplete; -1: not a frame."""
+        """Return the length of the frame at this ``$``; 0 if it is incomplete, -1 if there is no frame."""
         kept = self._kept
         left = len(kept) - at
         if left < 3:
@@ -163,7 +163,7 @@ class Parser:
         return length
 
     def _head(self, at: int, left: int) -> tuple[int, int, int] | None:
-        """Return the function, the payload's start and its size; None until they have arrived."""
+        """Return the function, and the start and size of the payload; None until they have arrived."""
         kept = self._kept
         if kept[at + 1] == ord("X"):
             if left < 8:

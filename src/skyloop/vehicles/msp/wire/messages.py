@@ -1,8 +1,8 @@
-"""Payloads of MSP's functions, both directions. Pure.
+"""Payloads of MSP's functions in both directions. Pure.
 
-All numbers are little endian. A payload longer than expected comes from newer firmware, and its end is ignored; one
-that is too short raises :class:`skyloop.errors.DecodeError`. Layouts: Betaflight's and INAV's wikis on MSP, checked
-against Betaflight 4.6.0.
+All numbers are little-endian. A payload longer than expected comes from newer firmware, and the excess is ignored; one
+that is too short raises :class:`skyloop.errors.DecodeError`. The layouts come from Betaflight's and INAV's wikis on MSP
+and were checked with Betaflight 4.6.0.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from skyloop.messages.geometry import in_16_bits
 
 
 class Function(IntEnum):
-    """Numbers of the functions that Skyloop uses."""
+    """Numbers of the MSP functions that Skyloop uses."""
 
     API_VERSION = 1
     FC_VARIANT = 2
@@ -93,12 +93,12 @@ def version(payload: bytes) -> tuple[int, int, int]:
 
 
 def text(payload: bytes, longest: int = 64) -> str:
-    """Return printable ASCII, without any other characters."""
+    """Return the printable ASCII characters, leaving out all others."""
     return "".join(chr(byte) for byte in payload[:longest] if 32 <= byte < 127)
 
 
 def board(payload: bytes) -> str:
-    """Return the board's name: its target's if it has one, else four letters."""
+    """Return the board's name: that of its target if it has one, otherwise its four-letter identifier."""
     if len(payload) < 4:
         raise DecodeError(f"BOARD_INFO of {len(payload)} bytes: at least 4 expected")
     if len(payload) > 9:
@@ -125,20 +125,20 @@ class Sensor(IntEnum):
 class Status:
     """Active sensors and modes, and the flags that prevent arming."""
 
-    sensors: int  #: one bit per :class:`Sensor`
-    modes: int  #: one bit per active mode, in the order of ``BOXIDS``
-    flags: int | None = None  #: one bit per flag that prevents arming; None if this reply does not have them
-    count: int = 0  #: number of flags of this version; 0: unknown
+    sensors: int  #: bits of :class:`Sensor`
+    modes: int  #: a bit for each active mode, in the order of ``BOXIDS``
+    flags: int | None = None  #: a bit for each flag that prevents arming; None if this reply has none
+    count: int = 0  #: number of flags in this version; 0 if unknown
     cycle_us: int = 0  #: duration of one control loop [µs]
-    load: int = 0  #: of the processor [%]
+    load: int = 0  #: processor load [%]
 
     def has(self, sensor: Sensor) -> bool:
-        """Return whether it has this sensor."""
+        """Return whether this sensor is present."""
         return bool(self.sensors >> sensor & 1)
 
     @classmethod
     def of_betaflight(cls, payload: bytes) -> Self:
-        """Read Betaflight's ``STATUS`` or ``STATUS_EX``, API 1.36 on. Raises :class:`DecodeError`."""
+        """Read Betaflight's ``STATUS`` or ``STATUS_EX``, API 1.36 and later. Raises :class:`DecodeError`."""
         cycle, _, sensors, modes, _, load, _, _ = _unpack(_STATUS, payload, "STATUS")
         if len(payload) <= _STATUS.size:
             return cls(sensors, modes, None, 0, cycle, load)
@@ -155,12 +155,12 @@ class Status:
         """Read ``INAV_STATUS``. Raises :class:`DecodeError`."""
         cycle, _, sensors, load, _, flags = _unpack(_INAV_STATUS, payload, "INAV_STATUS")
         rest = payload[_INAV_STATUS.size : _INAV_STATUS.size + 16]
-        if len(rest) % 4 == 1:  # the mixer's profile follows the modes
+        if len(rest) % 4 == 1:  # the mixer profile follows the modes
             rest = rest[:-1]
         return cls(sensors, int.from_bytes(rest, "little"), flags, 32, cycle, load)
 
     def betaflight(self) -> bytes:
-        """Return the payload of Betaflight's ``STATUS_EX``."""
+        """Return the payload for Betaflight's ``STATUS_EX``."""
         low, more = self.modes & 0xFFFFFFFF, self.modes >> 32
         size = (more.bit_length() + 7) // 8
         made = _STATUS.pack(self.cycle_us, 0, self.sensors, low, 0, self.load, 4, 0)
@@ -174,7 +174,7 @@ _INAV_STATUS: Final = struct.Struct("<HHHHBI")
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Roll, right side down, and pitch, nose down [degrees], and the heading, clockwise from north [degrees]."""
+    """Roll (positive right side down), pitch (positive nose down) and heading (clockwise from north) [degrees]."""
 
     roll_deg: float
     pitch_deg: float
@@ -196,7 +196,7 @@ _ATTITUDE: Final = struct.Struct("<hhh")
 
 @dataclass(frozen=True, slots=True)
 class Altitude:
-    """Height above the place of arming [m], and climb [m/s]."""
+    """Height above the place where it was armed [m], and climb [m/s]."""
 
     height_m: float
     climb_m_s: float
@@ -217,12 +217,12 @@ _ALTITUDE: Final = struct.Struct("<ih")
 
 @dataclass(frozen=True, slots=True)
 class Battery:
-    """State of the battery."""
+    """The battery's state."""
 
     voltage_v: float  #: [V]
     current_a: float  #: [A]
-    cells: int = 0  #: number of cells; 0: unknown
-    left: float | None = None  #: remaining charge, 0 to 1; None: not reported
+    cells: int = 0  #: number of cells; 0 if unknown
+    left: float | None = None  #: remaining charge, 0 to 1; None if not reported
 
     @classmethod
     def of_state(cls, payload: bytes) -> Self:
@@ -245,13 +245,13 @@ class Battery:
         return cls(int.from_bytes(whole, "little") / 100 if len(whole) == 2 else tenths / 10, current / 100)
 
     def state(self) -> bytes:
-        """Return the payload of ``BATTERY_STATE``."""
+        """Return the payload for ``BATTERY_STATE``."""
         tenths = min(255, round(self.voltage_v * 10))
         made = _BATTERY.pack(self.cells, 0, tenths, 0, in_16_bits(self.current_a * 100), 0)
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
     def analog(self) -> bytes:
-        """Return the payload of ``ANALOG``."""
+        """Return the payload for ``ANALOG``."""
         made = _ANALOG.pack(min(255, round(self.voltage_v * 10)), 0, 0, in_16_bits(self.current_a * 100))
         return made + struct.pack("<H", round(self.voltage_v * 100))
 
@@ -277,7 +277,7 @@ class CellVoltages:
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """A fix. Angles [degrees], ``speed_m_s`` over ground towards ``course_deg``, clockwise from north."""
+    """A GPS fix. Angles are in degrees; ``speed_m_s`` is over ground towards ``course_deg``, clockwise from north."""
 
     fix: bool
     satellites: int
@@ -305,7 +305,7 @@ _GPS: Final = struct.Struct("<BBiihHH")
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Raw sensor values: only the gyroscope's, in degrees per second, have the same unit on every board."""
+    """Raw sensor values. Only those of the gyroscope have the same unit on every board: degrees per second."""
 
     acceleration: tuple[int, int, int]
     gyro_deg_s: tuple[int, int, int]
@@ -334,12 +334,12 @@ def channels(payload: bytes) -> list[int]:
 
 
 def pack_channels(widths_us: Sequence[int]) -> bytes:
-    """Return the payload of ``SET_RAW_RC``, or of the reply ``RC``."""
+    """Return the payload for ``SET_RAW_RC``, or for the reply ``RC``."""
     return struct.pack(f"<{len(widths_us)}H", *widths_us)
 
 
 def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]]:
-    """Return the replies in ``MULTIPLE`` to the requested functions, as far as they fitted."""
+    """Return the replies in ``MULTIPLE`` to the requested functions, except for those that did not fit in it."""
     found = []
     at = 0
     for function in functions:
@@ -355,16 +355,16 @@ def multiple(payload: bytes, functions: Sequence[int]) -> list[tuple[int, bytes]
 
 @dataclass(frozen=True, slots=True)
 class ModeRange:
-    """The range of an AUX channel that switches a mode on."""
+    """The range of an AUX channel that activates a mode."""
 
-    mode: int  #: its permanent number
-    aux: int  #: the channel, counted from 0 for AUX 1
-    low_us: int  #: from this pulse width on [µs]
-    high_us: int  #: below this one [µs]; 2100 is unlimited
+    mode: int  #: the mode's permanent number
+    aux: int  #: the channel, 0 for AUX 1
+    low_us: int  #: lowest pulse width in the range [µs]
+    high_us: int  #: first pulse width above the range [µs]; 2100 for no upper limit
 
 
 def mode_ranges(payload: bytes) -> list[ModeRange]:
-    """Return the ranges in ``MODE_RANGES`` that are not empty."""
+    """Return the non-empty ranges in ``MODE_RANGES``."""
     found = []
     for mode, aux, low, high in struct.iter_unpack("<BBBB", payload[: len(payload) // 4 * 4]):
         if low < high:
@@ -373,7 +373,7 @@ def mode_ranges(payload: bytes) -> list[ModeRange]:
 
 
 def pack_mode_ranges(ranges: Sequence[ModeRange], places: int = 20) -> bytes:
-    """Return the payload of ``MODE_RANGES``."""
+    """Return the payload for ``MODE_RANGES``."""
     made = b"".join(
         bytes((each.mode, each.aux, (each.low_us - 900) // 25, (each.high_us - 900) // 25)) for each in ranges
     )
@@ -381,19 +381,19 @@ def pack_mode_ranges(ranges: Sequence[ModeRange], places: int = 20) -> bytes:
 
 
 def box_names(payload: bytes) -> list[str]:
-    """Return the names in ``BOXNAMES``, in the order of the bits of :attr:`Status.modes`."""
+    """Return the names in ``BOXNAMES``, in the order of the bits in :attr:`Status.modes`."""
     return [name for name in text(payload, len(payload)).split(";") if name]
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeConfig:
-    """The firmware's reaction to a silent receiver."""
+    """How the firmware reacts if the receiver falls silent."""
 
-    delay_s: float  #: until it starts [s]
-    landing_s: float  #: duration of a landing, or of running motors [s]
-    throttle_us: int  #: during a landing [µs]
-    low_throttle_s: float  #: with a low throttle for this long, it disarms at once [s]
-    procedure: int  #: Betaflight 0 land, 1 drop, 2 GPS rescue; INAV 0 land, 1 drop, 2 return, 3 nothing
+    delay_s: float  #: time until the failsafe starts [s]
+    landing_s: float  #: duration of a landing, or how long the motors keep running [s]
+    throttle_us: int  #: throttle during a landing [µs]
+    low_throttle_s: float  #: it disarms at once if the throttle was low for this long [s]
+    procedure: int  #: Betaflight: 0 land, 1 drop, 2 GPS rescue; INAV: 0 land, 1 drop, 2 return, 3 nothing
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -411,26 +411,26 @@ _FAILSAFE: Final = struct.Struct("<BBHBHB")
 
 
 class OnLoss(IntEnum):
-    """The value of a channel 0.3 s after the receiver fell silent."""
+    """The value that a channel takes 0.3 s after the receiver fell silent."""
 
-    AUTO = 0  #: centred sticks, no throttle
+    AUTO = 0  #: centred sticks and no throttle
     HOLD = 1
     SET = 2
 
 
 def rx_fail(payload: bytes) -> list[tuple[int, int]]:
-    """Return :class:`OnLoss` and pulse width [µs] of each channel in ``RXFAIL_CONFIG``."""
+    """Return the :class:`OnLoss` value and pulse width [µs] of each channel in ``RXFAIL_CONFIG``."""
     return list(struct.iter_unpack("<BH", payload[: len(payload) // 3 * 3]))
 
 
 def pack_rx_fail(channels: Sequence[tuple[int, int]]) -> bytes:
-    """Return the payload of ``RXFAIL_CONFIG``."""
+    """Return the payload for ``RXFAIL_CONFIG``."""
     return b"".join(struct.pack("<BH", mode, width) for mode, width in channels)
 
 
 @dataclass(frozen=True, slots=True)
 class RxConfig:
-    """Pulse widths [µs]: below ``low_us`` the throttle is low; a channel outside the valid range has failed."""
+    """Pulse widths [µs]. The throttle is low below ``low_us``; a channel outside the valid range has failed."""
 
     low_us: int = 1050
     middle_us: int = 1500
@@ -451,8 +451,8 @@ class RxConfig:
 
 _RX: Final = struct.Struct("<BHHHBHH")
 
-RX_MSP: Final = 1 << 14  #: a bit of Betaflight's features: sticks arrive by MSP
-USUAL_MAP: Final = (0, 1, 3, 2)  #: AETR: positions of roll, pitch, yaw and throttle in ``SET_RAW_RC``
+RX_MSP: Final = 1 << 14  #: bit in Betaflight's features: sticks are received over MSP
+USUAL_MAP: Final = (0, 1, 3, 2)  #: positions of roll, pitch, yaw and throttle in ``SET_RAW_RC`` (AETR)
 
 
 def rx_map(payload: bytes) -> tuple[int, ...]:
@@ -473,7 +473,7 @@ ANGLE_LIMIT_AT: Final = 17
 
 
 def angle_limit_deg(payload: bytes) -> int:
-    """Return the tilt of a full stick [degrees] from Betaflight's ``PID_ADVANCED``."""
+    """Return the tilt at full stick [degrees] from Betaflight's ``PID_ADVANCED``."""
     if len(payload) <= ANGLE_LIMIT_AT:
         raise DecodeError(f"PID_ADVANCED of {len(payload)} bytes: at least {ANGLE_LIMIT_AT + 1} expected")
     if payload[ANGLE_LIMIT_AT] == 0:

@@ -1,7 +1,7 @@
 """Real flight firmware in the simulated world: ArduCopter, PX4 and Betaflight as processes that fly simulated drones.
 
-Each is a :class:`~skyloop.sim.instruments.Firmware`. Their programs are not part of Skyloop; ``docs/autopilots.md``
-lists their sources.
+Each one is a :class:`~skyloop.sim.instruments.Firmware`. The programs are not part of Skyloop; ``docs/autopilots.md``
+says where to get them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from enum import StrEnum
 
 
 class AutopilotKind(StrEnum):
-    """Firmware that can fly a simulated drone, by its name in an address."""
+    """Firmware that can fly a simulated drone; values are the names used in addresses."""
 
     ARDUPILOT = "ardupilot"
     BETAFLIGHT = "betaflight"

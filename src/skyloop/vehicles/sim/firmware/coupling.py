@@ -1,4 +1,4 @@
-"""A firmware's process coupled to a simulation: the part shared by all kinds of firmware."""
+"""The coupling of a firmware's process to a simulation, as far as it is the same for all kinds of firmware."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from typing import ClassVar, Final
 from skyloop.sim.instruments import Readings
 from skyloop.vehicles.sim.firmware.program import FirmwareEvent, FirmwareEventKind, Launch, Program
 
-WAIT_S: Final = 0.3  #: longest wait for an answer; after a time-out no further wait until it answers
-STOP_S: Final = 0.5  #: of simulated time without an answer until the rotors stop, like real speed controllers
-SILENT_S: Final = 1.0  #: of simulated time without an answer until an event reports it
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out there is no more waiting until it replies
+STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
+SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
 
 Commands = Sequence[float]
 
 
 class CoupledFirmware(ABC):
-    """Flies a drone of a simulation with real firmware, which runs as a separate process.
+    """Flies a simulation's drone with real firmware that runs as a separate process.
 
     It is a :class:`~skyloop.sim.instruments.Firmware`: pass it to :meth:`~skyloop.sim.simulation.Simulation.fly_by`.
-    The simulation's thread waits up to :data:`WAIT_S` for an answer; after a time-out it does not wait again until the
-    firmware answers. Silence and the process's end stop the rotors; firmware that ended is restarted.
+    The simulation's thread waits up to :data:`WAIT_S` for a reply; after a time-out it does not wait again until the
+    firmware has replied. The rotors stop if the firmware is silent or its process ends; in that case it is restarted.
     """
 
-    NAME: ClassVar[str]  #: for messages
+    NAME: ClassVar[str]  #: the firmware's name in messages
 
     def __init__(self, on_event: Callable[[FirmwareEvent], None], *, folder: Path | None = None) -> None:
         """Prepare without starting anything.
 
         Args:
             on_event: Called with each event, on the simulation's or the program's thread; must return quickly.
-            folder: Working folder with the firmware's settings; None: a new one, removed at the end.
+            folder: Working folder with the firmware's settings; None for a new one that is removed at the end.
         """
         self.program = Program(self.NAME, self._prepare, on_event, verify=self._verify, folder=folder)
         self.keeps_folder = folder is not None
         self._on_event = on_event
-        self._starts = 0  # start number of the coupled process
-        self._owed = False  # whether the last readings need an answer
-        self._patient = False  # whether to wait for answers
-        self._answered_s: float | None = None  # simulated time of this process's last answer
+        self._starts = 0  # number of the start that created the coupled process
+        self._owed = False  # whether the last readings need a reply
+        self._patient = False  # whether to wait for replies
+        self._answered_s: float | None = None  # simulated time of this process's last reply
         self._reported_silent = False
 
     @property
@@ -49,7 +49,7 @@ class CoupledFirmware(ABC):
     def address(self) -> str: ...
 
     def start(self) -> None:
-        """Start the firmware. It may take a while to answer."""
+        """Start the firmware. It may take a while to reply."""
         self._open()
         self.program.start()
 
@@ -66,7 +66,7 @@ class CoupledFirmware(ABC):
             self._starts = self.program.starts
             self._owed, self._patient, self._answered_s = False, False, None
             self._begin()
-            return STOPPED  # for at least a step, even if its end was noticed late
+            return STOPPED  # for at least one step, even if its end was noticed late
         commands = self._receive(WAIT_S if self._owed and self._patient else 0.0)
         if commands is not None:
             self._on_answer(readings.time_s)
@@ -85,7 +85,7 @@ class CoupledFirmware(ABC):
         self._owed, self._patient, self._answered_s = False, True, time_s
 
     def _is_silent(self, time_s: float) -> bool:
-        """Return whether the rotors must stop after a long time without an answer."""
+        """Return whether the rotors must stop because there has been no reply for a long time."""
         if self._answered_s is None:
             return True
         silent_s = time_s - self._answered_s
@@ -99,7 +99,7 @@ class CoupledFirmware(ABC):
 
     @abstractmethod
     def _open(self) -> None:
-        """Find the program, and open the sockets for it."""
+        """Find the program and open sockets for it."""
 
     @abstractmethod
     def _close(self) -> None:
@@ -107,13 +107,13 @@ class CoupledFirmware(ABC):
 
     @abstractmethod
     def _prepare(self, folder: Path) -> Launch:
-        """Write the firmware's startup files, and return how to start it. On the program's thread."""
+        """Write the firmware's startup files and return how to start it. Runs on the program's thread."""
 
     def _verify(self) -> None:  # noqa: B027  most firmware either starts well or ends
-        """Return once its process has started well. On the program's thread.
+        """Return once its process has started properly. Runs on the program's thread.
 
         Raises:
-            OSError: The start failed; start it again.
+            OSError: The start failed and must be repeated.
         """
 
     @abstractmethod
@@ -126,4 +126,4 @@ class CoupledFirmware(ABC):
 
     @abstractmethod
     def _send(self, readings: Readings) -> None:
-        """Send readings if due, and set ``_owed`` to whether they need an answer. Must not wait."""
+        """Send the readings if they are due, and set ``_owed`` to whether they need a reply. Must not wait."""

@@ -1,9 +1,9 @@
-"""Run a flight firmware as the only child, and end it when the parent of this process ends.
+"""Run flight firmware as the only child process, and end it when the parent of this process ends.
 
 ``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …`` writes
 the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives it priority,
-``--apart`` a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the firmware's, or 128
-plus the number of the signal that ended it, as in a shell.
+``--apart`` a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the firmware's or, as in
+a shell, 128 plus the number of the signal that ended it.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from typing import Final
 from skyloop.child_process import on_parent_end
 from skyloop.vehicles.sim.firmware import ports
 
-LOW_PRIORITY: Final = 1  #: of the real-time scheduler: ahead of all ordinary processes
-NICENESS: Final = -10  #: if only that is allowed
-SLACK_NS: Final = 1  #: deliberate delay of wake-ups by the kernel; 50 µs by default
+LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which is ahead of all ordinary processes
+NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
+SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
 
 
 def become_prompt() -> None:
-    """Make the kernel wake up this process and its children on time: reliable as root, less so otherwise. Never raises.
+    """Make the kernel wake up this process and its children on time, reliably only as root. Never raises.
 
-    Has an effect on Linux only.
+    This has an effect only on Linux.
     """
     if sys.platform != "linux":
         return
@@ -96,7 +96,7 @@ def main(arguments: list[str]) -> int:
     libc = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
 
     def begin() -> None:
-        if libc is not None:  # if this process is killed, it cannot end the firmware
+        if libc is not None:  # because this process can't end the firmware if it is killed itself
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if prompt:
             become_prompt()
@@ -109,7 +109,7 @@ def main(arguments: list[str]) -> int:
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            preexec_fn=begin,  # noqa: PLW1509  there is only one thread so far
+            preexec_fn=begin,  # noqa: PLW1509  there is only one thread at this point
         )
     print(firmware.pid, flush=True)
     for relay in relays:

@@ -1,9 +1,9 @@
-"""Ports of several firmwares on one computer: find free ones, and isolate firmware with fixed ports in a network.
+"""Ports for several firmware processes on one computer: find free ones, or isolate firmware that has fixed ports.
 
-Such separate networks exist on Linux only. A socket belongs to the network of its creation, whichever process holds it.
-The firmware's keeper therefore leaves the computer's network before it starts the firmware, creates the datagram socket
-for the firmware there, and passes it on. It relays the bytes of the firmware's TCP port itself, to and from an
-inherited listener.
+Firmware with fixed ports gets a separate network, which is possible only on Linux. A socket belongs to the network in
+which it was created, whichever process holds it. The firmware's keeper therefore leaves the computer's network before
+it starts the firmware, creates the datagram socket for the firmware there, and passes it to the parent. It relays the
+bytes of the firmware's TCP port itself, to and from an inherited listener.
 
 ``python -m skyloop.vehicles.sim.firmware.ports`` exits with 0 if separate networks are possible.
 """
@@ -27,11 +27,11 @@ from skyloop.errors import UsageError
 LOOPBACK: Final = "127.0.0.1"
 
 _lock = threading.Lock()
-_reserved: set[tuple[str, int]] = set()  # instances of this process that may not have opened their ports yet
+_reserved: set[tuple[str, int]] = set()  # instances started by this process that may not have opened their ports yet
 
 
 def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
-    """Return a socket bound to a port on this computer's loopback; 0: any free one."""
+    """Return a socket bound to a loopback port; 0 for any free one."""
     made = socket.socket(socket.AF_INET, kind)
     try:
         if kind is socket.SOCK_STREAM:
@@ -51,7 +51,7 @@ def free_udp_port() -> int:
 
 
 def is_free(kind: socket.SocketKind, port: int) -> bool:
-    """Return whether a port can be opened on all addresses of this computer, as firmware does."""
+    """Return whether a port can be opened on all of this computer's addresses, as firmware does."""
     with socket.socket(socket.AF_INET, kind) as probe:
         if kind is socket.SOCK_STREAM:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -68,16 +68,16 @@ def reserve_instance(
     ports: Callable[[int], Iterable[tuple[socket.SocketKind, int]]],
     runs: Callable[[int], bool] = lambda _: False,
 ) -> int:
-    """Return the first free instance number, and reserve it within this process.
+    """Return the first free instance number and reserve it within this process.
 
     Args:
-        firmware: Its name.
-        most: How many instances its ports allow on a computer.
-        ports: Returns the ports of an instance.
-        runs: Returns whether an instance runs that may not have opened its ports.
+        firmware: The firmware's name.
+        most: Maximum number of instances on a computer that its ports allow.
+        ports: Returns an instance's ports.
+        runs: Returns whether an instance is running, even if it has not opened its ports yet.
 
     Raises:
-        UsageError: None is free.
+        UsageError: No instance number is free.
     """
     with _lock:
         for instance in range(most):
@@ -90,7 +90,7 @@ def reserve_instance(
 
 
 def release_instance(firmware: str, instance: int) -> None:
-    """Free a number from :func:`reserve_instance`."""
+    """Release a number returned by :func:`reserve_instance`."""
     with _lock:
         _reserved.discard((firmware, instance))
 
@@ -107,11 +107,11 @@ class Apart:
     """The parent's side of the connection to a firmware in a separate network.
 
     Attributes:
-        port: TCP port on this computer that leads to the firmware's TCP port.
+        port: TCP port on this computer that is forwarded to the firmware's TCP port.
     """
 
     def __init__(self, udp_port: int, tcp_port: int) -> None:
-        """Open the keepers' sockets. ``udp_port`` is ours in the firmware's network, ``tcp_port`` the firmware's."""
+        """Open the keepers' sockets; in the firmware's network, ``udp_port`` is ours, ``tcp_port`` the firmware's."""
         self._listener = socket.create_server((LOOPBACK, 0))
         self._ours, self._keepers = socket.socketpair()
         self._ours.setblocking(False)
@@ -120,16 +120,16 @@ class Apart:
 
     @property
     def descriptors(self) -> tuple[int, int]:
-        """File descriptors that each keeper inherits."""
+        """The file descriptors that each keeper inherits."""
         return self._listener.fileno(), self._keepers.fileno()
 
     @property
     def option(self) -> str:
-        """Command-line option for each keeper."""
+        """The command-line option for each keeper."""
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the newest keeper's UDP socket, which the caller closes. Raises OSError without a new one."""
+        """Return the newest keeper's UDP socket, to be closed by the caller. Raises OSError if there is no new one."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
@@ -147,10 +147,10 @@ class Apart:
 
 
 class Relay:
-    """The keeper's side. Create it while there is only one thread: this process leaves the computer's network.
+    """The keeper's side. Create it while there is only one thread, because this process leaves the computer's network.
 
     Raises:
-        OSError: That is not allowed.
+        OSError: Leaving the network is not allowed.
     """
 
     def __init__(self, option: str) -> None:
@@ -161,7 +161,7 @@ class Relay:
             socket.send_fds(keepers, [b"."], [made.fileno()])
 
     def start(self) -> None:
-        """Relay bytes from now on, on threads."""
+        """Start the threads that relay bytes."""
         threading.Thread(target=self._serve, name="skyloop-relay", daemon=True).start()
 
     def _serve(self) -> None:
@@ -170,7 +170,7 @@ class Relay:
             try:
                 inside = socket.create_connection((LOOPBACK, self._tcp_port), CONNECT_S)
             except OSError:
-                outside.close()  # no listener yet
+                outside.close()  # there is no listener yet
                 continue
             inside.settimeout(None)
             for ends in ((outside, inside), (inside, outside)):
@@ -188,9 +188,9 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 
 
 def leave_network() -> None:
-    """Move this process into a new network that has only a loopback.
+    """Move this process into a new network that has only a loopback interface.
 
-    This needs root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
+    This requires root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
     """
     if sys.platform != "linux":
         raise OSError("separate networks exist on Linux only")
@@ -203,7 +203,7 @@ def leave_network() -> None:
 
 
 def is_possible() -> bool:
-    """Return whether separate networks are possible here. Asks another process, which takes a moment."""
+    """Return whether separate networks are possible here. This starts another process, which takes a moment."""
     command: Sequence[str] = (sys.executable, "-m", "skyloop.vehicles.sim.firmware.ports")
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 

@@ -1,4 +1,4 @@
-"""A flight firmware as a child process: find it, start it in its own folder, watch it, restart it, end it."""
+"""Flight firmware as a child process: find it, start it in its own folder, monitor it, restart it and end it."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from skyloop.errors import SkyloopError, UsageError
 from skyloop.vehicles.sim.firmware.keeper import PROMPT
 from skyloop.vehicles.sim.firmware.ports import Apart
 
-RESTART_S: Final = 1.0  #: from the firmware's end to its next start; doubled after each early end
+RESTART_S: Final = 1.0  #: time from the firmware's end to its next start, doubled after each early end
 LONGEST_RESTART_S: Final = 30.0
-SOON_S: Final = 10.0  #: a process that ends within this time ended early
-AT_ONCE: Final = 5  #: consecutive failed starts that are retried without a pause
+SOON_S: Final = 10.0  #: a process that ends within this time has ended early
+AT_ONCE: Final = 5  #: number of consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
 _LAST_LINES: Final = 5
 _LAST_BYTES: Final = 2000
 
 
 class FirmwareEventKind(StrEnum):
-    """Events of a firmware."""
+    """Kinds of events that firmware causes."""
 
-    STARTED = "started"  #: its process runs
-    ANSWERS = "answers"  #: it controls the rotors, for the first time or again
-    SILENT = "silent"  #: it has not answered for a while, and the rotors stop
-    DIED = "died"  #: its process ended and is restarted
+    STARTED = "started"  #: its process is running
+    ANSWERS = "answers"  #: it is controlling the rotors, for the first time or again
+    SILENT = "silent"  #: it has not replied for a while, so the rotors stop
+    DIED = "died"  #: its process ended and is being restarted
     FAILED = "failed"  #: it could not be started; the start is retried
-    DEAF = "deaf"  #: its process ran and did not answer; another one starts at once
+    DEAF = "deaf"  #: its process ran but did not reply; another one is started at once
 
 
 class StartedInVainError(OSError):
-    """The process runs but will never answer: end it, and restart it at once."""
+    """Raised if the process is running but will never reply, so that it must be restarted at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class FirmwareEvent:
-    """An event of a firmware. ``text`` is for people."""
+    """An event caused by firmware. ``text`` is readable."""
 
     kind: FirmwareEventKind
     text: str
@@ -58,25 +58,25 @@ class Launch:
     """A firmware's command and environment."""
 
     command: Sequence[str]
-    environment: Mapping[str, str] = field(default_factory=dict)  #: in addition to this process's
+    environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
     prompt: bool = (
         False  #: whether it needs prompt wake-ups; see :func:`~skyloop.vehicles.sim.firmware.keeper.become_prompt`
     )
-    apart: Apart | None = None  #: for a separate network
+    apart: Apart | None = None  #: for running in a separate network
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
-        """Start it in a folder, under a keeper."""
+        """Start the firmware in a folder, under a keeper."""
         descriptors = () if self.apart is None else self.apart.descriptors
         return ChildProcess(keeper_command(self, folder, log), inherited=descriptors)
 
 
 class Program:
-    """A firmware's process, restarted whenever it ends, until :meth:`close`.
+    """A firmware process that is restarted whenever it ends, until :meth:`close`.
 
     Attributes:
         name: The firmware's name in messages.
         starts: Number of starts.
-        pid: Its process id; 0 while it does not run.
+        pid: The process id; 0 while it is not running.
     """
 
     def __init__(
@@ -89,17 +89,17 @@ class Program:
         folder: Path | None = None,
         restart_s: float = RESTART_S,
     ) -> None:
-        """Store the arguments; :meth:`start` starts it.
+        """Store the arguments; :meth:`start` starts the process.
 
         Args:
             name: The firmware's name in messages.
             prepare: Called before each start with the working folder; writes the files that the firmware reads there.
                 Raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if it can't be started now.
-            report: Called with each event, on a thread of this object.
-            verify: Called once its process runs, before the start is reported; raises ``OSError`` for a failed start,
-                which is then ended and retried; :class:`StartedInVainError`: at once. None: no check.
-            folder: Working folder with its settings; None: a new one, removed at the end.
-            restart_s: Time from its end to its next start [s].
+            report: Called with each event, on one of this object's threads.
+            verify: Called once the process is running, before the start is reported; None for no check. Raises
+                ``OSError`` to have it ended and restarted, or :class:`StartedInVainError` to do that at once.
+            folder: Working folder with the firmware's settings; None for a new one that is removed at the end.
+            restart_s: Time from the process's end to its next start [s].
         """
         self.name = name
         self.starts = 0
@@ -116,16 +116,16 @@ class Program:
 
     @property
     def running(self) -> bool:
-        """Whether its process runs."""
+        """Whether the process is running."""
         return self.pid != 0
 
     def start(self) -> None:
-        """Start it, on a thread that then watches it."""
+        """Start the process on a thread that then monitors it."""
         self._thread = threading.Thread(target=self._run, name="skyloop-firmware", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End the process. Idempotent."""
         with self._lock:
             self._ending.set()
             child = self._child
@@ -165,7 +165,7 @@ class Program:
             pause_s = min(2 * pause_s, LONGEST_RESTART_S) if soon else self._restart_s
 
     def _run_once(self, folder: Path) -> str:
-        """Run it until it ends; return a description of its end."""
+        """Run the process until it ends; return a description of how it ended."""
         launch = self._prepare(folder)
         with self._lock:
             if self._ending.is_set():
@@ -183,7 +183,7 @@ class Program:
                     self._verify()
             except StartedInVainError:
                 if child.code is None:
-                    raise  # otherwise it died, which is reported with its output
+                    raise  # otherwise the process died, which is reported with its output
             self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
             child.wait()
             return _ending(child.code)
@@ -204,7 +204,7 @@ def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
 
 
 def find_program(variable: str, names: Sequence[str], what: str, where: str) -> str:
-    """Return the path of a firmware's program: the variable's value, or one of these names on the search path."""
+    """Return the path of the firmware's program, from the variable or by one of these names on the search path."""
     given = os.environ.get(variable)
     if given:
         path = Path(given).expanduser()
@@ -219,7 +219,7 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
 
 
 def _ending(code: int | None) -> str:
-    with suppress(ValueError, TypeError):  # 255 is a program's own exit code, as is -1
+    with suppress(ValueError, TypeError):  # like -1, 255 is the program's own exit code
         return f"was killed by {signal.Signals((code or 0) - 128).name}"
     return f"ended with exit code {code}"
 

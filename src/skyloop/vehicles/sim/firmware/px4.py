@@ -1,7 +1,7 @@
-"""PX4 in the simulated world, through MAVLink's messages for hardware in the loop and in step with it.
+"""PX4 in the simulated world, connected through MAVLink's hardware-in-the-loop messages and running in step with it.
 
-PX4 connects to a TCP server, port 4560 plus one for each further vehicle. ``HIL_SENSOR`` is its clock: it answers
-each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
+PX4 connects to a TCP server on port 4560, plus one for each further vehicle. ``HIL_SENSOR`` is its clock: PX4 replies
+to each with ``HIL_ACTUATOR_CONTROLS`` once its startup has reached the point where it drives motors.
 https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 """
 
@@ -33,30 +33,30 @@ WHERE: Final = (
 )
 MODEL: Final = "none_iris"  #: PX4's quadrotor for an external simulator
 AIRFRAME: Final = "10016"
-SIMULATOR_PORT = 4560  # each of these ports plus the number of the instance
+SIMULATOR_PORT = 4560  # to which the instance number is added
 TELEMETRY_PORT = 14540
 COMPANION_PORT = 14580
 STATION_PORT = 18570
-MOST_INSTANCES: Final = 10  #: with more, PX4 would use one port for all further vehicles
-STEPS: Final = 4  #: steps of the plant per step of PX4: 250 Hz, as its startup script for such simulators expects
+MOST_INSTANCES: Final = 10  #: maximum number of instances, as PX4 would use the same port for all further vehicles
+STEPS: Final = 4  #: simulation steps per step of PX4: 250 Hz, as its startup script for such simulators expects
 STEP_US: Final = 4000
-TRUTH_EVERY: Final = 5  #: period in its steps
+TRUTH_EVERY: Final = 5  #: number of its steps from one truth message to the next
 RANGE_EVERY: Final = 10
-PROBE_EVERY: Final = 25  #: period in its steps, while it is silent
+PROBE_EVERY: Final = 25  #: number of its steps between probes while it is silent
 LOCK_FILE = "/tmp/px4_lock"
-MAX_BACKLOG: Final = 4096  #: unsent bytes that mean PX4 has stopped reading
+MAX_BACKLOG: Final = 4096  #: number of unsent bytes that means that PX4 has stopped reading
 MAX_READ: Final = 65536
-#: Parameters of this vehicle; without a remote control it must hold its position when set-points stop.
+#: Parameters for this vehicle. Without a remote control, it must hold position when set-points stop.
 PARAMETERS: Final = {
     "MPC_THR_HOVER": "0.7",
-    "THR_MDL_FAC": "0.78",  # thrust is the square of a speed that starts at an eighth of full speed
+    "THR_MDL_FAC": "0.78",  # thrust is the square of rotor speed, which starts at an eighth of full speed
     "COM_OBL_RC_ACT": "5",
 }
-#: Names of the parameter for the delay of fixes [ms], before and since early 2026; each version ignores the other one.
-#: PX4's startup for simulators sets 10. An underestimated delay turns PX4's heading while it flies circles in one
-#: direction, because each fix has an outdated velocity.
+#: Names of the parameter for the GPS delay [ms] before and since early 2026; each version ignores the other name. PX4's
+#: startup for simulators sets 10. Because each fix has an outdated velocity, an underestimated delay turns PX4's
+#: heading while it flies circles in one direction.
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
-_EVERYTHING: Final = 0b1_1011_1111_1111  #: all readings except the differential pressure are new
+_EVERYTHING: Final = 0b1_1011_1111_1111  #: flags which say that all readings except the differential pressure are new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
 _SYSTEM, _COMPONENT = 1, 200
 _DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
@@ -65,7 +65,7 @@ _UNKNOWN_COURSE: Final = 65535
 
 
 class Px4(CoupledFirmware):
-    """PX4, flying a simulated drone. See :class:`CoupledFirmware`."""
+    """PX4 flying a simulated drone. See :class:`CoupledFirmware`."""
 
     NAME: ClassVar[str] = "PX4"
 
@@ -87,15 +87,15 @@ class Px4(CoupledFirmware):
         self._link: socket.socket | None = None
         self._backlog = b""
         self._step = 0
-        self._sent = 0  # states
-        self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer since the last state
+        self._sent = 0  # number of states sent
+        self._inertial: list[tuple[float, ...]] = []  # gyro and accelerometer readings since the last state
         self._fix: GpsFix | None = None
-        self._own_us = STEP_US  # PX4's time, which pauses while it is silent
-        self._wanted_us = 0  # commands older than this answer an earlier state
+        self._own_us = STEP_US  # PX4's own time, which pauses while it is silent
+        self._wanted_us = 0  # commands older than this are replies to an earlier state
 
     @property
     def address(self) -> str:
-        """Address of its MAVLink. A ground station on UDP port 14550 of this computer finds it as well."""
+        """Its MAVLink address. A ground station that listens on this computer's UDP port 14550 finds it as well."""
         i = self._instance
         assert i is not None, "not started"
         peer = f"peer={LOOPBACK}:{COMPANION_PORT + i}"
@@ -112,7 +112,7 @@ class Px4(CoupledFirmware):
         self._server.setblocking(False)
 
     def _files(self) -> Path:
-        """Return the folder of PX4's startup scripts, next to the program's."""
+        """Return the folder with PX4's startup scripts, which is next to the program's."""
         return Path(self._program).resolve().parent.parent / "etc"
 
     def _close(self) -> None:
@@ -124,7 +124,7 @@ class Px4(CoupledFirmware):
             release_instance(self.NAME, self._instance)
             self._instance = None
 
-    def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  its parameters are in its working folder
+    def _prepare(self, folder: Path) -> Launch:  # noqa: ARG002  its parameters are kept in its working folder
         environment = {"PX4_SIM_MODEL": MODEL, "PX4_SYS_AUTOSTART": AIRFRAME, "PX4_SIM_HOSTNAME": LOOPBACK}
         parameters = {**PARAMETERS, **dict.fromkeys(GPS_DELAYS, str(self._gps_delay_ms))}
         if not self.keeps_folder:
@@ -200,7 +200,7 @@ class Px4(CoupledFirmware):
         if self._link is None:
             return
         if self._owed and not self._patient and self._answered_s is not None and self._step % (STEPS * PROBE_EVERY):
-            return  # it hangs: data sent now would be outdated when it reads again
+            return  # it hangs: data sent now would be outdated by the time it reads again
         messages = [*self._due(readings), self._sensor(readings, inertial)]
         self._transmit(b"".join(self._codec.encode(message) for message in messages))
         self._wanted_us = self._own_us if self._patient else 0
@@ -209,7 +209,7 @@ class Px4(CoupledFirmware):
         self._owed = True
 
     def _due(self, readings: Readings) -> list[Any]:
-        """Return the messages due at lower rates, which go before the message that advances PX4's clock."""
+        """Return the messages due at lower rates, to be sent before the message that advances PX4's clock."""
         due = []
         if self._fix is not None:
             due.append(self._gps(self._fix))
@@ -302,7 +302,7 @@ class Px4(CoupledFirmware):
 
 
 def _commands(controls: list[float]) -> Commands | None:
-    """Return rotor commands in the simulation's order, or None without any. PX4's X has ArduCopter's order."""
+    """Return rotor commands in the simulation's order, or None if there are none. PX4's X has ArduCopter's order."""
     motors = controls[:4]
     if not all(map(math.isfinite, motors)):
         return None
@@ -311,20 +311,20 @@ def _commands(controls: list[float]) -> Commands | None:
 
 
 def _runs(instance: int) -> bool:
-    """Return whether a PX4 holds the lock of this instance: another one would end at once, even with free ports."""
+    """Return whether a PX4 holds this instance's lock, in which case another one would exit at once."""
     if sys.platform != "linux":
         return False
-    asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock: the whole file
+    asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock for the whole file
     try:
         with Path(f"{LOCK_FILE}-{instance}").open("rb") as file:
             answer = fcntl.fcntl(file, fcntl.F_GETLK, asked)
     except OSError:
-        return False  # no lock file
+        return False  # there is no lock file
     return int(struct.unpack("hhqqi", answer)[0]) != fcntl.F_UNLCK
 
 
 def _ports(instance: int) -> list[tuple[socket.SocketKind, int]]:
-    """Return the ports of an instance: the simulator's, PX4's own, and the recipient port of its telemetry."""
+    """Return an instance's ports: the simulator's, PX4's own, and the port to which it sends telemetry."""
     return [
         (socket.SOCK_STREAM, SIMULATOR_PORT + instance),
         (socket.SOCK_DGRAM, COMPANION_PORT + instance),

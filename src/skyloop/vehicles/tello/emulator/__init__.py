@@ -1,6 +1,6 @@
-"""Emulate a Ryze Tello on the network over a simulated vehicle, for any program that flies the real one.
+"""An emulated Ryze Tello on the network, flying a simulated vehicle, for any program that flies the real one.
 
-At an address of this machine, for a test::
+To use it at a local address, as in a test::
 
     from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
     from skyloop.sim.host import SimHost
@@ -11,8 +11,8 @@ At an address of this machine, for a test::
         firmware.port  # UDP, where it takes commands
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-State and video go to ports 8890 and 11111 of the sender of ``command``, or to those set by ``port`` (SDK 3.0).
-``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` drops datagrams in both directions.
+State and video go to ports 8890 and 11111 of the host that sent ``command``, or to those set by ``port`` (SDK 3.0).
+``faults=Faults(seed=1, drop=0.1)`` drops datagrams in both directions (see :mod:`skyloop.faults`).
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
 
 REPORTS_HZ: Final = 50.0
-TAKEOFF_ALTITUDE_M: Final = 0.8  #: as in a recorded flight
+TAKEOFF_ALTITUDE_M: Final = 0.8  #: height at the end of a take-off, as in a recorded flight
 
-#: Small and light. Mass, size and time of flight: Ryze, Tello specifications; rotors of 3 inches. The rest is the
-#: simulator's own vehicle.
+#: A small, light drone. Mass, size and flight time come from Ryze's Tello specifications; it has 3-inch rotors. The
+#: rest is as for the simulator's own vehicle.
 TELLO: Final = VehicleParameters(
     mass_kg=0.087,
     radius_m=0.1,
     half_height_m=0.02,
     rotor_radius_m=0.038,
     rotor_height_m=0.03,
-    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s between leaving the ground and hovering, in a recorded flight
+    takeoff_climb_m_s=0.7,  # 0.8 m in the 1.3 s from leaving the ground to hovering, in a recorded flight
     battery_full_v=4.35,
     battery_empty_v=3.3,
     battery_charge_c=3960.0,  # 1100 mAh
     battery_resistance_ohm=0.03,
-    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, less the electronics
+    hover_power_w=17.0,  # 4.18 Wh in 13 minutes, minus the electronics
     electronics_power_w=2.0,
 )
 LIMITS: Final = Limits(
@@ -69,11 +69,11 @@ LIMITS: Final = Limits(
     climb_m_s=FULL_CLIMB_M_S,
     yaw_rate_rad_s=FULL_YAW_RATE_RAD_S,
     altitude_m=10.0,
-    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # both sticks in their corners
+    speed_m_s=FULL_SPEED_M_S * 2**0.5,  # with the stick in a corner
     takeoff_altitude_m=TAKEOFF_ALTITUDE_M,
 )
 
-#: Calibration of one drone, published with tello_ros, for pictures of 960×720.
+#: The calibration of one drone for 960×720 images, published with tello_ros.
 FRONT: Final = replace(
     FRONT_CAMERA,
     width=960,
@@ -86,47 +86,47 @@ FRONT: Final = replace(
     distortion=(-0.033458, 0.105152, 0.001256, -0.006647, 0.0),
     position_m=(0.05, 0.0, 0.0),
 )
-BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: its lens is an estimate
+BOTTOM: Final = replace(BOTTOM_CAMERA, width=320, height=240, fps=30.0)  #: the lens is an estimate
 
 
 def with_tellos(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world whose drones are Tellos. The firmware brings its own cameras and ignores others."""
+    """Return the options for a world of Tellos. The firmware has its own cameras and ignores those in the options."""
     return replace(options or SimOptions(), parameters=TELLO, rate_hz=REPORTS_HZ, cameras=())
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
+    """The arguments passed to :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
 
     sdk: Sdk
     bind: str
     port: int
     faults: Faults
     delay_s: float
-    pads: Mapping[int, tuple[float, float]]  #: by number: x, y in the world
+    pads: Mapping[int, tuple[float, float]]  #: x and y in the world by pad number
 
 
 STATE_HZ: Final = 10.0
-GROUP: Final = 30  #: pictures between keys
-FULL_KBPS: Final = 2500  #: pictures of 10 kB
+GROUP: Final = 30  #: number of images from one key frame to the next
+FULL_KBPS: Final = 2500  #: results in images of 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
 
 
 def automatic_kbps(loss: float) -> int:
-    """Return the bitrate for a share of lost datagrams. An estimate: a Tello adapts its bitrate, by an unknown rule."""
+    """Return the bitrate for a fraction of lost datagrams. An estimate: how a Tello adapts its bitrate is unknown."""
     return max(LEAST_KBPS, round(FULL_KBPS * (1 - 9 * loss)))
 
 
 class TelloPacker:
-    """Packs pictures to H.264 as a Tello does."""
+    """Encodes images in H.264 as a Tello does."""
 
     def __init__(self) -> None:
         self._made: tuple[tuple[int, int, float, int], Encoder] | None = None
         self.size = (FRONT.width, FRONT.height)
 
     def pack(self, picture: NDArray[np.uint8], settings: OneCamera, _captured_ns: int) -> Piece | None:
-        """Encode a picture; None if the encoder returned nothing."""
+        """Encode an image; None if the encoder returned nothing."""
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -172,7 +172,7 @@ class RunningFirmware(RunningEmulator):
 
     @property
     def port(self) -> int:
-        """The real UDP port for commands."""
+        """The actual UDP port for commands."""
         return self._commands.port
 
     def _datagrams(self, name: str, port: int) -> DatagramPort:
@@ -208,7 +208,7 @@ class RunningFirmware(RunningEmulator):
         return OneCamera("bottom" if logic.looks_down else "front", logic.fps, kbps)
 
     def _update_video(self) -> None:
-        """Apply the video configuration."""
+        """Apply the configured video settings."""
         logic, wanted = self.logic, self._wanted_video()
         self._packer.size = (BOTTOM.width, BOTTOM.height) if logic.looks_down else logic.size
         if wanted == self._shown:
@@ -218,7 +218,7 @@ class RunningFirmware(RunningEmulator):
             camera.model = replace(camera.model, fps=wanted.fps)
 
     def _encoded(self, piece: Piece) -> None:
-        """Send a picture. Runs on the encoder's thread."""
+        """Send an encoded image. Runs on the encoder's thread."""
         self._loop.post(lambda: self._send_video(piece))
 
     def _send_video(self, piece: Piece) -> None:
@@ -231,28 +231,28 @@ class RunningFirmware(RunningEmulator):
     # Called by the host on its threads ---------------------------------------------------------------------------
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the frame rate for this camera: the full one, or 0 without a client."""
+        """Return the frame rate to render this camera at: its full rate, or 0 if there is no client."""
         return super().wanted_fps(camera) if self.logic.streaming and self.logic.client is not None else 0.0
 
 
 class TelloFirmware(Emulator[RunningFirmware]):
     """The firmware of one drone in a host's world. Several can share a host, each with its own drone and address.
 
-    Make the host with :func:`with_tellos`.
+    Create the host with options from :func:`with_tellos`.
 
     Args:
         host: The simulated world.
-        drone: Its number in that world.
+        drone: Number of the drone in that world.
         sdk: 1.3, 2.0 or 3.0.
-        bind: The address of this machine to listen on.
-        port: UDP, for commands; 0 for any free one.
-        faults: Injected into all datagrams, in both directions.
-        delay_s: Added to all datagrams, in each direction.
-        pads: Mission pads on the floor, by their number from 1 to 8: x and y in world axes [m].
+        bind: The local address to listen on.
+        port: UDP port for commands; 0 for any free one.
+        faults: Faults injected into all datagrams in both directions.
+        delay_s: Delay added to all datagrams in each direction.
+        pads: Mission pads on the floor: x and y in world axes [m] by pad number from 1 to 8.
 
     Raises:
         UsageError: An argument is invalid.
-        MissingExtraError: A library that draws or encodes pictures is not installed.
+        MissingExtraError: A library that renders or encodes images is not installed.
     """
 
     def __init__(
@@ -278,15 +278,15 @@ class TelloFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, port=running.port)  # kept for a restart
+        self.settings = replace(self.settings, port=running.port)  # keeps the port for a restart
         return running
 
     @property
     def port(self) -> int:
-        """The real port; a free one was chosen for 0."""
+        """The actual port, which was chosen if 0 was given."""
         return self._started.port
 
     @property
     def logic(self) -> TelloLogic:
-        """The state of the running firmware, for tests; belongs to the loop's thread."""
+        """The logic of the running firmware, for tests. Belongs to the loop's thread."""
         return self._started.logic

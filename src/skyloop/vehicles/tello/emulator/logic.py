@@ -1,9 +1,9 @@
-"""The Tello's logic: execute commands one at a time, within Ryze's limits (SDK 1.3, 2.0), and answer them.
+"""The Tello's logic: executes and answers commands one at a time, within Ryze's limits (SDK 1.3, 2.0).
 
-Pure: the clock is an argument, and answers go to a function.
+Pure: the clock is an argument, and replies are passed to a function.
 
-Answers that no guide lists ("error Motor stop", "error Not joystick", "error No valid marker") were reported by users;
-in which case real firmware sends which is not verified.
+Replies that are not in any guide ("error Motor stop", "error Not joystick", "error No valid marker") were reported by
+users. When exactly real firmware sends them has not been verified.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Range = tuple[int, int]
 _MOVE: Final[tuple[Range, ...]] = ((20, 500),)
 _SPEED: Final[Range] = (10, 100)
 _PLACE: Final[tuple[Range, ...]] = ((-500, 500),) * 3
-_LEAST_CM: Final = 20  # at least one coordinate of a position must be this large
+_LEAST_CM: Final = 20  # at least one coordinate of a position must have this magnitude
 
 MOVES: Final = {
     "up": (0, 0, 1),
@@ -50,7 +50,7 @@ MOVES: Final = {
     "forward": (1, 0, 0),
     "back": (-1, 0, 0),
 }  #: forward, left, up
-#: Command: the first SDK that has it, and the ranges of its integers.
+#: First SDK with each command, and the ranges of its integers.
 NUMBERS: Final[dict[str, tuple[Sdk, tuple[Range, ...]]]] = {
     **dict.fromkeys(MOVES, (Sdk.V1_3, _MOVE)),
     "cw": (Sdk.V1_3, ((1, 3600),)),
@@ -64,11 +64,11 @@ NUMBERS: Final[dict[str, tuple[Sdk, tuple[Range, ...]]]] = {
     "setbitrate": (Sdk.V3_0, ((0, 5),)),
     "downvision": (Sdk.V3_0, ((0, 1),)),
 }
-_FULL_TURN: Final = 360  # the largest turn from SDK 2.0 on
+_FULL_TURN: Final = 360  # the largest turn since SDK 2.0
 
 
 def numbers_of(name: str, words: list[str], sdk: Sdk) -> list[int] | str:
-    """Return the numbers of a command, or the Tello's answer if it refuses them."""
+    """Return the numbers in a command, or the Tello's reply if it refuses them."""
     _, ranges = NUMBERS[name]
     if len(words) != len(ranges):
         return "error"
@@ -88,7 +88,7 @@ def _refusal(sdk: Sdk) -> str:
     return "error" if sdk is Sdk.V1_3 else OUT_OF_RANGE
 
 
-USUAL_SPEED_CM_S: Final = 50  #: until ``speed`` sets another
+USUAL_SPEED_CM_S: Final = 50  #: speed until ``speed`` sets another one
 FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
 SIZES: Final = {"high": (960, 720), "low": (640, 480)}
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
@@ -97,7 +97,7 @@ _SDK_NUMBERS: Final = {Sdk.V2_0: "20", Sdk.V3_0: "30"}
 
 
 class TelloLogic:
-    """The logic of one drone. Not thread-safe. Answers go to a function, with their recipient's address."""
+    """The logic of one drone. Not thread-safe. Replies are passed to a function, with their recipient's address."""
 
     def __init__(
         self,
@@ -116,10 +116,10 @@ class TelloLogic:
         self._pads = pads
         self._link_quality = link_quality
         self._report: Report | None = None
-        self._job: tuple[Job, Address | None] | None = None  # with the recipient of the answer
+        self._job: tuple[Job, Address | None] | None = None  # the running job, with the recipient of its reply
         self._received_ns = clock()
         self._speed_cm_s = USUAL_SPEED_CM_S
-        self._start: tuple[float, float] | None = None  # yaw when switched on, altitude at take-off
+        self._start: tuple[float, float] | None = None  # yaw at switch-on, altitude at take-off
         self._motor_s = 0.0
         self._before_s: float | None = None
         self.client: str | None = None  #: the recipient of state and video; None before ``command``
@@ -130,13 +130,13 @@ class TelloLogic:
         self.looks_for_pads = False
         self.fps = FPS["high"]
         self.size = SIZES["high"]
-        self.bitrate_mbps = 0  #: 0: adapted to the link
-        self.unknown = 0  #: datagrams that are not commands
+        self.bitrate_mbps = 0  #: 0 to adapt to the link
+        self.unknown = 0  #: number of datagrams that were not commands
 
     # Receiving -------------------------------------------------------------------------------------------------
 
     def receive(self, datagram: bytes, sender: Address) -> None:
-        """Execute a command and answer it. Never raises for any content."""
+        """Execute a command and reply to it. Never raises, whatever the content."""
         text = decoded(datagram)
         if not text or (self.client is None and text != ENTER):
             self.unknown += 1
@@ -149,7 +149,7 @@ class TelloLogic:
             self._answer(reply, sender)
 
     def supervise(self, report: Report) -> None:
-        """Handle the newest report of the vehicle and continue the present command. Called regularly."""
+        """Handle the vehicle's newest report and continue the present command. Called regularly."""
         truth = report.truth
         if self._start is None:
             self._start = report.believed.yaw_rad, report.believed.altitude_m
@@ -159,7 +159,7 @@ class TelloLogic:
         self._report = report
         if truth.state is FlightState.EMERGENCY:
             self._job = None
-            self._vehicle.command(ResetEmergency())  # effective once it lies: a Tello has no emergency state
+            self._vehicle.command(ResetEmergency())  # takes effect on the ground: a Tello has no emergency state
         if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:
@@ -176,7 +176,7 @@ class TelloLogic:
     # Sending ---------------------------------------------------------------------------------------------------
 
     def state_string(self) -> bytes | None:
-        """Return the present state; None before the first report."""
+        """Return the present state string; None before the first report."""
         snapshot = self._snapshot()
         return None if snapshot is None else telemetry.state_string(snapshot, self._sdk)
 
@@ -194,7 +194,7 @@ class TelloLogic:
     # Commands --------------------------------------------------------------------------------------------------
 
     def _obey(self, text: str, sender: Address) -> str | None:
-        """Execute a command. Return the answer, or None if there is none or not yet."""
+        """Execute a command. Return the reply, or None if there is none or it comes later."""
         name, *words = text.split()
         if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
             return f"unknown command: {text}"
@@ -239,7 +239,7 @@ class TelloLogic:
             self.bitrate_mbps = numbers[0]
         elif name == "downvision":
             self.looks_down = bool(numbers[0])
-        return OK  # mdirection: pads are seen regardless
+        return OK  # mdirection: pads are seen whatever it is
 
     def _configure(self, name: str, words: list[str], text: str) -> str:
         if name in ("streamon", "streamoff"):
@@ -282,13 +282,13 @@ class TelloLogic:
 
     def _land(self, sender: Address) -> str | None:
         if self._vehicle.state in (FlightState.LANDED, FlightState.EMERGENCY):
-            self._job = None  # a take-off before it leaves the ground
+            self._job = None  # cancels a take-off that has not left the ground yet
             return "error Motor stop"
         self._job = Landing(), sender
         return None
 
     def _follow(self, sticks: list[int]) -> None:
-        """Handle ``rc``, which is never answered and has no effect during a manoeuvre."""
+        """Handle ``rc``, which gets no reply and has no effect during a manoeuvre."""
         if self._vehicle.state not in _FLYING or not isinstance(self._job[0] if self._job else None, Rising | None):
             return
         right, forward, up, clockwise = (stick / MAX_STICK for stick in sticks)
@@ -339,7 +339,7 @@ class TelloLogic:
         return None
 
     def _places(self, offsets_cm: list[list[int]], pad: str | None) -> list[Vec3] | None:
-        """Return places in world axes: relative to here and the heading, or to a pad; None if the pad is not seen."""
+        """Return positions in world axes, given relative to the drone or to a pad; None if the pad is not in view."""
         assert self._report is not None
         truth = self._report.truth
         base, heading = truth.position_m, truth.yaw_rad

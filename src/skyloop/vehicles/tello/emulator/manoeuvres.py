@@ -1,4 +1,4 @@
-"""Commands of a Tello that take time and are answered at their end. Pure: driven by reports."""
+"""Tello commands that take time and are answered when they end. Pure: driven by reports."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
 
 OK: Final = "ok"
-SPIN_UP_S: Final = 0.8  #: before a take-off leaves the ground; airborne after 1.1 s in a recorded flight
-RISES_WITHIN_S: Final = 0.5  #: of simulated time; otherwise the take-off was refused for a low battery
-TAKEOFF_ANSWER_S: Final = 8.7  #: after the command in the same flight, though it hovers long before
-FLIP_S: Final = 1.5  #: estimate; the simulated vehicle does not turn over
-TURN_RAD_S: Final = 1.0  #: estimate
-PATIENCE_S: Final = 30.0  #: a command that takes longer has failed
-_NEAR_M: Final = 0.06  # distance at the end of a move
-_SLOW_M_S: Final = 0.12  # speed at the end of a move
-_NEAR_RAD: Final = 0.03  # remaining angle at the end of a turn
+SPIN_UP_S: Final = 0.8  #: time before a take-off leaves the ground; a recorded flight was airborne after 1.1 s
+RISES_WITHIN_S: Final = 0.5  #: if it has not risen within this simulated time, take-off was refused for a low battery
+TAKEOFF_ANSWER_S: Final = 8.7  #: time from command to reply in the same flight, although it hovered long before
+FLIP_S: Final = 1.5  #: duration of a flip, an estimate; the simulated vehicle does not turn over
+TURN_RAD_S: Final = 1.0  #: yaw rate of a turn, an estimate
+PATIENCE_S: Final = 30.0  #: a command that takes longer than this fails
+_NEAR_M: Final = 0.06  # a move ends within this distance …
+_SLOW_M_S: Final = 0.12  # … and below this speed
+_NEAR_RAD: Final = 0.03  # a turn ends within this angle
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
-#: The vehicle's next command, and the answer if the job is over.
+#: The vehicle's next command, and the reply if the job is over.
 Step = tuple[AnyAction | None, str | None]
 
 
 class Job(Protocol):
-    """The work of one command."""
+    """The execution of one command."""
 
     def step(self, report: Report) -> Step: ...
 
@@ -41,7 +41,7 @@ class Rising:
         self._commanded_s: float | None = None
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         now_s, state = report.truth.time_s, report.truth.state
         elapsed_s = now_s - self._begun_s
         if self._commanded_s is None:
@@ -50,16 +50,16 @@ class Rising:
             self._commanded_s = now_s
             return Takeoff(), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
-            # Counted from the command: on a busy machine this step may run late.
+            # Measured from the command, because this step may run late on a busy machine.
             return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
 
 
 class Landing:
-    """``land``, and the Tello's landing when it receives no commands."""
+    """``land``, and the Tello's automatic landing if it receives no commands."""
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
             return None, OK
         return (None if report.truth.state is FlightState.LANDING else Land()), None
@@ -72,7 +72,7 @@ class Flipping:
         self._until_s = report.truth.time_s + FLIP_S
 
     def step(self, report: Report) -> Step:
-        """Return the answer at the end."""
+        """Return the reply at the end."""
         return None, OK if report.truth.time_s >= self._until_s else None
 
 
@@ -80,8 +80,8 @@ class Turning:
     """``cw`` and ``ccw``.
 
     Args:
-        report: The present one.
-        by_rad: Counter-clockwise; may be several turns.
+        report: The present report.
+        by_rad: Angle, positive counter-clockwise; may be several turns.
     """
 
     def __init__(self, report: Report, by_rad: float) -> None:
@@ -89,7 +89,7 @@ class Turning:
         self._yaw_rad = report.truth.yaw_rad
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         self._left_rad -= wrap_angle(report.truth.yaw_rad - self._yaw_rad)
         self._yaw_rad = report.truth.yaw_rad
         if abs(self._left_rad) < _NEAR_RAD:
@@ -101,7 +101,7 @@ class Going:
     """Moves, ``go`` and ``curve``.
 
     Args:
-        report: The present one.
+        report: The present report.
         places: Waypoints in world axes [m].
         speed_m_s: Speed along the way.
     """
@@ -112,7 +112,7 @@ class Going:
         self._until_s = report.truth.time_s + PATIENCE_S
 
     def step(self, report: Report) -> Step:
-        """Return the next command, and the answer at the end."""
+        """Return the next command, and the reply at the end."""
         truth = report.truth
         if truth.time_s > self._until_s:
             return Hover(), "error"

@@ -1,4 +1,4 @@
-"""A Tello's state strings, its answers to questions, and its view of mission pads on the floor. Pure."""
+"""A Tello's state strings, its replies to queries, and its detection of mission pads on the floor. Pure."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from skyloop.sim.reports import VehicleTruth
 from skyloop.vehicles.tello.wire import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
 
 MOST: Final = 8
-LOWEST_M: Final = 0.3  #: pads are recognised between these heights; estimates
+LOWEST_M: Final = 0.3  #: pads are recognised between this height and the next; estimates
 HIGHEST_M: Final = 1.2
-_VIEW: Final = 0.5  # as a share of the height: horizontal reach of the camera that looks down; estimate
+_VIEW: Final = 0.5  # horizontal reach of the downward camera as a fraction of the height; an estimate
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A pad below and the drone's position above it, in world axes, as all pads are aligned with them."""
+    """A pad below, and the drone's position above it in world axes, with which all pads are aligned."""
 
     number: int
     place_m: tuple[float, float, float]
 
 
 def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighting | None:
-    """Return the nearest pad in view by number, from pads at x and y in world axes [m]."""
+    """Return the nearest pad in view; ``pads`` has x and y in world axes [m] by pad number."""
     x, y, z = truth.position_m
     if not LOWEST_M <= z <= HIGHEST_M:
         return None
@@ -40,28 +40,28 @@ def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighti
     return Sighting(nearest, (x - east, y - north, z))
 
 
-FARTHEST_CM: Final = 400  #: range of the distance sensor; estimate
+FARTHEST_CM: Final = 400  #: range of the distance sensor; an estimate
 COLD_C: Final = 60  #: lowest reported temperature; a simulated drone does not warm up
-BAROMETER_CM: Final = -6000  #: an arbitrary zero, as in real drones
+BAROMETER_CM: Final = -6000  #: the barometer's reading at height 0, which is arbitrary as in real drones
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The state of one instant."""
+    """The state at one instant."""
 
     report: Report
-    start_yaw_rad: float  #: when switched on
-    start_altitude_m: float  #: at the take-off
+    start_yaw_rad: float  #: yaw at switch-on
+    start_altitude_m: float  #: altitude at take-off
     motor_s: int
     pad: Sighting | None = None
 
 
 def fields(snapshot: Snapshot) -> dict[str, str]:
-    """Return all values, as text, in the drone's own units and axes."""
+    """Return all values as text, in the drone's own units and axes."""
     believed = snapshot.report.believed
     yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
     forward, left, up = believed.velocity_m_s
-    ahead, aside = turned(forward, left, yaw_rad)  # along the heading at the start
+    ahead, aside = turned(forward, left, yaw_rad)  # relative to the heading at switch-on
     ax, ay, az = (part / GRAVITY_M_S2 * 1000 for part in believed.acceleration_m_s2)
     altitude_cm = believed.altitude_m * 100
     steep = math.cos(believed.roll_rad) * math.cos(believed.pitch_rad)
@@ -87,13 +87,13 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
 
 
 def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
-    """Return the datagram for the state, sent ten times a second."""
+    """Return the datagram with the state, which is sent ten times per second."""
     values = list(fields(snapshot).items())
     return build(values if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *values])
 
 
 def answer(question: str, snapshot: Snapshot) -> str:
-    """Return the answer to a question about the state; raise ``KeyError`` for other questions."""
+    """Return the reply to a query about the state; raise ``KeyError`` for other queries."""
     values = fields(snapshot)
     answers = {
         "battery?": values["bat"],
