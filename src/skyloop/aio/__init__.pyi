@@ -40,7 +40,7 @@ __all__ = ["Callback", "Config", "Drone", "Listener", "Swarm", "connect", "swarm
 class Config:
     """Parameters: ``await drone.config.get("limits.tilt")``, ``await drone.config.set("limits.tilt", 0.2)``.
 
-    Writing needs the authority. See :class:`skyloop.client.Config` for how written values are kept.
+    Writing needs the authority. :class:`skyloop.client.Config` explains how written values are kept.
     """
 
     sync: client.Config
@@ -110,7 +110,7 @@ class Drone:
         """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
     @property
     def log(self) -> client.Logbook:
-        """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
+        """Publishes text and numbers during the flight; see :class:`skyloop.client.Logbook`."""
     def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
@@ -832,7 +832,7 @@ class Swarm:
     """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
 
     Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may demand a landing. Only one
+    :meth:`emergency_stop` are coroutines. So is :meth:`feedback`, because ``on_error`` may require a landing. Only one
     task at a time may await them; :meth:`emergency_stop` may be called at any time.
     """
 
@@ -857,7 +857,7 @@ class Swarm:
 
         Args:
             function: A coroutine function; its exceptions count as in :meth:`skyloop.Swarm.each`.
-            what: Name of the action in error messages; empty: the function's.
+            what: Name of the action in error messages; empty: the function's name.
 
         Returns:
             Its results, by name.
